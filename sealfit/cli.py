@@ -261,7 +261,7 @@ def ingest(
 
 
 def _fit_command(step: str) -> Callable[..., None]:
-    """Return the command of a fit; all fits have the same options."""
+    """Return the command of a fit; these have the same options."""
 
     def fit(
         out: Results,
@@ -276,12 +276,59 @@ def _fit_command(step: str) -> Callable[..., None]:
     return fit
 
 
-for step, text in (
-    ("fit-steady", "Fit steady LuGre to each condition."),
-    ("fit-aging", "Fit the aging law across days."),
-    ("fit-dynamic", "Fit sigma_0 and sigma_1 to the pre-sliding part."),
-):
-    command(step, help=text, epilog=f"Example: sealfit {step} results")(_fit_command(step))
+command(
+    "fit-steady", help="Fit steady LuGre to each condition.", epilog="Example: sealfit fit-steady results"
+)(_fit_command("fit-steady"))
+
+
+@command("fit-aging", epilog="Example: sealfit fit-aging --values strength.csv --out results")
+def fit_aging(
+    out: Annotated[
+        Path | None, typer.Argument(metavar="OUT", help="Folder of results of `ingest` or `run`.")
+    ] = None,
+    values: Annotated[
+        Path | None, typer.Option("--values", help="Or a table of property values of specimens.")
+    ] = None,
+    new: Annotated[Path | None, typer.Option("--out", help="With --values: folder of results.")] = None,
+    config: ConfigFile = None,
+    properties: Annotated[
+        list[str] | None, typer.Option("--property", metavar="COLUMN", help="Property; may be repeated.")
+    ] = None,
+    batch: Annotated[
+        str | None, typer.Option("--batch", metavar="COLUMN", help="Batch of a specimen. [default: batch]")
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    force: Force = False,
+    profile: Profile = False,
+    as_json: Json = False,
+) -> None:
+    """Fit the aging law across days."""
+    if values is None:
+        if new or config or properties or batch:
+            raise typer.BadParameter("--out, --config, --property and --batch go with --values.")
+        if out is None:
+            raise typer.BadParameter("give OUT, or --values TABLE --out OUT.")
+        _single("fit-aging", out, profile, as_json, **_options(workers, scheduler, force=force))
+        return
+    if (out is None) == (new is None):
+        raise typer.BadParameter("give the folder of results once: --values TABLE --out OUT.")
+    asked = {"names": tuple(properties or ()), "force": force} | ({"batch": batch} if batch else {})
+    _do(
+        "fit-aging",
+        profile,
+        as_json,
+        lambda pipeline, progress: pipeline.fit_properties(
+            values, new or out, config, progress=progress, **asked
+        ),
+    )
+
+
+command(
+    "fit-dynamic",
+    help="Fit sigma_0 and sigma_1 to the pre-sliding part.",
+    epilog="Example: sealfit fit-dynamic results",
+)(_fit_command("fit-dynamic"))
 
 
 @command("close-loop", epilog="Example: sealfit close-loop results")
@@ -336,7 +383,9 @@ def predict(
 @command(epilog="Example: sealfit lifetime results --quantity mu_s --threshold 0.70 --temperature 40")
 def lifetime(
     out: Results,
-    quantity: Annotated[str, typer.Option("--quantity", help="mu_s, mu_c, F_s or F_c.")] = "mu_s",
+    quantity: Annotated[
+        str, typer.Option("--quantity", help="mu_s, mu_c, F_s, F_c, or a property.")
+    ] = "mu_s",
     threshold: Annotated[
         float | None, typer.Option("--threshold", help="Value at which the life ends.")
     ] = None,

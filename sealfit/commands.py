@@ -27,6 +27,8 @@ from sealfit.units import Units
 if TYPE_CHECKING:
     import pandas as pd
 
+    from sealfit.fit.aging.joint_law import JointLaw
+
 MODELS = ("after", "before")  # with the loop's effects taken out at their reference, and without effects
 
 
@@ -165,7 +167,6 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     RequestError
         If the request does not fit the campaign.
     """
-    from sealfit.fit.aging.all_series import law_of
     from sealfit.fit.aging.joint_law import rivals_of
     from sealfit.fit.aging.lifetime import answer, finite_ends, goal_of, over_laws
 
@@ -173,21 +174,33 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     if asked.model not in MODELS:
         raise RequestError(f"there is no model '{asked.model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
     goal, years = goal_of(asked.threshold, asked.loss_pct), asked.years
-    tables, taken_out = _fits_of(store, asked.model)
-    laws = law_of(*tables, asked.quantity, asked.law)
+    laws, taken_out = _laws_of(store, asked, asked.model)
     place = {"temperature_C": asked.temperature_C, "compression_pct": asked.compression_pct}
     chosen, rivals = answer(laws[0], goal, years, resample=True, **place), []
     if asked.law is None:
         rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)]
         if years is None:
             chosen["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
-    said = {"out": str(store.out), "quantity": asked.quantity, "model": asked.model, "effects": taken_out}
+    model = asked.model if store.state.properties is None else None  # a property has one model only
+    said = {"out": str(store.out), "quantity": asked.quantity, "model": model, "effects": taken_out}
     before = None
     if taken_out:
         with suppress(RequestError):  # the declared model may have no answer where this one has
-            declared = law_of(*_fits_of(store, "before")[0], asked.quantity, asked.law)[0]
-            before = answer(declared, goal, years, **place)
+            before = answer(_laws_of(store, asked, "before")[0][0], goal, years, **place)
     return {**said, **chosen, "rivals": rivals, "before": before}
+
+
+def _laws_of(store: Store, asked: LifetimeRequest, model: str) -> tuple[list[JointLaw], list[dict]]:
+    """Return the laws of a quantity in order of BIC, and the effects taken out of its values."""
+    if store.state.properties is not None:
+        from sealfit.fit.aging.property import laws_of_property
+
+        store.require("fit-aging")
+        return laws_of_property(store.read("property_values"), asked.quantity, asked.law), []
+    from sealfit.fit.aging.all_series import law_of
+
+    tables, taken_out = _fits_of(store, model)
+    return law_of(*tables, asked.quantity, asked.law), taken_out
 
 
 def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame], list[dict]]:

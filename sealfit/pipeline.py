@@ -11,9 +11,15 @@ from typing import TYPE_CHECKING
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.progress import Silent, timed
-from sealfit.store.manifest import STEPS, ConfigCopy, fingerprint, glob_names
+from sealfit.store.manifest import BATCH, STEPS, ConfigCopy, Properties, fingerprint, glob_names
 from sealfit.store.out_folder import Store
-from sealfit.store.paths import campaign_folder, existing_out, own_effects_folder, possible_tables
+from sealfit.store.paths import (
+    campaign_folder,
+    existing_file,
+    existing_out,
+    own_effects_folder,
+    possible_tables,
+)
 from sealfit.store.staged_writes import Staged
 
 if TYPE_CHECKING:
@@ -34,6 +40,7 @@ FITS = {
 FITTED = tuple(name for names in FITS.values() for name in names)
 MADE = {"ingest": INGESTED, **FITS, "close-loop": (*CLOSED, *AFTER)}  # tables by the step that makes them
 TABLES = tuple(name for names in MADE.values() for name in names)
+OF_PROPERTIES = ("property_values", "aging_fit", "aging_curves", "aging_laws", "master_curve")
 BESIDE = ("steady_covariance", "steady_shift", "aging_covariance")  # of the parameters of a fit
 UNREPORTED = (  # of many rows, and nothing in the report needs them
     "traces", "bins", "steady_after", *BESIDE, *(f"{name}_after" for name in BESIDE),
@@ -114,6 +121,42 @@ def ingest(campaign: Path, out: Path, config: Path | None = None, **options) -> 
     return run(campaign, out, config, steps=("ingest",), **options)
 
 
+def fit_properties(
+    table: Path,
+    out: Path,
+    config: Path | None = None,
+    *,
+    names: tuple[str, ...] = (),
+    batch: str = BATCH,
+    progress: Silent | None = None,
+    **options,
+) -> dict:
+    """Fit the aging laws of properties of specimens, without traces, and return the summary.
+
+    Parameters
+    ----------
+    table : Path
+        CSV, Excel or Parquet file with a row per specimen.
+    out, config : Path
+        As `run`.
+    names, batch
+        As `sealfit.ingest.property_table.read_properties`.
+    **options
+        Fields of `Options`.
+
+    Raises
+    ------
+    SealfitError
+        Whatever the user has to fix.
+    """
+    chosen, source = Options(**options), ConfigCopy.at(config)
+    source.parse()
+    table = existing_file(table, "table of values").resolve()
+    asked = Properties(table.name, tuple(names), batch)
+    with Store.writing(out, table.parent, source, properties=asked) as store:
+        return _do_steps(store, ("fit-aging",), chosen, progress or Silent())
+
+
 def single(step: str, out: Path, *, progress: Silent | None = None, **options) -> dict:
     """Do one step after the first in an OUT whose earlier steps are current, and return its summary.
 
@@ -131,7 +174,8 @@ def single(step: str, out: Path, *, progress: Silent | None = None, **options) -
         Store.writing(existing_out(out), effects=chosen.effects_folder) as store,
         on_cluster(chosen.scheduler, out),
     ):
-        store.require(STEPS[STEPS.index(step) - 1])
+        for before in store.up_to(step)[:-1][-1:]:
+            store.require(before)
         return _do_steps(store, (step,), chosen, progress or Silent())
 
 
@@ -203,7 +247,22 @@ def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) ->
     return len(steady), "strokes"
 
 
+def _fit_properties(store: Store, staged: Staged, asked: Properties, progress: Silent) -> Counted:
+    from sealfit.fit.aging.property import fit_properties
+    from sealfit.ingest.property_table import read_properties
+
+    path, config = store.state.campaign / asked.table, store.seen_config("fit-aging")
+    staged.inputs = {asked.table: fingerprint(path)}  # as it was when the reading began
+    specimens, faults = read_properties(path, config, asked.names, asked.batch)
+    progress.faults(faults)
+    progress.say("fitting the aging law")
+    _write(staged, {"property_values": specimens, **fit_properties(specimens, config)})
+    return len(specimens), "values"
+
+
 def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+    if store.state.properties is not None:
+        return _fit_properties(store, staged, store.state.properties, progress)
     from sealfit.fit.aging.all_series import joint_laws
     from sealfit.fit.aging.series import aging_curves, fit_series
     from sealfit.fit.stored_tables import whole_steady_fit
@@ -276,8 +335,8 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
     with timed("reading tables"):
         tables = report_tables(store)
     with timed("page"):
-        about = store.read_json("closure"), store.provenance(), store.seen_config("report")
-        report = build_report(tables, *about)
+        closure = store.read_json("closure") if store.state.properties is None else None
+        report = build_report(tables, closure, store.provenance(), store.seen_config("report"))
     with timed("writing plots", rows=len(report.figures), of="plots"):
         for name, figure in report.figures.items():
             staged.figure(name, figure)
@@ -287,6 +346,8 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
 
 def report_tables(store: Store) -> dict[str, pd.DataFrame]:
     """Return by name what the report shows and draws of the tables in OUT."""
+    if store.state.properties is not None:
+        return {name: store.read(name) for name in OF_PROPERTIES}
     names = [name for name in TABLES if name not in (*UNREPORTED, "traces_mean")]
     tables = {name: store.read(name, REPORTED.get(name)) for name in names}
     return {**tables, "traces_mean": _example_traces(store, tables["runs"])}

@@ -376,6 +376,7 @@ AGING_LAWS = Schema(
         Column("rival", "", BOOL, "true where it is not distinguishable from the best law with these data"),
         Column("criterion", "", FLOAT, "BIC minus that of the best law"),
         Column("scatter_rel", "", FLOAT, "relative scatter between specimens about the law"),
+        Column("lack_of_fit_p", "", FLOAT, "of the law against replicates; null without them"),
         Column("heldout_series", "", FLOAT, "RMS error on held-out series, in the quantity's unit"),
         Column("heldout_last_day", "", FLOAT, "RMS error on the held-out last days of all series"),
         Column("parameter", "", TEXT, "parameter; null for separate laws"),
@@ -385,6 +386,21 @@ AGING_LAWS = Schema(
         Column("unit", "", TEXT, "unit of value, lo95 and hi95"),
         Column("identified", "", BOOL, "false where these data do not determine it"),
     ),
+)
+PROPERTY_VALUES = Schema(
+    "property_values",
+    (
+        CONDITION,
+        SERIES,
+        RUBBER,
+        Column("aging_days", "d", FLOAT, "aging time"),
+        Column("quantity", "", TEXT, "property: the column's name"),
+        Column("value", "", FLOAT, "value of one specimen"),
+        Column("unit", "", TEXT, "unit of value"),
+        Column("batch", "", TEXT, "batch of the specimen; null if none is named"),
+        Column("line", "", INT, "line in the table of values"),
+    ),
+    open_=True,
 )
 MASTER_CURVE = Schema(
     "master_curve",
@@ -466,6 +482,7 @@ SCHEMAS = {
         CURVES,
         AGING_CURVES,
         AGING_LAWS,
+        PROPERTY_VALUES,
         MASTER_CURVE,
         DYNAMIC_FIT,
         DYNAMIC_CURVES,

@@ -83,7 +83,10 @@ def test_examples_print_what_they_say(page):
     assert not failed
 
 
-@pytest.mark.parametrize(("name", "folder"), [("tutorial", "desk"), ("how-to/enough-runs", "with_results")])
+@pytest.mark.parametrize(
+    ("name", "folder"),
+    [("tutorial", "desk"), ("how-to/enough-runs", "with_results"), ("how-to/properties", "desk")],
+)
 def test_commands_print_what_they_say(name, folder, request):
     commands = list(console(DOCS / f"{name}.md"))
     assert commands

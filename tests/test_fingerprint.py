@@ -3,7 +3,7 @@ import os
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sealfit.config import Config, parse_config
+from sealfit.config import Config, Files, parse_config
 from sealfit.store.manifest import Fingerprint, changes, fingerprint, step_keys
 
 files = st.sampled_from([f"{folder}{name}.csv" for folder in ("", "one/", "two/") for name in "abcd"])
@@ -27,16 +27,16 @@ def test_changes_are_what_is_new_other_or_gone(tmp_path):
     for name in ("same", "other", "touched", "gone"):
         (tmp_path / f"{name}.csv").write_text(name)
     known = {path.name: fingerprint(path) for path in tmp_path.iterdir()}
-    assert changes(tmp_path, known, Config()) == {}
+    assert changes(tmp_path, known, Files()) == {}
     (tmp_path / "other.csv").write_text("OTHER")
     os.utime(tmp_path / "other.csv", ns=(7, 7))
     os.utime(tmp_path / "touched.csv", ns=(7, 7))
     (tmp_path / "gone.csv").unlink()
     (tmp_path / "new.csv").write_text("new")
-    found = changes(tmp_path, known, Config())
+    found = changes(tmp_path, known, Files())
     assert found.keys() == {"other.csv", "touched.csv", "gone.csv"}
     assert found["gone.csv"] == Fingerprint()
     assert found["touched.csv"] == known["touched.csv"]._replace(mtime_ns=7)
     assert found["other.csv"].sha256 != known["other.csv"].sha256
     globbed = parse_config("[files]\nglob = '*.csv'", "rig")
-    assert changes(tmp_path, known, globbed).keys() == found.keys() | {"new.csv"}
+    assert changes(tmp_path, known, globbed.files).keys() == found.keys() | {"new.csv"}

@@ -245,7 +245,7 @@ class _Law:
             return
         found = self._estimate()
         words, interval = "; ".join(self._kept_words()), self._interval(found)
-        for row in law_rows(self.curve_of, found, interval, t_quantile(self.df), self.df):
+        for row in law_rows(self.curve_of, found, interval, self.df):
             yield {**row, "reason": " ".join(part for part in (row["reason"], words) if part)}
         yield from self._statistics(steady_fit)
         yield from covariance_rows(self.curve_of, found.covariance)

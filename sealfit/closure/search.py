@@ -92,8 +92,7 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
         for kink in kinks(channel).T:
             yield from _shape_candidates(tests, channel, kink[:, None], MAIN_TARGETS)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
-    fine = channel.numeric and units >= FINE_UNITS
-    if fine and np.unique(channel.values).size > 2 * FINE_DF:
+    if channel.numeric and units >= FINE_UNITS and np.unique(channel.values).size > 2 * FINE_DF:
         yield from _shape_candidates(tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
     if channel.name == "elapsed_h" and DAY_AND_NIGHT.shown_by(channel.values):
         angle = 2 * np.pi * channel.values[:, None] / DAY_H

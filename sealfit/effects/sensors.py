@@ -217,6 +217,8 @@ LEAST_DAYS, LEAST_PART = 2, 0.25
 
 
 def _shows_days(hours: np.ndarray) -> bool:
+    if not np.isfinite(hours).all():  # the start of a file is not known
+        return False
     day = np.floor((hours - hours.min()) / DAY_H).astype(int)
     spans = [np.ptp(hours[day == k]) for k in np.unique(day)]
     return sum(span >= LEAST_PART * DAY_H for span in spans) >= LEAST_DAYS

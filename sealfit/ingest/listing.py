@@ -133,30 +133,51 @@ def _runs_table(campaign: Path, config: Config) -> str | None:
 
 
 def _read_runs(campaign: Path, config: Config, table: str) -> tuple[Entries, Columns, list[Fault]]:
+    lines, columns, faults = read_table(campaign, table, config, needed="file")
+    files = [_posix(campaign, file) for file in columns.pop("file", [])]
+    if not files and not any(fault.severity == "error" for fault in faults):
+        raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
+    return Entries(files, lines, table), columns, faults
+
+
+def read_table(
+    folder: Path, table: str, config: Config, *, needed: str | None = None
+) -> tuple[list[int], Columns, list[Fault]]:
+    """Return the line of every row of a table, its cells by our names of the columns, and its faults.
+
+    Cells are text, None where they say that there is nothing, except in the column that is needed.
+
+    Parameters
+    ----------
+    folder, table : Path, str
+        A CSV, Excel or Parquet file and its folder.
+    config : Config
+        Says what `files.runs_columns` are called.
+    needed : str, optional
+        Column that every row must have.
+
+    Raises
+    ------
+    CampaignError
+        If it cannot be read as a table, or the needed column is not there.
+    """
     try:
-        text, delimiter = text_of_runs(campaign, table, config)
+        text, delimiter = text_of_runs(folder, table, config)
     except BadFile as error:
         place = {"file": table, "line": error.fault.line, "column": error.fault.column}
         raise _stop(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
     _, head = next(_lines(text), (1, ""))
     delimiter = delimiter or max(",;\t", key=head.count)
     names, faults = _our_names(_cells(head, delimiter) if head else [], config)
-    if "file" not in names:
-        fix = suggestion("file", _cells(head, delimiter) if head else [])
-        raise _stop("missing_column", "there is no such column.", fix, file=table, line=1, column="file")
-    lines, columns = _rows(text, names, delimiter, faults)
+    if needed and needed not in names:
+        fix = suggestion(needed, _cells(head, delimiter) if head else [])
+        raise _stop("missing_column", "there is no such column.", fix, file=table, line=1, column=needed)
+    lines, columns = _rows(text, names, delimiter, faults, needed)
     # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
     if delimiter != ",":
         columns = {name: mapped(column, _decimal_point) for name, column in columns.items()}
-    files = [_posix(campaign, file) for file in columns.pop("file", [])]
-    if not files and not any(fault.severity == "error" for fault in faults):
-        raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
-    faults = [replace(fault, file=table) for fault in faults]
-    return (
-        Entries(files, lines, table),
-        {name: mapped(column, _said) for name, column in columns.items()},
-        faults,
-    )
+    columns = {name: column if name == needed else mapped(column, _said) for name, column in columns.items()}
+    return lines, columns, [replace(fault, file=table) for fault in faults]
 
 
 def _lines(text: bytes) -> Iterator[tuple[int, str]]:
@@ -178,8 +199,10 @@ def _decimal_point(cell: str) -> str:
     return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
 
 
-def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) -> tuple[list[int], Columns]:
-    """Return the line of every trace file, and the columns that have a name; adds to `faults`."""
+def _rows(
+    text: bytes, names: list[str], delimiter: str, faults: list[Fault], needed: str | None
+) -> tuple[list[int], Columns]:
+    """Return the line of every row, and the columns that have a name; adds to `faults`."""
     lines, rows = [], []
     for number, line in islice(_lines(text), 1, None):
         if _left_open(line, delimiter):
@@ -194,10 +217,10 @@ def _rows(text: bytes, names: list[str], delimiter: str, faults: list[Fault]) ->
             )
             continue
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
-        if "file" not in row:
-            reason = "no trace file is named."
+        if needed and needed not in row:
+            reason = "no trace file is named." if needed == "file" else "the cell is empty."
             faults.append(
-                Fault("empty_cell", reason, file=RUNS_CSV, line=number, column="file", fix="Name it.")
+                Fault("empty_cell", reason, file=RUNS_CSV, line=number, column=needed, fix="Fill it.")
             )
             continue
         lines.append(number)

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 import pandas as pd
 
 from sealfit.config import Config
+from sealfit.report.summary import NOT_PARAMETERS
 from sealfit.tables import Schema
 from sealfit.units import Units
 
 OF_CONDITIONS = ("steady", "dynamic")  # `quantity` of the rows that are parameters of a condition
-OF_LAWS = ("mu_s", "mu_c", "F_s", "F_c")  # and of those that are parameters of an aging law
 # In the order of the equations.
 PARAMETERS = ("mu_s", "mu_c", "F_s", "F_c", "v_s", "sigma_2", "sigma_0", "sigma_1")
 ESTIMATE = ("value", "se", "lo95", "hi95", "u_sys", "unit", "before", "identified", "reason", "model")
@@ -159,7 +159,7 @@ def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], con
 
 
 def laws(fit: pd.DataFrame, before: pd.DataFrame, config: Config) -> pd.DataFrame:
-    """Return a row per series, quantity and parameter of Eq. 15: mu_0, a, b and c of mu_s and of mu_c.
+    """Return a row per series, quantity and parameter of Eq. 15: mu_0, a, b, c of mu_s, mu_c or a property.
 
     Parameters
     ----------
@@ -168,7 +168,8 @@ def laws(fit: pd.DataFrame, before: pd.DataFrame, config: Config) -> pd.DataFram
     config : Config
         Names the columns that tell series apart.
     """
-    rows = _with_before(_of([fit], OF_LAWS), _of([before], OF_LAWS), ["series", "quantity", "parameter"])
+    rows, earlier = (own[~own["quantity"].isin(NOT_PARAMETERS)] for own in (fit, before))
+    rows = _with_before(rows, earlier, ["series", "quantity", "parameter"])
     keys = [name for name in (*config.series_columns, *config.rubber) if name in rows]
     columns = dict.fromkeys(["series", "rubber", *keys, "quantity", "parameter", *ESTIMATE])
     return rows[list(columns)].reset_index(drop=True)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from sealfit.errors import RequestError
 from sealfit.pipeline import report_tables
 from sealfit.report.figures import draw_all
-from sealfit.report.page import answered
+from sealfit.report.page import to_draw
 from sealfit.report.style import compose, look
 from sealfit.store.out_folder import Store
 
@@ -38,8 +38,8 @@ class Plots:
         If these results have nothing to draw in it.
     """
 
-    def __init__(self, current: Callable[[str], Store]):
-        self._current = current  # gives the store if a step is current, else raises
+    def __init__(self, answered: Callable[[], Store]):
+        self._answered = answered  # gives the store if its answer is current, else raises
 
     def finding(self) -> Figure:
         """Return the residual along the variable of the largest effect, and the errors, before and after."""
@@ -82,8 +82,9 @@ class Plots:
         return self._drawn("traces_mean")
 
     def _drawn(self, name: str) -> Figure:
-        store = self._current("close-loop")
-        tables, closure = answered(report_tables(store), store.read_json("closure"))
+        store = self._answered()
+        closure = store.read_json("closure") if store.state.properties is None else None
+        tables, closure = to_draw(report_tables(store), closure)
         plots = draw_all(tables, closure, store.config)
         if name not in plots:
             raise RequestError(

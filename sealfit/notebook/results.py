@@ -1,9 +1,10 @@
-"""`sealfit.run` and `sealfit.open`: the results of a campaign for a notebook or another program."""
+"""`sealfit.run`, `fit_properties` and `open`: the results of a campaign for a notebook or another program."""
 
 from __future__ import annotations
 
 import html
 import warnings
+from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from sealfit.engine.run_map import cores
 from sealfit.errors import RequestError, SealfitError
 from sealfit.notebook import frames
 from sealfit.report import summary, summary_lines
+from sealfit.store.manifest import BATCH
 from sealfit.store.out_folder import Store
 from sealfit.store.paths import existing_out
 from sealfit.tables import SCHEMAS
@@ -63,6 +65,42 @@ def run(
     folders |= {"campaign": _path(campaign), "out": _path(out), "config": _path(config)}
     pipeline.run(**folders, workers=workers or cores(), **options)
     return Results(out, effects_folder)
+
+
+def fit_properties(
+    values: str | Path,
+    out: str | Path,
+    config: str | Path | None = None,
+    *,
+    properties: Sequence[str] = (),
+    batch: str = BATCH,
+    **options: object,
+) -> Results:
+    """Fit the aging laws of properties of specimens, as `sealfit fit-aging --values` does.
+
+    Parameters
+    ----------
+    values : str or Path
+        CSV, Excel or Parquet file with a row per specimen.
+    out, config
+        As `run`.
+    properties : sequence of str
+        Columns of the properties; by default the only one there is.
+    batch : str
+        Column that names the batch of a specimen.
+    **options
+        `force` and `progress` of `sealfit.pipeline.fit_properties`.
+
+    Raises
+    ------
+    SealfitError
+        Whatever the user has to fix: the message says where, what and how.
+    """
+    one_thread()
+    options.setdefault("progress", progress.for_notebook())
+    folders = (_path(values), _path(out), _path(config))
+    pipeline.fit_properties(*folders, names=tuple(properties), batch=batch, **options)
+    return Results(out)
 
 
 def open(out: str | Path, effects_folder: str | Path | None = None) -> Results:
@@ -160,7 +198,7 @@ class Results:
     @property
     def laws(self) -> pd.DataFrame:
         """A row per series, quantity and parameter of the aging law (Eq. 15); empty if no rubber was aged."""
-        store = self._current(ANSWERED)
+        store = self._answered()
         fit, before = self._answer(store, "aging_fit"), store.read("aging_fit")
         return frames.with_units(frames.laws(fit, before, store.config), store.config.units)
 
@@ -229,7 +267,7 @@ class Results:
         """The report's figures: `results.plot.aging()` returns a matplotlib Figure."""
         from sealfit.notebook.plots import Plots
 
-        return Plots(self._current)
+        return Plots(self._answered)
 
     def predict(self, points: pd.DataFrame) -> pd.DataFrame:
         """Return the points with the force, before and after, and 95 % intervals, as `sealfit predict` does.
@@ -265,7 +303,7 @@ class Results:
         Parameters
         ----------
         quantity : str
-            mu_s, mu_c, F_s or F_c.
+            mu_s, mu_c, F_s, F_c, or a property.
         threshold, loss_pct : float
             Value at which life ends, or percent of the start that may be lost: one of the two.
         temperature_C : float, optional
@@ -284,14 +322,21 @@ class Results:
     # ------------------------------------------------------------ how it shows itself
     def __repr__(self) -> str:
         try:
-            store, closure = self._closure()
+            store = self._answered()
+            if store.state.properties is not None:
+                return "\n".join(summary_lines.lines(summary.of_steps(store, ["fit-aging"])))
+            closure = store.read_json("closure")
         except SealfitError as error:
             return f"results in {self.out}: {error}"
         return "\n".join(summary_lines.closure_lines(summary.of_closure(closure, store.config.units)))
 
     def _repr_html_(self) -> str:
         try:
-            store, closure = self._closure()
+            store = self._answered()
+            if store.state.properties is not None:
+                said = map(summary_lines.property_sentences, summary.of_aging(store)["properties"])
+                return "\n".join([*(f"<p>{html.escape(text)}</p>" for text in said), _table_html(self.laws)])
+            closure = store.read_json("closure")
         except SealfitError as error:
             return f"<p>Results in {html.escape(str(self.out))}: {html.escape(str(error))}</p>"
         units = store.config.units
@@ -316,6 +361,12 @@ class Results:
         store.require(step)
         return store
 
+    def _answered(self) -> Store:
+        """Return the store if its answer is current: what the report, the last step, would show."""
+        store = self._open()
+        store.require(store.state.order[-2])
+        return store
+
     def _closure(self) -> tuple[Store, dict]:
         store = self._current(ANSWERED)
         return store, store.read_json("closure")
@@ -323,6 +374,8 @@ class Results:
     @staticmethod
     def _answer(store: Store, name: str) -> pd.DataFrame:
         """Return a table of the after-model, or that before where no effect was added."""
+        if store.state.properties is not None:
+            return store.read(name)
         after = store.read(f"{name}{AFTER}")
         return after if len(after) else store.read(name)
 
@@ -351,7 +404,8 @@ class Lifetime(dict):
 
 
 def _step_of(table: str) -> str:
-    step = next((step for step, names in pipeline.MADE.items() if table in names), None)
+    made = {**pipeline.MADE, "fit-aging": (*pipeline.FITS["fit-aging"], *pipeline.OF_PROPERTIES)}
+    step = next((step for step, names in made.items() if table in names), None)
     if step is None:
         raise RequestError(f"there is no table '{table}'.", fix=_nearest(table, pipeline.TABLES))
     return step

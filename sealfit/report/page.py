@@ -38,6 +38,8 @@ from sealfit.report.notation import (
 )
 from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
 from sealfit.report.style import Drawn, Plot, data_uri, draw
+from sealfit.report.summary import of_properties
+from sealfit.report.summary_lines import LACKING, property_sentences, values_clause
 from sealfit.report.words import left_over, undecided, verdict, with_left_channels
 from sealfit.tables import SCHEMAS
 
@@ -169,7 +171,7 @@ def provenance_facts(provenance: Mapping) -> dict:
         "system": provenance.get("system", ""),
         "packages": dict(provenance.get("packages") or {}),
         "campaign": campaign,
-        "name": PurePath(campaign).name or campaign,
+        "name": provenance.get("table") or PurePath(campaign).name or campaign,
         "config_name": config.get("name", ""),
         "config_path": config.get("path"),
         "config_text": config.get("text", ""),
@@ -197,7 +199,7 @@ def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict
 
 TABLES = (
     "inputs", "runs", "quality", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves",
-    "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
+    "aging_laws", "property_values", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
 )  # fmt: skip
 FITS = (
@@ -251,21 +253,72 @@ def build_report(
     Report
         The page loads nothing. Figures are drawn once; the page shows their panels.
     """
-    tables, closure = answered(tables, closure)
+    content = _content(*answered(tables, closure), provenance, config)
+    tables, closure = to_draw(tables, closure)
+    if len(tables["property_values"]):
+        content |= _of_properties(tables)
     plots = draw_all(tables, closure, config)
     with timed("plots", rows=len(plots), of="plots"):
         figures = {name: draw(plot) for name, plot in plots.items()}
     images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
     html = _environment().from_string(_text("template.html")).render(
-        style=Markup(_text("style.css")), plots=images, **_content(tables, closure, provenance, config)
+        style=Markup(_text("style.css")), plots=images, **content
     )  # fmt: skip
     return Report(html, figures)
+
+
+def property_means(values: pd.DataFrame) -> pd.DataFrame:
+    """Return the means of properties per condition as rows of table `steady_fit`, for the plot of the law.
+
+    Parameters
+    ----------
+    values : DataFrame
+        Table `property_values`.
+    """
+    from sealfit.fit.aging.property import means_of
+
+    parts = []
+    for (rubber, quantity), own in values.groupby(["rubber", "quantity"]):
+        means = means_of(own)
+        half = means.half_width()
+        value = means.table["value"]
+        kept = means.table[["condition", "series", "value"]]
+        parts.append(
+            kept.assign(
+                rubber=rubber, quantity="steady", parameter=quantity, identified=True,
+                lo95=value - half, hi95=value + half,
+            )
+        )  # fmt: skip
+    return pd.concat(parts, ignore_index=True)
+
+
+def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
+    """Return what the page says of properties in place of the campaign and the loop."""
+    properties = of_properties(*(tables[name] for name in ("property_values", "aging_fit", "aging_laws")))
+    known = [p for one in properties if (p := one["lack_of_fit_p"]) is not None]
+    fits = not known or min(known) >= LACKING
+    return {
+        "of_properties": True,
+        "badge": "Fit: not known" if not known else "The law fits" if fits else "The law does not fit",
+        "verdict": " ".join(map(property_sentences, properties)),
+        "facts": [f"{one['quantity']}: {values_clause(one)}" for one in properties],
+    }
+
+
+def to_draw(
+    tables: Mapping[str, pd.DataFrame], closure: Mapping | None
+) -> tuple[dict[str, pd.DataFrame], Mapping | None]:
+    """Return tables and closure.json as the figures use them, properties as the means of conditions."""
+    tables, closure = answered(tables, closure)
+    if len(tables["property_values"]):
+        tables["steady_fit"] = property_means(tables["property_values"])
+    return tables, closure
 
 
 def answered(
     tables: Mapping[str, pd.DataFrame], closure: Mapping | None
 ) -> tuple[dict[str, pd.DataFrame], Mapping | None]:
-    """Return tables and closure.json as the figures and the page use them; see `with_after_fits`."""
+    """Return tables and closure.json as the page uses them; see `with_after_fits`."""
     tables = with_after_fits(tables)
     if closure is not None:
         closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
@@ -301,6 +354,7 @@ def _content(
     break_aways, break_aways_in_all = break_away_rows(dynamic, config)
     findings, in_all = page.quality_findings(tables["quality"], config)
     return {
+        "of_properties": False,
         "closure": closure,
         "badge": VERDICTS[closure["verdict"] if closure else None],
         "fit": fit_badge(closure),

@@ -65,6 +65,7 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
                     "heldout_last_day": number(first["heldout_last_day"])
                     if known(first["heldout_last_day"])
                     else NOTHING,
+                    "lack_of_fit": number(first["lack_of_fit_p"], 2) if known(first["lack_of_fit_p"]) else "",
                     "chosen": rank == 1,
                     "before": False,
                     "key": (rubber, quantity),
@@ -92,7 +93,8 @@ def _with_interval(by: pd.DataFrame, name: str) -> str:
 # Tables of the fitted parameters: a row per condition or series, each parameter with its interval and u_sys.
 
 STATISTICS = (
-    "rmse_N", "rmse", "max_error_pct", "specimen_sd_pct", "reduced_chi2", "lack_of_fit_p", "df",
+    "rmse_N", "rmse", "max_error_pct", "specimen_sd_pct", "reduced_chi2",
+    "lack_of_fit_p", "df",
     "n_runs", "n_files", "n_speeds", "n_days", "last_day",
 )  # fmt: skip
 ENDS = ("value", "lo95", "hi95")
@@ -347,5 +349,5 @@ def _title(key: str, quantities: Sequence[str], *, after: bool) -> str:
     return (
         ("Aging law per series, from the joint fit" if after else "Aging law per series")
         if set(quantities) <= {"mu_s", "mu_c", "F_s", "F_c"}
-        else ", ".join(quantities)
+        else f"Aging law per series: {', '.join(quantities)}"
     )

@@ -46,7 +46,7 @@ def of_steps(store: Store, steps: Iterable[str]) -> dict:
     make = {
         "ingest": lambda: of_ingest({name: store.read(name, columns) for name, columns in OF_INGEST.items()}),
         "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
-        "fit-aging": lambda: of_fit(store.read("aging_fit"), "series"),
+        "fit-aging": lambda: of_aging(store),
         "fit-dynamic": lambda: of_dynamic(store.read("dynamic_fit")),
         "close-loop": lambda: (
             of_closure(store.read_json("closure"), store.config.units) | {"fits": of_after(store)}
@@ -108,6 +108,57 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
             }
         )
     return {of: int(fit[of].nunique()), "parameters": ranges}
+
+
+def of_aging(store: Store) -> dict:
+    """Return the ranges of the aging law's parameters; of properties, also their scatter and their laws."""
+    fit = store.read("aging_fit")
+    found = of_fit(fit, "series")
+    if store.state.properties is not None:
+        found["properties"] = of_properties(store.read("property_values"), fit, store.read("aging_laws"))
+    return found
+
+
+def of_properties(values: pd.DataFrame, fit: pd.DataFrame, laws: pd.DataFrame) -> list[dict]:
+    """Return the summary of every property in tables `property_values`, `aging_fit` and `aging_laws`."""
+    return [
+        _of_property(own, fit, laws[(laws["rubber"] == rubber) & (laws["quantity"] == quantity)])
+        for (rubber, quantity), own in values.groupby(["rubber", "quantity"])
+    ]
+
+
+def _of_property(values: pd.DataFrame, fit: pd.DataFrame, laws: pd.DataFrame) -> dict:
+    """Return number and scatter of one property's values, how the laws fit, and the likeliest for all series.
+
+    The lack of fit of the laws per series is their smallest p-value times their number (Bonferroni).
+    """
+    from sealfit.fit.aging.property import means_of
+
+    first, means = values.iloc[0], means_of(values)
+    own = fit[(fit["rubber"] == first["rubber"]) & fit["parameter"].str.startswith(f"{first['quantity']}:")]
+    named = own.set_index(own["parameter"].str.replace(f"{first['quantity']}:", "", regex=False))["value"]
+    p_values = named[named.index == "lack_of_fit_p"].dropna() if means.df else named.iloc[:0]
+    best = laws[laws["rank"] == 1]
+    energy = best[best["parameter"] == "E"]
+    return {
+        "rubber": first["rubber"],
+        "quantity": first["quantity"],
+        "unit": first["unit"] or "",
+        "values": len(values),
+        "conditions": int(values["condition"].nunique()),
+        "mean": float(values["value"].mean()),
+        "replicate_sd": means.specimen_sd if means.df else None,
+        "batch_sd": means.batch_sd if means.batch_sd == means.batch_sd else None,
+        "lack_of_fit_p": min(1.0, len(p_values) * float(p_values.min())) if len(p_values) else None,
+        "law": None
+        if best.empty
+        else {
+            **{name: best[name].iloc[0] for name in ("law", "way", "form")},
+            "drivers": [name for name in ("E", "kappa") if (best["parameter"] == name).any()],
+            "lack_of_fit_p": float(best["lack_of_fit_p"].iloc[0]),
+            "E": None if energy.empty else energy[["value", "lo95", "hi95"]].iloc[0].tolist(),
+        },
+    }
 
 
 def of_dynamic(fit: pd.DataFrame) -> dict:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+# Level of the test for lack of fit.
+LACKING = 0.05
 
 # ---------------------------------------------------------------- summary lines
 
@@ -16,7 +19,7 @@ def lines(summary: Mapping) -> list[str]:
         "close_loop": closure_lines,
         "ingest": ingest_lines,
         "fit_steady": lambda part: _fit_lines("steady fit", part),
-        "fit_aging": lambda part: _fit_lines("aging", part),
+        "fit_aging": lambda part: _fit_lines("aging", part) + property_lines(part.get("properties", ())),
         "fit_dynamic": dynamic_lines,
         "report": lambda part: [line("report", part["file"])],
     }
@@ -71,6 +74,62 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
         reason = next((entry["reason"] for entry in lacking if entry["reason"]), "")
         found.append(line("", f"not identified: {', '.join(texts)}. {reason}".rstrip()))
     return found
+
+
+def property_lines(properties: Sequence[Mapping]) -> list[str]:
+    """Return the lines of properties: their values, their scatter, and how the laws fit them."""
+    found = []
+    for one in properties:
+        found.append(line(one["quantity"], values_clause(one)))
+        if clause := lack_of_fit_clause(one["lack_of_fit_p"]):
+            found.append(line("", f"law per series: it {clause}"))
+        if one["law"]:
+            found.append(line("law", _property_law(one["law"])))
+    return found
+
+
+def values_clause(one: Mapping) -> str:
+    """Return the number of a property's values and their scatter, in words."""
+    unit = f" {one['unit']}" if one["unit"] else ""
+    scatter = "no replicates, so nothing shows whether a law fits"
+    if one["replicate_sd"] is not None:
+        scatter = f"standard deviation of replicates {one['replicate_sd']:.3g}{unit}"
+    if one["batch_sd"] is not None:
+        scatter += f", of batches {one['batch_sd']:.3g}{unit}"
+    return f"{_count(one['values'], 'value')} in {_count(one['conditions'], 'condition')}; {scatter}"
+
+
+def property_sentences(one: Mapping) -> str:
+    """Return in sentences whether the law per series fits a property, and the law for all series."""
+    clause = lack_of_fit_clause(one["lack_of_fit_p"]) or "has no replicates to be judged by"
+    law = f" One law for all series: {_property_law(one['law'])}." if one["law"] else ""
+    return f"{one['quantity']}: the law mu_0 - a ln(1 + t/b), series by series, {clause}.{law}"
+
+
+def _property_law(law: Mapping) -> str:
+    text = f"{law['form']}, {drivers_clause(law['drivers'], law['way'])}"
+    if law["E"]:
+        value, low, high = law["E"]
+        text += f", E = {value:.3g} kJ/mol [{low:.3g}, {high:.3g}]"
+    clause = lack_of_fit_clause(law["lack_of_fit_p"])
+    return f"{text}; it {clause}" if clause else text
+
+
+def drivers_clause(drivers: Sequence[str], way: str) -> str:
+    """Return in words what temperature (E) and compression (kappa) change in a law."""
+    names = [name for name, of in (("temperature", "E"), ("compression", "kappa")) if of in drivers]
+    if not names:
+        return "a single temperature and compression"
+    return f"{' and '.join(names)} {'changes' if len(names) == 1 else 'change'} the {way}"
+
+
+def lack_of_fit_clause(p: float | None) -> str:
+    """Return in words whether a law fits the values within the scatter of replicates; "" if not known."""
+    if p is None or p != p:
+        return ""
+    if p < LACKING:
+        return f"does not fit (lack of fit, p = {p:.2g}): do not rely on it between or beyond the tests"
+    return f"fits within the scatter of replicates (lack of fit, p = {p:.2g})"
 
 
 def dynamic_lines(part: Mapping) -> list[str]:
@@ -191,7 +250,9 @@ def _number(value: float | None) -> str:
 def lifetime_lines(part: Mapping) -> list[str]:
     """Return the lines of a lifetime, followed by those of the alternative laws."""
     found = [line("model", text) for text in _model(part)]
-    found.append(line("law", f"{part['quantity']} = {part['form']}, {_change(part)}"))
+    clause = lack_of_fit_clause(part["lack_of_fit_p"])
+    law = f"{part['quantity']} = {part['form']}, {_change(part)}"
+    found.append(line("law", f"{law}; it {clause}" if clause else law))
     found.append(line("life" if "days" in part else "use", _life(part)))
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
@@ -208,6 +269,8 @@ def lifetime_lines(part: Mapping) -> list[str]:
 
 def _model(part: Mapping) -> list[str]:
     """Return the model used, and the reference state of each of its effects."""
+    if part["model"] is None:
+        return []
     if part["model"] == "before":
         return ["before: declared model, without the effects of the loop"]
     if not part["effects"]:
@@ -216,12 +279,8 @@ def _model(part: Mapping) -> list[str]:
 
 
 def _change(part: Mapping) -> str:
-    names = [name for name in ("E", "kappa") if name in part["parameters"]]
-    if not names:
-        return "a single temperature and compression"
-    driven = f"temperature and compression change the {part['way']}"
-    energy = f", E = {part['parameters']['E']:.3g} kJ/mol" if "E" in names else ""
-    return driven + energy
+    energy = f", E = {part['parameters']['E']:.3g} kJ/mol" if "E" in part["parameters"] else ""
+    return drivers_clause(tuple(part["parameters"]), part["way"]) + energy
 
 
 def _life(part: Mapping) -> str:

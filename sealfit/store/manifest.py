@@ -28,6 +28,9 @@ from sealfit.errors import OutError
 STEPS = ("ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report")
 """The steps in order; each reads the tables of those before it."""
 
+STEPS_OF_PROPERTIES = ("fit-aging", "report")
+"""The steps of a table of properties, which has no traces."""
+
 FITS = ("fit-steady", "fit-aging", "fit-dynamic")
 """Steps whose tables close-loop does not read: it fits its own model to the bins."""
 
@@ -69,10 +72,11 @@ def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
     return Fingerprint(status.st_size, status.st_mtime_ns, hashlib.sha256(raw).hexdigest())
 
 
-def changes(folder: Path, known: Fingerprints, config: Config) -> dict[str, Fingerprint]:
+def changes(folder: Path, known: Fingerprints, files: Files) -> dict[str, Fingerprint]:
     """Return the current fingerprints of a campaign's trace files that are new or differ from those `known`.
 
-    A file is read only if its size or time differ from those known.
+    A file is read only if its size or time differ from those known. New ones are those that the glob of
+    `files` finds.
     """
     place, changed = os.path.join(folder, ""), []
     for file, mark in known.items():
@@ -83,7 +87,7 @@ def changes(folder: Path, known: Fingerprints, config: Config) -> dict[str, Fing
             continue
         if (status.st_size, status.st_mtime_ns) != mark[:2]:
             changed.append(file)
-    changed += [file for file in glob_names(folder, config.files) if file not in known]
+    changed += [file for file in glob_names(folder, files) if file not in known]
     return {file: fingerprint(place + file) for file in changed}
 
 
@@ -101,11 +105,15 @@ def seen_config(step: str, config: Config) -> Config:
 
 
 def step_keys(
-    inputs: Fingerprints, config: Config, effects: Mapping[str, str | None] | None = None
+    inputs: Fingerprints,
+    config: Config,
+    effects: Mapping[str, str | None] | None = None,
+    properties: Properties | None = None,
 ) -> dict[str, str]:
     """Return the key of every step, in order, for these inputs, this config and this version of the program.
 
-    `effects` are the hashes of the user's own effects; where their folder lies does not matter.
+    `effects` are the hashes of the user's own effects; where their folder lies does not matter. `properties`
+    says what is asked of a table of properties.
     """
     config = config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
     keys: dict[str, str] = {}
@@ -113,10 +121,12 @@ def step_keys(
     hashes = (inputs[name].sha256 or "" for name in names)
     known = "\0".join([*names, *hashes])  # no path contains \0
     before = hashlib.sha256(os.fsencode(known)).hexdigest()
-    for step in STEPS:
+    for step in STEPS if properties is None else STEPS_OF_PROPERTIES:
         seen = [__version__, step, seen_config(step, config).model_dump(mode="json"), before]
         if step == "close-loop" and effects:
             seen.append(dict(effects))
+        if properties is not None:
+            seen.append(asdict(properties))
         keys[step] = before = hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()
     return keys
 
@@ -136,6 +146,7 @@ def provenance(state: State) -> dict:
         "system": f"{platform.system()} {platform.machine()}",
         "packages": {name: found for name in PACKAGES if (found := _version(name)) is not None},
         "campaign": str(state.campaign),
+        "table": None if state.properties is None else state.properties.table,
         "config": {
             "name": state.config.name,
             "path": str(state.config.path) if state.config.path else None,
@@ -165,7 +176,8 @@ def _version(package: str) -> str | None:
 # The content of state.json: campaign, config, inputs, and the key of each step.
 
 STATE = "state.json"
-FORMAT = 7
+FORMAT = 8
+BATCH = "batch"  # column that names the batch, if nothing else is said
 DEFAULT = "default"
 
 
@@ -230,15 +242,40 @@ class Done:
 
 
 @dataclass(frozen=True, slots=True)
+class Properties:
+    """A table of properties of specimens, in the folder that stands for a campaign, and what is asked of it.
+
+    Attributes
+    ----------
+    table : str
+        File name of the table.
+    names : tuple of str
+        Columns of the properties; none for the only one there is.
+    batch : str
+        Column that names the batch.
+    """
+
+    table: str
+    names: tuple[str, ...]
+    batch: str
+
+
+@dataclass(frozen=True, slots=True)
 class State:
-    """The content of state.json."""
+    """The content of state.json; `properties` where the results are of such a table and not of traces."""
 
     campaign: Path
     config: ConfigCopy
+    properties: Properties | None = None
     inputs: Fingerprints = field(default_factory=dict)
     # SHA-256 of the user's own effects, by file name
     effects: dict[str, str | None] = field(default_factory=dict)
     steps: dict[str, Done] = field(default_factory=dict)
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """The steps in order."""
+        return STEPS if self.properties is None else STEPS_OF_PROPERTIES
 
     def as_dict(self) -> dict:
         """Return the state as it is written."""
@@ -247,6 +284,7 @@ class State:
             "format": FORMAT,
             "campaign": str(self.campaign),
             "config": {"path": str(self.config.path) if self.config.path else None, "text": self.config.text},
+            "properties": None if self.properties is None else asdict(self.properties),
             "inputs": self.inputs,
             "own_effects": self.effects,
             "steps": {name: asdict(done) for name, done in self.steps.items()},
@@ -268,6 +306,7 @@ class State:
                 raise ValueError
             at = kept["config"]["path"]
             belongs = Path(kept["campaign"]), ConfigCopy(Path(at) if at else None, kept["config"]["text"])
+            belongs += (_properties(kept.get("properties")),)
             if kept["format"] < FORMAT:  # of an earlier version: every step is out of date
                 return cls(*belongs)
             return cls(
@@ -286,6 +325,15 @@ class State:
                 file=path,
                 fix="Choose another --out.",
             ) from error
+
+
+def _properties(kept: dict | None) -> Properties | None:
+    """Return what is asked of a table of properties; ValueError if the table is not a file name."""
+    if kept is None:
+        return None
+    if PurePath(kept["table"]).name != kept["table"]:
+        raise ValueError(f"{kept['table']} is no file name")
+    return Properties(kept["table"], tuple(kept["names"]), kept["batch"])
 
 
 def _inside(done: Done) -> Done:

@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit import __version__
-from sealfit.config import Config
-from sealfit.errors import ConfigError, OutError, StaleError
+from sealfit.config import Config, Files
+from sealfit.errors import ConfigError, OutError, RequestError, StaleError
 from sealfit.store.lock import held, undisturbed
 from sealfit.store.manifest import (
+    BATCH,
     STATE,
-    STEPS,
     ConfigCopy,
     Done,
     Fingerprint,
+    Properties,
     State,
     changes,
     fingerprint,
@@ -63,7 +64,8 @@ class Store:
         self.anew = False  # whether stored results are to be recomputed
         self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
         if state.campaign.is_dir():
-            self._changed = changes(state.campaign, state.inputs, self.config)
+            files = self.config.files if state.properties is None else Files()
+            self._changed = changes(state.campaign, state.inputs, files)
         elif known:
             self.warnings.append(
                 f"the campaign folder {state.campaign} is missing, so changes cannot be detected."
@@ -103,10 +105,12 @@ class Store:
         campaign: Path | None = None,
         source: ConfigCopy | None = None,
         effects: Path | None = None,
+        properties: Properties | None = None,
     ) -> Iterator[Store]:
         """Hold `out` as its only writer and give the store; without `campaign`, one that already has results.
 
-        `source` is the config that the command line names, `effects` the folder that --effects-folder names.
+        `source` is the config that the command line names, `effects` the folder that --effects-folder names,
+        `properties` what is asked of a table of properties in `campaign`.
 
         Raises
         ------
@@ -121,16 +125,28 @@ class Store:
                 store = cls.open(out, effects)
             else:
                 folder = own_effects_folder(effects, source, out, campaign)
-                store = cls._of_campaign(out, campaign.resolve(), source, folder)
+                store = cls._of_campaign(out, campaign.resolve(), source, folder, properties)
             store._keep_what_moved()
             yield store
 
     @classmethod
-    def _of_campaign(cls, out: Path, campaign: Path, source: ConfigCopy, effects: Path | None) -> Store:
+    def _of_campaign(
+        cls,
+        out: Path,
+        campaign: Path,
+        source: ConfigCopy,
+        effects: Path | None,
+        properties: Properties | None,
+    ) -> Store:
         kept = State.read(out)
         hashes = {} if effects is None else effect_hashes(effects)
-        if kept is None or (kept.campaign != campaign and not kept.steps):
-            return cls(out, State(campaign, source, effects=hashes), known=False, kept=kept, effects=effects)
+        tables = [None if asked is None else asked.table for asked in (kept and kept.properties, properties)]
+        if kept is None or (not kept.steps and (kept.campaign != campaign or tables[0] != tables[1])):
+            state = State(campaign, source, properties, effects=hashes)
+            return cls(out, state, known=False, kept=kept, effects=effects)
+        if tables[0] != tables[1]:
+            what = f"the campaign {kept.campaign}" if tables[0] is None else f"the table {tables[0]}"
+            raise OutError(f"holds the results of {what}.", file=out, fix="Choose another --out.")
         store_inputs, moved = kept.inputs, kept.campaign != campaign
         if moved:
             store_inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
@@ -140,7 +156,8 @@ class Store:
                     file=out,
                     fix="Choose another --out.",
                 )
-        state = replace(kept, campaign=campaign, config=source, inputs=store_inputs, effects=hashes)
+        belongs = {"campaign": campaign, "config": source, "properties": properties}
+        state = replace(kept, **belongs, inputs=store_inputs, effects=hashes)
         store = cls(out, state, known=True, kept=kept, effects=effects)
         if moved:
             store.warnings.append(
@@ -177,9 +194,9 @@ class Store:
     def why_stale(self, step: str) -> str:
         """Return the reason why `step` is out of date, or "" if it is current."""
         if self._keys is None:
-            self._keys = step_keys(self.marks, self.config, self.state.effects)
+            self._keys = self._step_keys(self.marks)
         keys = self._keys
-        for name in STEPS[: STEPS.index(step) + 1]:
+        for name in self.up_to(step):
             done = self.state.steps.get(name)
             if done is None:
                 return f"{name} has not been done"
@@ -189,6 +206,26 @@ class Store:
                 if file_size(f"{self.out}/{file}") != size or self._damaged(file, done):
                     return f"{name} is stale: its {file} is missing or was changed"
         return ""
+
+    def _step_keys(self, inputs: Mapping[str, Fingerprint]) -> dict[str, str]:
+        return step_keys(inputs, self.config, self.state.effects, self.state.properties)
+
+    def up_to(self, step: str) -> tuple[str, ...]:
+        """Return the steps up to `step`, in order.
+
+        Raises
+        ------
+        RequestError
+            If these results have no such step.
+        """
+        order = self.state.order
+        if step not in order:
+            raise RequestError(
+                f"{self.out} holds the aging laws of {self.state.properties.table}, which has no traces: "
+                f"there is no {step}.",
+                fix=f"Its steps are {' and '.join(order)}; sealfit lifetime asks its laws.",
+            )
+        return order[: order.index(step) + 1]
 
     def _damaged(self, file: str, done: Done) -> bool:
         """Whether a file is not what its step wrote; it is read once by this process."""
@@ -208,6 +245,8 @@ class Store:
         if changed:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             return f"inputs changed ({', '.join(changed[:3])}{more})"
+        if self._kept is not None and self._kept.properties != self.state.properties:
+            return "other columns are asked for"
         own = what_differs(self.kept_effects, self.state.effects)
         if own and step == "close-loop":
             return own
@@ -215,7 +254,7 @@ class Store:
 
     def require(self, step: str) -> None:
         """Raise StaleError, naming the command to run, unless `step` and all before it are current."""
-        for name in STEPS[: STEPS.index(step) + 1]:
+        for name in self.up_to(step):
             why = self.why_stale(name)
             if why:
                 raise StaleError(f"{why}.", file=self.out, fix=f"Run: {self.command(name)}")
@@ -228,11 +267,16 @@ class Store:
     def command(self, step: str) -> str:
         """Return the command line that does `step`."""
         out = shlex.quote(str(self.out))
-        if step != "ingest":
+        if step != self.state.order[0]:
             own = self.effects or ("FOLDER" if self._names_effects or self.state.effects else None)
             option = f" {OPTION} {shlex.quote(str(own))}" if own and step == "close-loop" else ""
             return f"sealfit {step} {out}{option}"
         config = f" --config {shlex.quote(str(self.state.config.path))}" if self.state.config.path else ""
+        if (asked := self.state.properties) is not None:
+            names = "".join(f" --property {shlex.quote(name)}" for name in asked.names)
+            batch = f" --batch {shlex.quote(asked.batch)}" if asked.batch != BATCH else ""
+            table = shlex.quote(str(self.state.campaign / asked.table))
+            return f"sealfit fit-aging --values {table} --out {out}{config}{names}{batch}"
         return f"sealfit ingest {shlex.quote(str(self.state.campaign))} --out {out}{config}"
 
     # ------------------------------------------------------------ reading
@@ -300,7 +344,7 @@ class Store:
         inputs = self.state.inputs if staged.inputs is None else staged.inputs
         files = dict(staged.files)
         done = Done(
-            step_keys(inputs, self.config, self.state.effects)[name],
+            self._step_keys(inputs)[name],
             __version__,
             datetime.now(UTC).isoformat(timespec="seconds"),
             round(seconds, 3),
@@ -310,9 +354,8 @@ class Store:
         # The step counts as not done until every file is moved, so that a killed run leaves no mixture of old
         # and new tables as current. All is on the disk before the first move, so a full disk changes nothing
         # in OUT.
-        earlier = {
-            step: self.state.steps[step] for step in STEPS[: STEPS.index(name)] if step in self.state.steps
-        }
+        steps = self.state.steps
+        earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
         known = inputs if earlier else {}  # none are known of steps not done
         begun = replace(self.state, inputs=known, steps=earlier)
         ended = replace(begun, inputs=inputs, steps={**earlier, name: done})

@@ -179,6 +179,7 @@ def test_a_wave_with_the_time_of_day_has_a_test_of_its_own(hours):
         (np.add.outer(24.0 * np.arange(3), np.arange(0.0, 9.0, 3.0)).ravel(), True),  # three working days
         (np.r_[np.linspace(0.0, 2.0, 20), np.linspace(53.0, 54.0, 20)], False),  # two short visits
         (np.linspace(0.0, 24.0, 40), False),  # one day
+        (np.full(9, np.nan), False),  # no file says when it began
     ],
 )
 def test_a_change_with_the_time_of_day_needs_two_days_of_tests(hours, shown):

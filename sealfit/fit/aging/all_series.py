@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -66,18 +66,26 @@ def joint_laws(
     config : Config
         Says whether rubber is aged, and gives the units.
     """
-    rows, curves = [], []
+    data = {}
     if config.aging and "aging_days" in steady_fit.columns:
         levels = shared_levels(steady, steady_fit)
         for rubber, quantity in _quantities(levels):
-            try:
-                laws = fit_laws(aged_values(levels, rubber, quantity))
-            except FitError:  # no law can be fitted
-                continue
             unit = parameter_units(config.units, quantity in FORCES)["mu_s"]
-            at = {"rubber": rubber, "quantity": quantity}
-            rows += [{**at, **row} for row in _law_rows(laws, unit)]
-            curves.append(_master_curve(laws[0]).assign(**at))
+            data[rubber, quantity] = (aged_values(levels, rubber, quantity), unit)
+    return law_tables(data)
+
+
+def law_tables(data: Mapping[tuple[str, str], tuple[Aged, str]]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return tables `aging_laws` and `master_curve` of values and their units, by rubber and quantity."""
+    rows, curves = [], []
+    for (rubber, quantity), (aged, unit) in data.items():
+        try:
+            laws = fit_laws(aged)
+        except FitError:  # no law can be fitted
+            continue
+        at = {"rubber": rubber, "quantity": quantity}
+        rows += [{**at, **row} for row in _law_rows(laws, unit)]
+        curves.append(_master_curve(laws[0]).assign(**at))
     curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
     return (
         pd.DataFrame(rows).assign(model="before").reindex(columns=AGING_LAWS.names()),
@@ -104,6 +112,7 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
             "rival": law in rivals,
             "criterion": law.bic - best.bic,
             "scatter_rel": law.scatter,
+            "lack_of_fit_p": law.lack_of_fit_p(),
             "heldout_series": errors.get("series", np.nan),
             "heldout_last_day": errors.get("last_day", np.nan),
         }
@@ -190,7 +199,18 @@ def law_of(
     if "aging_days" not in steady_fit.columns:
         raise RequestError("this rig ages no rubber.", fix="Name aging_days in the config's condition.")
     levels = shared_levels(steady, steady_fit)
-    known = _quantities(levels)
+    rubber = rubber_of(_quantities(levels), quantity)
+    return laws_of(aged_values(levels, rubber, quantity), name)
+
+
+def rubber_of(known: Sequence[tuple[str, str]], quantity: str) -> str:
+    """Return the one rubber of a quantity among the known (rubber, quantity).
+
+    Raises
+    ------
+    RequestError
+        If the quantity is not there, or of several rubbers.
+    """
     rubbers = [rubber for rubber, own in known if own == quantity]
     if not rubbers:
         there = ", ".join(dict.fromkeys(own for _, own in known)) or "none"
@@ -199,9 +219,19 @@ def law_of(
         raise RequestError(
             f"there are several rubbers: {', '.join(rubbers)}.", fix="Analyse them one by one."
         )
+    return rubbers[0]
+
+
+def laws_of(aged: Aged, name: str | None = None) -> list[JointLaw]:
+    """Return the laws of one quantity in order of BIC, or only a named one.
+
+    Raises
+    ------
+    RequestError
+        If there is no such law, or it cannot be fitted.
+    """
     if name is not None and name not in LOSSES:
         raise RequestError(f"there is no law '{name}'.", fix=f"Choose one of: {', '.join(LOSSES)}.")
-    aged = aged_values(levels, rubbers[0], quantity)
     try:
         return fit_laws(aged) if name is None else fit_laws(aged, (name,))
     except FitError as error:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import fdtrc, stdtrit
 
 from sealfit.effects import aging_laws
 from sealfit.errors import FitError
@@ -54,6 +54,11 @@ class Aged:
     variance : ndarray, shape (n,) or (n, n), or None
         Measurement variance or covariance of the values; the scatter between specimens is estimated and
         added. None if it is 0.
+    size : ndarray, shape (n,), or None
+        Values to which that scatter is relative; None for the values themselves.
+    replicates_df, level_df : float
+        Degrees of freedom of a variance estimated from replicates, of differences between values and of their
+        common level; 0 if it is known otherwise.
     """
 
     days: np.ndarray
@@ -61,12 +66,15 @@ class Aged:
     temperature_C: np.ndarray | None = None
     compression_pct: np.ndarray | None = None
     variance: np.ndarray | None = None
+    size: np.ndarray | None = None
+    replicates_df: float = 0.0
+    level_df: float = 0.0
 
     def part(self, keep: np.ndarray) -> Aged:
         """Return the values in a mask, shape (n,)."""
         taken = {
             name: None if getattr(self, name) is None else getattr(self, name)[keep]
-            for name in ("temperature_C", "compression_pct")
+            for name in ("temperature_C", "compression_pct", "size")
         }
         variance = self.variance
         if variance is not None:
@@ -81,16 +89,22 @@ class Aged:
         scatter : float
             Relative standard deviation between specimens, beyond the measured variance.
         about : ndarray, shape (n,), optional
-            Values to which it is relative; default the measured ones.
+            Values to which it is relative without `size`; default the measured ones.
         """
         measured = np.zeros(self.value.size) if self.variance is None else self.variance
-        own = (scatter * (self.value if about is None else about)) ** 2 + TINY
+        about = self.value if about is None else about
+        own = (scatter * (about if self.size is None else self.size)) ** 2 + TINY
         return (np.diag(measured) if measured.ndim == 1 else measured) + np.diag(own)
 
     @cached_property
     def spread(self) -> Spread:
         """The covariance as a function of the scatter."""
-        return Spread(self.covariance(0.0), np.abs(self.value))
+        return Spread(self.covariance(0.0), self.scale)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Values to which the scatter is relative, shape (n,)."""
+        return np.abs(self.value) if self.size is None else self.size
 
     def drivers(self) -> tuple[str, ...]:
         """Return the names of the coefficients in ln k of the variables that were varied."""
@@ -227,14 +241,27 @@ class JointLaw:
     bic: float
 
     @property
-    def df(self) -> int:
-        """Values less parameters."""
-        return self.aged.value.size - self.x.size
+    def df(self) -> float:
+        """Degrees of freedom of intervals of the law's values: those of the scatter that they contain."""
+        return self._df(self.aged.level_df)
+
+    def _df(self, of_replicates: float) -> float:
+        left = self.aged.value.size - self.x.size
+        return left if self.scatter > 0 else of_replicates or left
 
     @property
     def t(self) -> float:
-        """Student's quantile of 95 % intervals."""
+        """Student's quantile of 95 % intervals of the law's values."""
         return float(stdtrit(max(self.df, 1), 0.975))
+
+    def lack_of_fit_p(self) -> float:
+        """Return the p-value of the law's lack of fit against the replicates (F test); nan without them."""
+        error, left = self.aged.replicates_df, self.aged.value.size - self.x.size
+        if not (error > 0 and left > 0):
+            return np.nan
+        x = solved(self, self.aged.spread.whitening(0.0), self.x)
+        chi2 = self.aged.spread.chi2(self.aged.value - self.at(self.aged, x), 0.0)
+        return float(fdtrc(left, error, chi2 / left))
 
     def at(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
         """Return the law at other conditions, shape (n,), or (..., n) for x of shape (..., p)."""
@@ -285,8 +312,9 @@ class JointLaw:
 
     def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
         """Yield name, value, ends of the 95 % interval, and whether the values determine it."""
+        t = float(stdtrit(max(self._df(self.aged.replicates_df), 1), 0.975))
         for k, name in enumerate(self.names):
-            half = self.t * float(np.sqrt(self.covariance[k, k]))
+            half = (self.t if name == "mu_0" else t) * float(np.sqrt(self.covariance[k, k]))
             if name in self.loss.parameters:
                 low, high = (float(np.exp(np.clip(self.x[k] + s * half, -700, 700))) for s in (-1, 1))
                 yield name, float(np.exp(self.x[k])), low, high, bool(2 * half < KNOWN)
@@ -330,7 +358,7 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
         x = solved(empty, aged.spread.whitening(scatter), x)
         residual = aged.value - empty.at(aged, x)
         chi2 = partial(aged.spread.chi2, residual)
-        before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), residual / aged.value)
+        before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), residual / aged.scale)
         if abs(scatter - before) <= CONVERGED * before:
             break
     bic = aged.spread.chi2(aged.value - empty.at(aged, x), scatter) + aged.spread.log_determinant(scatter)

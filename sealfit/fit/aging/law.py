@@ -78,7 +78,13 @@ class Values:
     value: np.ndarray  # (n,)
     origin: np.ndarray  # (n,) int: number of the value's mu_0
     curve: np.ndarray  # (n,) int: number of its curve, -1 for unaged rubber
-    covariance: np.ndarray  # (n, n), 0 between conditions
+    covariance: np.ndarray  # (n, n)
+    # (n,), values to which the scatter between specimens is relative; None: the law's own
+    size: np.ndarray | None = None
+    # degrees of freedom of a covariance estimated from replicates, of differences between values and of their
+    # common level; 0 if it is known otherwise
+    replicates_df: float = 0.0
+    level_df: float = 0.0
 
     @property
     def origins(self) -> int:
@@ -92,7 +98,7 @@ class Values:
 
     @cached_property
     def whitening(self) -> np.ndarray:
-        """W with W C W' = 1, shape (n, n); block diagonal, as only adjacent values are correlated."""
+        """W with W C W' = 1, shape (n, n); block diagonal where only adjacent values are correlated."""
         n = self.value.size
         linked = np.abs(self.covariance) > 0
         reach = np.array([np.flatnonzero(row)[-1] for row in linked])
@@ -114,7 +120,14 @@ class Values:
             np.unique(self.origin[keep], return_inverse=True)[1],
             np.where(curve >= 0, numbered, -1),
             self.covariance[np.ix_(keep, keep)],
+            None if self.size is None else self.size[keep],
+            self.replicates_df,
+            self.level_df,
         )
+
+    def scale(self, model: np.ndarray) -> np.ndarray:
+        """Return the values to which the scatter is relative, shape (n,), given the law's."""
+        return np.abs(model) if self.size is None else self.size
 
 
 @dataclass(frozen=True)
@@ -258,12 +271,13 @@ def _rescan(found: LawFit) -> np.ndarray | None:
 def between_scatter(values: Values) -> tuple[float, LawFit]:
     """Return the relative scatter of a quantity's values beyond their covariance, and the fit without it.
 
-    The variance of every value is increased by (scatter times the law)^2; the estimate is Paule and Mandel's.
+    The variance of every value is increased by (scatter times the law or `size`)^2; the estimate is Paule and
+    Mandel's.
     """
     plain = fit_law(values)
     if plain.df <= 0 or plain.chi2 <= plain.df:
         return 0.0, plain
-    scale = np.abs(plain.model)
+    scale = values.scale(plain.model)
 
     def chi2(tau: float) -> float:
         covariance = values.covariance + np.diag((tau * scale) ** 2)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc, ndtri, stdtrit
+from scipy.special import chdtrc, fdtrc, ndtri, stdtrit
 
 from sealfit.fit.aging.law import LawFit
 from sealfit.fit.aging.law_profiles import CurveInterval
@@ -47,14 +47,24 @@ class OneQuantity:
     series: int  # number of series with a law
 
     @property
-    def df(self) -> int:
-        """Degrees of freedom of the intervals."""
-        return self.alone.df
+    def df(self) -> float:
+        """Degrees of freedom of the intervals of a, b and c: those of the scatter that they contain."""
+        return self.alone.df if self.tau > 0 else self.alone.values.replicates_df or self.alone.df
+
+    @property
+    def level_df(self) -> float:
+        """Degrees of freedom of the intervals of mu_0 and of the law's values."""
+        return self.alone.df if self.tau > 0 else self.alone.values.level_df or self.alone.df
 
     @property
     def t(self) -> float:
-        """Student's quantile of 95 % intervals."""
-        return float(stdtrit(self.df, 0.975) if self.df > 0 else ndtri(0.975))
+        """Student's quantile of 95 % intervals of a, b and c."""
+        return t_of_95(self.df)
+
+
+def t_of_95(df: float) -> float:
+    """Return Student's quantile of 95 % intervals; the normal one without degrees of freedom."""
+    return float(stdtrit(df, 0.975) if df > 0 else ndtri(0.975))
 
 
 @dataclass(frozen=True)
@@ -87,13 +97,13 @@ class Estimate:
             return float(np.sqrt(gradient @ self.covariance @ gradient))
 
 
-def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, t: float, df: float) -> Iterator[dict]:
-    """Return the rows of mu_0, a, b and c; `t` is Student's quantile, of `df` degrees of freedom."""
+def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, df: float) -> Iterator[dict]:
+    """Return the rows of mu_0, a, b and c; `df` are the degrees of freedom of mu_0's interval."""
     mu_0, a, u = found.x
     unit = curve.unit
     se = np.sqrt(np.diag(found.covariance))
     b, se_c = np.exp(u), found.error_of_c()
-    beside = "" if df > 0 else NO_SCATTER
+    beside, t = "" if df > 0 else NO_SCATTER, t_of_95(df)
     move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # the rest is rounding
     judged = _judge(curve, a, b, ends)
     limits = {"mu_0": (mu_0 - t * se[0], mu_0 + t * se[0]), "a": ends.a, "b": ends.b, "c": ends.c}
@@ -183,29 +193,42 @@ def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Itera
     chi2 = float(squares[own[part]].sum() + squares[unaged[part]].sum() / share)
     own_df = float(own.sum() - 2 + (unaged.sum() - 1) / share)
     shown = own | unaged
-    error = joint.model[shown] / values.value[shown] - 1
-    p = float(chdtrc(own_df, chi2)) if own_df > 0 else np.nan
+    error = (joint.model - values.value)[shown] / values.scale(values.value)[shown]
+    replicates = values.replicates_df
+    p = np.nan
+    if own_df > 0:
+        p = float(fdtrc(own_df, replicates, chi2 / own_df) if replicates else chdtrc(own_df, chi2))
     reason = ""
     if not own_df > 0:
         reason = "as many parameters as days: the law cannot disagree with them."
+    elif p < SIGNIFICANT and replicates:
+        reason = (
+            "the means deviate from the law by more than replicates scatter: the law is wrong, or conditions "
+            f"differ by more than they should (by {100 * tau:.2g} %). The intervals include this."
+        )
     elif p < SIGNIFICANT:
         reason = (
             f"the values scatter about the law by {100 * tau:.2g} % more than their errors: "
             "specimens differ, or the law is wrong. The intervals include this; replicate specimens would "
             "distinguish the two."
         )
-    name = curve.quantity
+    name, known = curve.quantity, "replicates" if values.size is not None else "steady fits"
     for statistic, value, its_unit, why in (
-        ("chi2", chi2, "", "against the steady fits' covariance alone"),
+        ("chi2", chi2, "", f"against the covariance of the {known} alone"),
         ("df", own_df, "", "this series' share, mu_0 being shared"),
         ("lack_of_fit_p", p, "", reason),
         (
             "specimen_sd_pct",
             100 * tau,
             "%",
-            "scatter between specimens beyond the steady fits, all series together",
+            f"scatter beyond that of the {known}, all series together",
         ),
-        ("error_df", quantity.df, "", "degrees of freedom of the intervals' Student t, all series together"),
+        (
+            "error_df",
+            quantity.level_df,
+            "",
+            "degrees of freedom of intervals of the law's values, all series together",
+        ),
         ("max_error_pct", 100 * np.abs(error).max(), "%", "largest error of the law over the days tested"),
         ("rmse", np.sqrt(np.mean((joint.model - values.value)[shown] ** 2)), curve.unit, ""),
         ("n_days", shown.sum(), "", "days tested, day 0 included"),

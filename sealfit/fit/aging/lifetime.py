@@ -356,6 +356,7 @@ def answer(
         )
     found = {"law": law.loss.name, "way": law.acts_on, "form": law.loss.form, "criterion": law.bic}
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
+    found["lack_of_fit_p"] = _finite(law.lack_of_fit_p())
     if years is not None:
         celsius, *ends = temperature_for(law, goal, years, compression_pct)
         low, high = ends_of(law.aged.temperature_C[law.aged.days > 0])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from scipy.special import ndtri, stdtrit
 
 from sealfit.config import Config
 from sealfit.fit.aging.law import LawFit, Values, between_scatter, fit_law
@@ -19,6 +19,7 @@ from sealfit.fit.aging.law_table import (
     covariance_rows,
     law_rows,
     statistics_rows,
+    t_of_95,
     without_law,
 )
 from sealfit.fit.steady.condition import FULL
@@ -114,7 +115,9 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
         number,
         steady_covariance(used, values_of(own, "covariance")),
     )
-    return list(_rubber_rows(values, curves, fitted, used, own))
+    known = values_of(own, "sensor_shift")
+    moved = [known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)]
+    return list(rubber_rows(values, curves, fitted, np.nan_to_num(np.array(moved, float))))
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
@@ -177,23 +180,34 @@ def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -
 
 def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Values:
     """Return values with specimen scatter in the covariance, correlated in a condition as the residuals."""
-    relative = (values.value - model) / model
+    scale = values.scale(model)
+    relative = (values.value - model) / scale
     tau = np.array(taus)[values.origin]
     near = values.covariance != 0
     link = near & (values.origin[:, None] != values.origin[None, :])
     correlation = 0.0
     if link.any() and min(taus) > 0:
-        cross = (np.outer(relative, relative) - values.covariance / np.outer(model, model))[link].mean()
+        cross = (np.outer(relative, relative) - values.covariance / np.outer(scale, scale))[link].mean()
         correlation = float(np.clip(cross / np.prod(taus), -0.9, 0.9))  # below 1, so that it is invertible
-    added = np.outer(tau * model, tau * model) * (np.eye(len(tau)) + correlation * link)
-    return Values(values.days, values.value, values.origin, values.curve, values.covariance + added)
+    added = np.outer(tau * scale, tau * scale) * (np.eye(len(tau)) + correlation * link)
+    return replace(values, covariance=values.covariance + added)
 
 
 # ---------------------------------------------------------------- table
-def _rubber_rows(
-    values: Values, curves: list[Curve], fitted: list[str], used: pd.DataFrame, own: pd.DataFrame
-) -> Iterator[dict]:
-    """Yield the rows of a rubber: `used` are the fitted values, `own` all rows of its steady fits."""
+def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndarray) -> Iterator[dict]:
+    """Yield the rows of table `aging_fit` of one rubber.
+
+    Parameters
+    ----------
+    values : Values
+        The fitted values.
+    curves : list of Curve
+        All curves, those without a law too.
+    fitted : list of str
+        Quantities with a law, in the order of `values.origin`.
+    moved : ndarray, shape (n,)
+        Change of the values if the sensor reads one standard uncertainty too high.
+    """
     quantities = {}
     model = np.empty(values.value.size)
     for q, name in enumerate(fitted):
@@ -204,26 +218,22 @@ def _rubber_rows(
         model[part] = alone.model
     joint = fit_law(_with_specimens(values, [one.tau for one in quantities.values()], model))
     intervals = curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))
-    shift = _shift(joint, used, own)
+    shift = _shift(joint, moved)
     for curve in curves:
         if curve.place < 0:
             yield from without_law(curve)
             continue
         one = quantities[curve.quantity]
         found = Estimate.of(joint, curve, fitted.index(curve.quantity), shift)
-        yield from law_rows(curve, found, intervals[curve.place], one.t, one.df)
+        yield from law_rows(curve, found, intervals[curve.place], one.level_df)
         yield from statistics_rows(curve, joint, one)
         yield from covariance_rows(curve, found.covariance)
 
 
-def _shift(joint: LawFit, used: pd.DataFrame, own: pd.DataFrame) -> np.ndarray:
-    """Return the change of parameters, shape (p,), if the sensor reads one standard uncertainty too high."""
-    known = values_of(own, "sensor_shift")
-    moved = np.array(
-        [known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)], float
-    )
+def _shift(joint: LawFit, moved: np.ndarray) -> np.ndarray:
+    """Return the change of parameters, shape (p,), for a change of the values, shape (n,)."""
     white = joint.values.whitening
-    weighted = (white @ joint.jacobian).T @ (white @ np.nan_to_num(moved))
+    weighted = (white @ joint.jacobian).T @ (white @ moved)
     return np.where(np.isfinite(joint.covariance), joint.covariance, 0.0) @ weighted
 
 
@@ -279,7 +289,7 @@ def _curve(
             value = known["covariance", f"{names[j]},{names[i]}"]
             covariance[i, j] = covariance[j, i] = value if np.isfinite(value) else 0.0
     df = known["statistics", f"{quantity}:error_df"]
-    t = stdtrit(df, 0.975) if df > 0 else ndtri(0.975)
+    t = t_of_95(df)
     if days is None:
         days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
     days = np.asarray(days, float)

@@ -96,11 +96,12 @@ def draw_aging(
         )
     ax.xaxis.set_major_locator(round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
-    ax.set_ylabel(
-        "friction coefficient"
-        if "mu_s" in quantities or "mu_c" in quantities
-        else plain(units.label("force_N"))
-    )
+    if "mu_s" in quantities or "mu_c" in quantities:
+        ax.set_ylabel("friction coefficient")
+    elif {"F_s", "F_c"} & set(quantities):
+        ax.set_ylabel(plain(units.label("force_N")))
+    elif len(quantities) == 1:  # a property
+        ax.set_ylabel(plain(units.label(quantities[0])))
 
 
 def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
@@ -146,7 +147,9 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         alt += f"{symbol_plain(quantities[0])} starts at {number(first)}."
         panels.append(Panel(short(names(name)), alt, draw))
     legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
-    legend += [Key("fit per condition, 95 %", FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
+    of_property = len(tables.get("property_values", ())) > 0
+    of_point = "mean of a condition, 95 %" if of_property else "fit per condition, 95 %"
+    legend += [Key(of_point, FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
     if len(before):
         legend.append(Key("before, without the effects", FLOOR, "dotted"))
     return Plot("aging", "Aging", tuple(panels), tuple(legend), note)

@@ -1,0 +1,238 @@
+r"""The aging law of a property measured on specimens: strength, hardness, compression set, ...
+
+Specimens of one condition are replicates. Specimens scatter independently, and those of a batch have a
+deviation in common, which is no pure error: a specimen of condition c and batch b has
+
+.. math:: y = \mu(t_c) + B_b + \varepsilon, \qquad \mathrm{Var}\, B_b = \sigma_B^2, \quad
+    \mathrm{Var}\, \varepsilon = \sigma^2
+
+Both variances are estimated by restricted maximum likelihood (REML) with a free mean for every condition, so
+that no law is assumed. The law is fitted to these means, which are generalised least-squares estimates
+(Searle, Casella & McCulloch 1992, Variance Components, chapters 6 and 8).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import minimize_scalar
+from scipy.special import stdtrit
+
+from sealfit.config import Config
+from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, law_tables, laws_of, rubber_of
+from sealfit.fit.aging.joint_law import Aged, JointLaw
+from sealfit.fit.aging.law import Values
+from sealfit.fit.aging.law_table import DAYS_FOR_LAW, Curve, without_law
+from sealfit.fit.aging.series import SMALLEST, aging_curves, rubber_rows
+from sealfit.tables import AGING_FIT
+
+# Largest ratio of the variance between batches to that between specimens that is searched.
+MOST_RATIO = 1e6
+# Smaller singular values of the batches within conditions are rounding.
+ROUNDING = 1e-9
+# Smallest variance. It keeps the weights finite if all values are zero.
+TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means of one property of one rubber over specimens and batches, by condition.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row per condition: `series`, `condition`, the condition columns, `value`, and `n`, its specimens.
+    covariance : ndarray, shape (n, n)
+        Covariance of the means.
+    specimen_sd, batch_sd : float
+        Standard deviations between specimens of one condition and batch, and between batches; nan where
+        these values do not determine them.
+    df, level_df : float
+        Degrees of freedom of the covariance of differences between means, and of their common level
+        (Satterthwaite); 0 without replicates.
+    """
+
+    table: pd.DataFrame
+    covariance: np.ndarray
+    specimen_sd: float
+    batch_sd: float
+    df: float
+    level_df: float
+
+    @property
+    def size(self) -> np.ndarray:
+        """Values to which further scatter is relative: the root mean square of all, shape (n,)."""
+        value = self.table["value"].to_numpy(float)
+        return np.full(value.size, np.sqrt(np.mean(value**2)) or 1.0)
+
+    def half_width(self) -> np.ndarray:
+        """Return half the width of the 95 % intervals of the means, shape (n,); nan without replicates."""
+        if not self.level_df:
+            return np.full(len(self.table), np.nan)
+        return stdtrit(self.level_df, 0.975) * np.sqrt(np.diag(self.covariance))
+
+    def aged(self) -> Aged:
+        """Return the means as the data of a law for all series."""
+
+        def column(name: str) -> np.ndarray | None:
+            known = name in self.table and self.table[name].notna().any()
+            return self.table[name].to_numpy(float) if known else None
+
+        days, value = (self.table[name].to_numpy(float) for name in ("aging_days", "value"))
+        scatter = self.covariance, self.size, self.df, self.level_df
+        return Aged(days, value, column(TEMPERATURE), column(COMPRESSION), *scatter)
+
+
+def means_of(specimens: pd.DataFrame) -> Means:
+    """Return the means of one property of one rubber, and their covariance.
+
+    Parameters
+    ----------
+    specimens : DataFrame
+        Rows of table `property_values` of one rubber and property.
+    """
+    specimens = specimens.assign(batch=specimens["batch"].fillna(""))
+    specimen, batch, df = _variances(specimens)
+    cells = specimens.groupby(["condition", "batch"], sort=True)["value"].agg(["mean", "size"]).reset_index()
+    conditions = specimens.groupby("condition", sort=True)
+    table = conditions.first().drop(columns=["value", "batch"]).reset_index()
+    table["n"] = conditions.size().to_numpy()
+
+    named = cells["batch"].to_numpy(str)
+    same = (named[:, None] == named[None, :]) & (named != "")[:, None]
+    shared = np.where(same, np.nan_to_num(batch), 0.0)
+    rounding = SMALLEST**2 * np.mean(cells["mean"].to_numpy(float) ** 2) + TINY
+    of_cells = shared + np.diag(np.nan_to_num(specimen) / cells["size"].to_numpy(float) + rounding)
+    member = pd.get_dummies(cells["condition"], dtype=float)[table["condition"]].to_numpy()
+    weighted = np.linalg.solve(of_cells, member).T
+    covariance = np.linalg.inv(weighted @ member)
+    gain = covariance @ weighted
+    table["value"] = gain @ cells["mean"].to_numpy(float)
+
+    share = _batch_shares(gain @ shared @ gain.T, covariance)
+    contrast_df, level_df = (_satterthwaite(own, df) for own in share)
+    return Means(table, covariance, float(np.sqrt(specimen)), float(np.sqrt(batch)), contrast_df, level_df)
+
+
+def _batch_shares(shared: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Return the shares of the batches in the variances of differences between means, and of their level."""
+    n = len(shared)
+    weight = np.linalg.solve(covariance, np.ones(n))
+    level = float(weight @ shared @ weight / (weight @ covariance @ weight))
+    if n < 2:
+        return 0.0, level
+    contrasts = np.linalg.svd(np.ones((1, n)))[2][1:]
+    part, whole = contrasts @ shared @ contrasts.T, contrasts @ covariance @ contrasts.T
+    return float(np.clip(np.trace(np.linalg.solve(whole, part)) / (n - 1), 0.0, 1.0)), level
+
+
+def _satterthwaite(share: float, df: tuple[int, int]) -> float:
+    """Return the degrees of freedom of a variance of which the batches have a share; 0 without replicates."""
+    if not df[0]:
+        return 0.0
+    return 1 / ((1 - share) ** 2 / df[0] + (share**2 / df[1] if df[1] else 0.0))
+
+
+def _variances(specimens: pd.DataFrame) -> tuple[float, float, tuple[int, int]]:
+    """Return the variances between specimens and between batches, and their degrees of freedom.
+
+    A variance that the values do not determine is nan. The means of the conditions have no influence.
+    """
+    value, condition, batch = specimens["value"].astype(float), specimens["condition"], specimens["batch"]
+    df = len(value) - condition.nunique()
+    left = (value - value.groupby(condition).transform("mean")).to_numpy(float)
+    member = pd.get_dummies(batch[batch != ""], dtype=float).reindex(specimens.index, fill_value=0.0)
+    within = (member - member.groupby(condition).transform("mean")).to_numpy(float)
+    u, d, _ = np.linalg.svd(within, full_matrices=False)
+    kept = d > ROUNDING
+    u, d = u[:, kept], d[kept]
+    scores = u.T @ left
+    rest = float(left @ left - scores @ scores)
+    if df <= 0:
+        return np.nan, np.nan, (0, 0)
+    if d.size == 0:
+        return rest / df, np.nan, (df, 0)
+    if df == d.size:  # one specimen of each batch and condition
+        return np.nan, np.nan, (0, 0)
+
+    def variance(ratio: float) -> float:
+        return (rest + float(np.sum(scores**2 / (1 + ratio * d**2)))) / df
+
+    def deviance(log_ratio: float) -> float:
+        ratio = np.exp(log_ratio)
+        return float(np.sum(np.log1p(ratio * d**2)) + df * np.log(max(variance(ratio), 1e-300)))
+
+    found = minimize_scalar(deviance, bounds=(-np.log(MOST_RATIO), np.log(MOST_RATIO)), method="bounded")
+    ratio = float(np.exp(found.x)) if found.fun < deviance(-np.log(MOST_RATIO)) else 0.0
+    return variance(ratio), ratio * variance(ratio), (df - d.size, d.size)
+
+
+def fit_properties(specimens: pd.DataFrame, config: Config) -> dict[str, pd.DataFrame]:
+    """Return tables `aging_fit`, `aging_curves`, `aging_laws` and `master_curve` of properties.
+
+    Parameters
+    ----------
+    specimens : DataFrame
+        Table `property_values`.
+    config : Config
+        Names the condition columns.
+    """
+    rows, found = [], {}
+    for (rubber, quantity), own in specimens.groupby(["rubber", "quantity"], sort=True):
+        means, unit = means_of(own), str(own["unit"].iloc[0])
+        rows += [{"rubber": rubber, **row} for row in _law_per_series(means, quantity, unit)]
+        found[rubber, quantity] = (means.aged(), unit)
+    open_columns = [name for name in config.series_columns if name in specimens]
+    keys = specimens.groupby("series", sort=True)[open_columns].first().reset_index()
+    columns = [*AGING_FIT.names(), *open_columns]
+    fit = pd.DataFrame(rows).merge(keys, on="series", how="left").reindex(columns=columns)
+    laws, curve = law_tables(found)
+    return {"aging_fit": fit, "aging_curves": aging_curves(fit), "aging_laws": laws, "master_curve": curve}
+
+
+def laws_of_property(specimens: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
+    """Return the laws of one property for all series in order of BIC, or only a named one.
+
+    Parameters
+    ----------
+    specimens : DataFrame
+        Table `property_values`.
+    quantity : str
+        Name of the property.
+    name : str, optional
+        Name of the law.
+
+    Raises
+    ------
+    RequestError
+        If there is no such property or law, several rubbers, or too few conditions.
+    """
+    pairs = specimens[["rubber", "quantity"]].drop_duplicates()
+    rubber = rubber_of(list(pairs.itertuples(index=False, name=None)), quantity)
+    own = specimens[(specimens["rubber"] == rubber) & (specimens["quantity"] == quantity)]
+    return laws_of(means_of(own).aged(), name)
+
+
+def _law_per_series(means: Means, quantity: str, unit: str) -> list[dict]:
+    table = means.table
+    days, series = table["aging_days"].to_numpy(float), table["series"]
+    columns = [name for name in (TEMPERATURE, COMPRESSION) if name in table]
+    order = table[days > 0].sort_values(columns, kind="stable")["series"] if columns else series[days > 0]
+    curves, place = [], 0
+    for name in dict.fromkeys(order):
+        tested = np.unique(days[(series == name) & (days > 0)])
+        enough = tested.size + bool((days == 0).any()) >= DAYS_FOR_LAW
+        curves.append(Curve(name, quantity, place if enough else -1, tested, bool((days == 0).any()), unit))
+        place += enough
+    if not place:
+        return [row for curve in curves for row in without_law(curve)]
+    places = {curve.series: curve.place for curve in curves}
+    number = np.array([-1 if day == 0 else places[name] for day, name in zip(days, series, strict=True)])
+    kept = (days == 0) | (number >= 0)
+    values = Values(
+        days, table["value"].to_numpy(float), np.zeros(days.size, int), number, means.covariance, means.size,
+        means.df, means.level_df,
+    ).part(kept)  # fmt: skip
+    return list(rubber_rows(values, curves, [quantity], np.zeros(int(kept.sum()))))

@@ -1,0 +1,164 @@
+"""A table of property values of specimens: strength, hardness, ... over aging time, without traces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.errors import CampaignError, Fault
+from sealfit.ingest.categorical import Columns, keys_of, known, where
+from sealfit.ingest.columns import suggestion
+from sealfit.ingest.derived_columns import (
+    NUMBERS,
+    in_our_units,
+    out_of_range,
+    to_values,
+    with_computed,
+    with_day_0,
+)
+from sealfit.ingest.listing import Entries, read_table
+from sealfit.store.manifest import BATCH
+
+DAYS = "aging_days"
+# Columns of numbers that are no property.
+NO_PROPERTY = (*NUMBERS, "repeat", "stroke", "run_order", "elapsed_h")
+# Columns that are read as labels.
+LABELS = ("specimen_id", "run_id", "file", "started_at", BATCH)
+
+
+def read_properties(
+    path: Path, config: Config, properties: Sequence[str] = (), batch: str = BATCH
+) -> tuple[pd.DataFrame, list[Fault]]:
+    """Return table `property_values`, and what was found that does not stop the fit.
+
+    Parameters
+    ----------
+    path : Path
+        The table: CSV, Excel or Parquet; a row per specimen with `aging_days`, the other condition columns
+        and a column per property.
+    config : Config
+        Names, units and computed columns are those of a table of runs: `files.runs_columns`, `runs.compute`.
+        Condition columns that the table lacks are not needed.
+    properties : sequence of str
+        Columns of the properties; by default the only column of numbers that is no condition.
+    batch : str
+        Column that names the batch of a specimen.
+
+    Raises
+    ------
+    CampaignError
+        With every fault at once: a table that cannot be read, a missing column, cells that are no numbers.
+    """
+    table = path.name
+    lines, columns, faults = read_table(path.parent, table, config, needed=None)
+    if not lines and not faults:
+        raise _stop(table, "no_rows", "has a header but no rows.", "Write one row per specimen.")
+    entries = Entries([table] * len(lines), lines, table)
+    columns = with_day_0(in_our_units(columns, config.conversions("runs")), _of_table(config, columns))
+    words = {name: columns.pop(name) for name in {*LABELS, batch} if name in columns}
+    columns, found = to_values(entries, columns, config)
+    faults += found
+    columns, found = with_computed(entries, columns, config)
+    faults += found
+    if DAYS not in columns:
+        fix = suggestion(DAYS, [*columns, *words]) + " Name it in files.runs_columns of a --config."
+        raise _stop(table, "missing_column", "there is no such column.", fix.strip(), line=1, column=DAYS)
+    config = _of_table(config, columns)
+    try:
+        chosen = _properties(table, columns, config, properties)
+    except CampaignError as error:  # a cell that is no number may be the reason
+        raise CampaignError([*(f for f in faults if f.severity != "info"), *error.faults]) from error
+    if batch != BATCH and batch not in words:
+        fix = suggestion(batch, [*columns, *words])
+        raise _stop(table, "missing_column", "there is no such column.", fix, line=1, column=batch)
+    faults += out_of_range(entries, columns) + _lacking(entries, columns, config)
+    if stopping := [f for f in faults if f.severity == "error" and f.action == "stopped"]:
+        raise CampaignError(stopping)
+    made = pd.concat([_rows(columns, words, lines, config, name, batch) for name in chosen])
+    usable = made["value"].notna()
+    faults += _left_out(entries, made[~usable])
+    if not (made["aging_days"][usable] > 0).any():
+        fix = f"Give values of aged specimens: {DAYS} above 0."
+        raise _stop(table, "nothing_left", "holds no value of an aged specimen.", fix)
+    return made[usable].reset_index(drop=True), faults
+
+
+def _of_table(config: Config, columns: Columns) -> Config:
+    """Return the config with the condition columns that the table has."""
+    there = [name for name in config.condition if name in columns or name == DAYS]
+    rubber = [name for name in config.rubber if name in columns]
+    return config.model_copy(update={"condition": [*dict.fromkeys([*there, DAYS])], "rubber": rubber})
+
+
+def _properties(table: str, columns: Columns, config: Config, named: Sequence[str]) -> list[str]:
+    """Return the columns of the properties, those that are named or the only one that may be one."""
+    numbers = [
+        name
+        for name, cells in columns.items()
+        if name not in (*NO_PROPERTY, *config.condition, *config.rubber)
+        and known(cells).any()
+        and not where(cells, lambda value: isinstance(value, str)).any()
+    ]
+    for name in named:
+        if name not in numbers:
+            what = "is no column of numbers." if name in columns else "there is no such column."
+            raise _stop(table, "missing_column", what, suggestion(name, numbers), line=1, column=name)
+    if named:
+        return list(dict.fromkeys(named))
+    if len(numbers) == 1:
+        return numbers
+    if not numbers:
+        fix = "Add one of numbers, or correct the cells that are none."
+        raise _stop(table, "missing_column", "there is no column of a property.", fix, line=1)
+    reason = f"which column is the property is not said: {', '.join(numbers)}."
+    raise _stop(table, "missing_column", reason, f"Name it, or several: --property {numbers[0]}.", line=1)
+
+
+def _lacking(entries: Entries, columns: Columns, config: Config) -> list[Fault]:
+    """Return faults of aged specimens without a value in a condition column."""
+    aged = ~where(columns[DAYS], lambda value: value == 0)
+    faults = []
+    for name in config.condition:
+        for i in np.flatnonzero(aged & ~known(columns[name])).tolist():
+            fix = "Fill it: it is one of the config's condition columns."
+            faults.append(entries[i].fault("empty_cell", "the cell is empty.", name, value="", fix=fix))
+    return faults
+
+
+def _rows(
+    columns: Columns, words: Columns, lines: list[int], config: Config, name: str, batch: str
+) -> pd.DataFrame:
+    """Return the rows of one property, values that are missing included."""
+    conditions = {key: columns[key] for key in config.condition}
+    keys = keys_of({**conditions, **{key: columns[key] for key in config.rubber}}, len(lines), config)
+    values = pd.Series(columns[name], dtype=float)
+    return pd.DataFrame(
+        {
+            **keys,
+            **conditions,
+            "quantity": name,
+            "value": values,
+            "unit": config.units.of(name),
+            "batch": words.get(batch, [None] * len(lines)),
+            "line": lines,
+        }
+    )
+
+
+def _left_out(entries: Entries, rows: pd.DataFrame) -> list[Fault]:
+    """Return a finding for every row without a value."""
+    at = {line: i for i, line in enumerate(entries.lines or [])}
+    place = {"severity": "info", "action": "row left out", "fix": ""}
+    return [
+        entries[at[row.line]].fault("empty_cell", "the cell is empty.", row.quantity, value="", **place)
+        for row in rows.itertuples()
+    ]
+
+
+def _stop(table: str, check: str, reason: str, fix: str, **place) -> CampaignError:
+    return CampaignError([replace(Fault(check, reason, fix=fix, **place), file=table)])
