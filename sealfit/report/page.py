@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from importlib.resources import files
 from pathlib import PurePath
 
@@ -15,6 +17,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
 from sealfit.report import page
+from sealfit.report.drawing import Drawn, data_uri, draw
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
 from sealfit.report.loop_tables import (
@@ -37,7 +40,7 @@ from sealfit.report.notation import (
     true_units,
 )
 from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
-from sealfit.report.style import Drawn, Plot, data_uri, draw
+from sealfit.report.style import Plot
 from sealfit.report.summary import of_properties
 from sealfit.report.summary_lines import LACKING, property_sentences, values_clause
 from sealfit.report.words import left_over, undecided, verdict, with_left_channels
@@ -262,7 +265,8 @@ def build_report(
         figures = {name: draw(plot) for name, plot in plots.items()}
     images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
     html = _environment().from_string(_text("template.html")).render(
-        style=Markup(_text("style.css")), plots=images, **content
+        style=Markup(_text("style.css")), script=Markup(_text("report.js")), plots=images,
+        script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(), **content
     )  # fmt: skip
     return Report(html, figures)
 

@@ -1,12 +1,9 @@
-"""Style of the plots, their conversion to SVG and PNG, and the selection of panels in large campaigns."""
+"""Style and layout of the plots, and the selection of panels in large campaigns."""
 
 from __future__ import annotations
 
-import io
 import math
 import re
-import warnings
-from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -394,55 +391,3 @@ def _handle(key: Key) -> Line2D | Patch:
         )
     style = {"line": "-", "dotted": ":", "dashed": "--"}[key.mark]
     return Line2D([], [], color=key.colour, linestyle=style, label=label)
-
-
-# ---------------------------------------------------------------- drawn
-# Plots as SVG and PNG files, and each panel as a separate SVG for the page.
-
-CSS = 96
-"""Pixels of a page in an inch."""
-
-
-@dataclass(frozen=True)
-class Image:
-    """A panel as the page shows it: SVG, and its size in CSS pixels."""
-
-    svg: str
-    width: int
-    height: int
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A plot as SVG, as PNG, and its panels."""
-
-    svg: str
-    png: bytes
-    panels: tuple[Image, ...]
-
-
-def draw(plot: Plot) -> Drawn:
-    """Return a plot, drawn; equal plots give equal bytes."""
-    whole = compose(plot)
-    panels = tuple(
-        Image(_svg(panel_figure(panel)), round(CSS * WIDTH), round(CSS * panel.height))
-        for panel in plot.panels
-    )
-    return Drawn(_svg(whole), _saved(whole, "png", {"Software": None}), panels)
-
-
-def data_uri(text: str) -> str:
-    """Return SVG as a data URI."""
-    return "data:image/svg+xml;base64," + b64encode(text.encode()).decode()
-
-
-def _svg(figure: Figure) -> str:
-    return _saved(figure, "svg", {"Date": None, "Creator": None}).decode()
-
-
-def _saved(figure: Figure, form: str, metadata: dict) -> bytes:
-    buffer = io.BytesIO()
-    with look(), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # the SVG has it as text
-        figure.savefig(buffer, format=form, metadata=metadata)
-    return buffer.getvalue()

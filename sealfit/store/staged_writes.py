@@ -19,7 +19,7 @@ from sealfit.units import Units
 if TYPE_CHECKING:
     import pandas as pd
 
-    from sealfit.report.style import Drawn
+    from sealfit.report.drawing import Drawn
 
 STAGING = ".staging-"
 PARQUET = ".parquet"

@@ -1,5 +1,6 @@
-"""The page in a browser: nothing is wider than the window, and every image shows."""
+"""The page in a browser: nothing is wider than the window, every image shows, and its script works."""
 
+import html
 import json
 import re
 import shutil
@@ -23,8 +24,43 @@ frame.onload = () => {
   const page = frame.contentDocument, images = [...page.images], root = page.documentElement;
   const boxes = [...page.querySelectorAll("body *")].filter(e => !e.closest(".box") && !e.closest("pre"));
   const right = Math.ceil(Math.max(...boxes.map(e => e.getBoundingClientRect().right)));
-  const shown = images.filter(i => i.complete && i.naturalWidth > 0).length;
-  document.title = ["measured", root.clientWidth, root.scrollWidth, right, shown, images.length].join(" ");
+  const drawings = [...page.querySelectorAll(".panels svg")], all = images.length + drawings.length;
+  const shown = images.filter(i => i.complete && i.naturalWidth > 0).length
+    + drawings.filter(d => d.getBoundingClientRect().width > 100).length;
+  document.title = ["measured", root.clientWidth, root.scrollWidth, right, shown, all].join(" ");
+};
+frame.srcdoc = PAGE;
+document.body.append(frame);
+</script>"""
+
+# Drives the page, whose own rules hold, from the page around it.
+DRIVE = """<!doctype html><title>not measured</title><body><script>
+const frame = document.createElement("iframe");
+frame.style.width = "1200px";
+frame.style.height = "2000px";
+frame.onload = () => {
+  const page = frame.contentDocument, found = {};
+  const tip = page.querySelector(".tip"), point = page.querySelector("svg use[data-text]");
+  const box = point.getBoundingClientRect();
+  const at = { clientX: box.x + box.width / 2, clientY: box.y + box.height / 2, bubbles: true };
+  found.hidden = frame.contentWindow.getComputedStyle(tip).visibility;
+  point.closest("svg").dispatchEvent(new frame.contentWindow.PointerEvent("pointermove", at));
+  found.shown = frame.contentWindow.getComputedStyle(tip).visibility;
+  found.tip = tip.textContent;
+  const head = page.querySelector("th.n.sorts"), table = head.closest("table");
+  const column = () => [...table.tBodies[0].rows].map(row => row.cells[head.cellIndex].textContent.trim());
+  head.click();
+  found.rising = column();
+  head.dispatchEvent(new frame.contentWindow.KeyboardEvent("keydown", { key: "Enter" }));
+  found.falling = column();
+  found.sort = head.getAttribute("aria-sort");
+  frame.contentWindow.Blob = function (parts) { found.csv = parts.join(""); };
+  frame.contentWindow.URL.createObjectURL = () => "blob:none";
+  frame.contentWindow.HTMLAnchorElement.prototype.click = function () { found.name = this.download; };
+  [...page.querySelectorAll("#errors .tools button")].find(b => b.textContent === "CSV").click();
+  const ids = [...page.querySelectorAll("[id]")].map(e => e.id);
+  found.single = new Set(ids).size === ids.length;
+  document.title = "driven " + JSON.stringify(found);
 };
 frame.srcdoc = PAGE;
 document.body.append(frame);
@@ -33,14 +69,12 @@ document.body.append(frame);
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium on PATH")
 
 
-@pytest.mark.parametrize("width", [1400, 400])
+@pytest.mark.parametrize("width", [1400, 800, 400])
 @pytest.mark.parametrize("make", [aging_campaign, torque_campaign, not_run])
 def test_nothing_overflows_and_every_image_shows(make, width, tmp_path):
-    html = html_of(make)
-    page = tmp_path / "frame.html"
-    text = json.dumps(html).replace("</", "<\\/")
-    page.write_text(FRAME.replace("WIDTH", str(width)).replace("PAGE", text), "utf-8")
-    client, scroll, right, shown, images = measured(page, tmp_path)
+    shown = loaded(FRAME.replace("WIDTH", str(width)), html_of(make), tmp_path)
+    found = re.search(r"<title>measured (\d+) (\d+) (\d+) (\d+) (\d+)</title>", shown)
+    client, scroll, right, shown, images = map(int, found.groups())
     assert client == width
     assert scroll <= width
     assert right <= width
@@ -52,14 +86,52 @@ def html_of(make):
     return build_report(*make().arguments).html
 
 
-def measured(page, folder):
+def test_points_speak_tables_sort_and_are_saved(tmp_path):
+    shown = loaded(DRIVE, html_of(aging_campaign), tmp_path)
+    found = json.loads(html.unescape(re.search(r"<title>driven (.*?)</title>", shown, re.S)[1]))
+    assert (found["hidden"], found["shown"]) == ("hidden", "visible")
+    assert re.match(r"(before|after): .* N\n", found["tip"])
+    rising = [float(text.replace("\u2212", "-")) for text in found["rising"]]
+    assert len(rising) > 1
+    assert rising == sorted(rising)
+    assert [float(text.replace("\u2212", "-")) for text in found["falling"]] == sorted(rising, reverse=True)
+    assert found["sort"] == "descending"
+    assert found["name"] == "Errors_before_and_after.csv"
+    lines = found["csv"].removeprefix("\ufeff").splitlines()
+    assert len({line.count(",") for line in lines if '"' not in line}) == 1
+    assert found["single"]
+
+
+def test_without_scripts_the_page_is_whole(tmp_path):
+    inert = html_of(aging_campaign).replace("<script>", '<script type="text/plain">')
+    shown = loaded(FRAME.replace("WIDTH", "1200"), inert, tmp_path)
+    images = re.search(r"<title>measured 1200 1200 \d+ (\d+) (\d+)</title>", shown)
+    assert images[1] == images[2] == str(html_of(aging_campaign).count("<img"))
+
+
+def test_the_page_prints(tmp_path):
+    page, printed = tmp_path / "page.html", tmp_path / "page.pdf"
+    page.write_text(html_of(aging_campaign), "utf-8")
+    browsed(page, tmp_path, f"--print-to-pdf={printed}")
+    assert printed.read_bytes().startswith(b"%PDF")
+
+
+def loaded(around, page, folder):
+    """Return what a browser made of a page in another one, where it stands for PAGE."""
+    path = folder / "frame.html"
+    path.write_text(around.replace("PAGE", json.dumps(page).replace("</", "<\\/")), "utf-8")
+    return browsed(path, folder)
+
+
+def browsed(page, folder, *options):
+    """Return the page after its scripts, which may print nothing to the console."""
     command = [
         BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
         "--hide-scrollbars",
         "--disable-background-networking", "--disable-component-update", "--disable-sync",
-        f"--user-data-dir={folder / 'profile'}", "--window-size=1600,2000", "--dump-dom", page.as_uri(),
+        f"--user-data-dir={folder / 'profile'}", "--window-size=1600,2000", "--enable-logging=stderr",
+        *options, "--dump-dom", page.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    found = re.search(r"<title>measured (\d+) (\d+) (\d+) (\d+) (\d+)</title>", done.stdout)
-    assert found, done.stderr[-2000:]
-    return [int(group) for group in found.groups()]
+    assert "CONSOLE" not in done.stderr, done.stderr[-2000:]
+    return done.stdout

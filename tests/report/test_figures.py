@@ -13,6 +13,7 @@ from report.made_campaigns import Made, aging_campaign, not_run, torque_campaign
 from report.made_tables import DROP, empty, shapes, table
 
 from sealfit.config import Config
+from sealfit.report.drawing import draw
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.aging import (
     draw_aging,
@@ -31,7 +32,7 @@ from sealfit.report.figures.residual import (
     run_means,
 )
 from sealfit.report.figures.speed import curve_lines, force_speed, run_points
-from sealfit.report.style import Key, Panel, Plot, compose, draw, is_logarithmic, panel_figure, value_ticks
+from sealfit.report.style import Key, Panel, Plot, compose, is_logarithmic, panel_figure, value_ticks
 from sealfit.units import Units
 
 TORQUE = Units(
@@ -197,7 +198,7 @@ def test_trace_shades_its_steady_window(ax):
 def test_scaled_days_are_plain_numbers(ax):
     known = {"kind": "value", "quantity": "mu_s", "temperature_C": 60.0, "compression_ratio_pct": 80.0}
     rows = pd.DataFrame({**known, "scaled_days": [0.0, 1.0, 30.0], "value": [0.9, 0.8, 0.7], "lo95": np.nan})
-    rows = rows.assign(hi95=np.nan)
+    rows = rows.assign(hi95=np.nan, aging_days=[0.0, 1.0, 30.0])
     draw_master_curve(ax, rows, {60.0: "#0072B2"}, Units())
     ax.figure.draw_without_rendering()
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0", "1", "10"]

@@ -7,11 +7,12 @@ from report.made_tables import table
 
 from sealfit.config import Config
 from sealfit.report import page
+from sealfit.report.drawing import draw
 from sealfit.report.figures.aging import aging
 from sealfit.report.figures.speed import force_speed
 from sealfit.report.page import build_report
 from sealfit.report.parameter_tables import break_away_rows, parameter_tables
-from sealfit.report.style import condition_misfits, draw, spread, telling
+from sealfit.report.style import condition_misfits, spread, telling
 
 TEMPERATURES = (20, 30, 40, 50, 60, 70, 80)
 

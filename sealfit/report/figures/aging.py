@@ -10,12 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from sealfit.config import Config
+from sealfit.report.drawing import explain
 from sealfit.report.notation import (
     ConditionNames,
     count,
     given,
     is_unaged,
     joined,
+    measured,
     number,
     plain,
     short,
@@ -85,7 +87,7 @@ def draw_aging(
         spread = np.nan_to_num(
             np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float)
         )
-        ax.errorbar(
+        markers, *_ = ax.errorbar(
             here["aging_days"],
             here["value"],
             np.abs(spread),
@@ -94,6 +96,7 @@ def draw_aging(
             elinewidth=0.8,
             capsize=1.5,
         )
+        explain(markers, [_of_point(row) for row in here.to_dict("records")])
     ax.xaxis.set_major_locator(round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
     if "mu_s" in quantities or "mu_c" in quantities:
@@ -102,6 +105,11 @@ def draw_aging(
         ax.set_ylabel(plain(units.label("force_N")))
     elif len(quantities) == 1:  # a property
         ax.set_ylabel(plain(units.label(quantities[0])))
+
+
+def _of_point(row: Mapping) -> str:
+    value, interval = measured(row["value"], row["lo95"], row["hi95"])
+    return f"{symbol_plain(row['quantity'])} {value} {interval}\n{given(row['aging_days'])} d"
 
 
 def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
@@ -343,7 +351,7 @@ def draw_master_curve(
         marker = (
             MARKERS[int(np.searchsorted(percents, percent)) % len(MARKERS)] if np.isfinite(percent) else "o"
         )
-        ax.plot(
+        (points,) = ax.plot(
             own["scaled_days"],
             own["value"],
             linestyle="",
@@ -351,6 +359,13 @@ def draw_master_curve(
             markersize=4,
             color=colours.get(celsius, BLACK),
         )
+        place = ", ".join(
+            f"{given(value)} {unit}"
+            for value, unit in ((celsius, "°C"), (percent, "%"))
+            if np.isfinite(value)
+        )
+        texts = zip(own["value"], own["aging_days"], strict=True)
+        explain(points, [f"{number(value, 4)}\n{place}, {given(days)} d" for value, days in texts])
     quantity = str(rows["quantity"].iloc[0])
     ax.set_xlabel(f"{SCALED} ({plain(units.of('aging_days'))})")
     ax.set_ylabel(symbol_math(quantity))

@@ -10,6 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
+from sealfit.report.drawing import explain
 from sealfit.report.figures.speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.notation import (
     by_gain,
@@ -263,7 +264,7 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     for stage, colour, marker, shift in (("before", BEFORE, "o", -apart), ("after", AFTER, "s", apart)):
         spread = Z95 * rows[f"{stage}_se_N"].fillna(0.0).to_numpy(float)
         places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
-        ax.errorbar(
+        points, *_ = ax.errorbar(
             places,
             mean,
             spread,
@@ -279,6 +280,12 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
             zorder=2 if stage == "before" else 3,
             rasterized=len(rows) > MOST_MARKS,
         )
+        if len(rows) <= MOST_MARKS:
+            names = [number(value, 4) for value in x] if numeric else categories(rows, channel)
+            texts = (f"{number(m, 3)} ± {number(s, 2)}" for m, s in zip(mean, spread, strict=True))
+            place, unit = channel_label(channel, units), units.unit("force")
+            said = zip(texts, names, strict=True)
+            explain(points, [f"{stage}: {value} {unit}\n{place}: {name}" for value, name in said])
     if log:
         log_axis(ax)
     elif numeric:

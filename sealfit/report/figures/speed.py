@@ -10,6 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
+from sealfit.report.drawing import explain
 from sealfit.report.notation import (
     ConditionNames,
     channel_words,
@@ -50,6 +51,7 @@ from sealfit.units import Units
 # Force against speed: a panel per series, every condition with its model, band and run means.
 
 MOST_CURVES = 24  # in one panel
+MOST_FILES = 4  # named under the pointer
 MOST_COLOURS = 10  # in one panel; with more, each condition has its own, or numbers are thinned
 TALL = 3.1  # inches, where one or two panels hold everything
 LOG_SPAN = 20.0  # speeds that span this factor are drawn on a logarithmic axis
@@ -101,7 +103,7 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
             backward = len(curve) and curve["direction"].iloc[0] < 0
             ax.plot(curve["speed"], curve["after"], color=line.colour, linestyle="--" if backward else "-")
         for direction, points in line.points.groupby("direction") if len(line.points) else ():
-            ax.errorbar(
+            drawn, *_ = ax.errorbar(
                 points["speed"],
                 points["force"],
                 points["sd"].fillna(0.0),
@@ -114,12 +116,21 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
                 capsize=0.0 if dense else 1.5,
                 rasterized=dense,
             )
+            if not dense:
+                explain(drawn, [_of_run(row, line.label, units) for row in points.to_dict("records")])
     if log:
         log_axis(ax)
     else:
         ax.set_xlim(left=0.0)
     ax.set_xlabel(plain(units.label("speed_mm_s")))
     ax.set_ylabel(plain(units.label("force_N")))
+
+
+def _of_run(row: Mapping, condition: str, units: Units) -> str:
+    scatter = f" ± {number(row['sd'], 2)}" if np.isfinite(row["sd"]) else ""
+    force = f"{number(row['force'], 4)}{scatter} {units.unit('force')}, {count(int(row['n']), 'file')}"
+    speed = f"{given(row['speed'])} {units.unit('speed')}"
+    return "\n".join([force, f"{condition}, {speed}", row["run_id"], row["files"]])
 
 
 def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
@@ -233,6 +244,10 @@ def run_points(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     runs = files.groupby(level=["condition", "run_id", "direction"], sort=False)
     found = runs["speed"].mean().to_frame()
     found["force"], found["sd"], found["n"] = runs["force"].mean(), runs["force"].std(), runs["force"].size()
+    names = files.index.to_frame(index=False).groupby(["condition", "run_id", "direction"], sort=False)[
+        "file"
+    ]
+    found["files"] = names.agg(lambda own: ", ".join(spread(list(own), MOST_FILES)))
     return found.reset_index()
 
 
