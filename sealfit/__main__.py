@@ -1,6 +1,19 @@
-"""python -m sealfit."""
+"""The program `sealfit`, also as `python -m sealfit`."""
 
-from sealfit.cli import main
+import sys
+
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
+
+def main() -> None:
+    """Run the command line; Ctrl-C ends it with one line while it is still loading, too."""
+    try:
+        from sealfit import cli
+    except KeyboardInterrupt:
+        print("sealfit: interrupted; nothing was begun.", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    cli.main()
+
 
 if __name__ == "__main__":
     main()

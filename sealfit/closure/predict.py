@@ -184,7 +184,7 @@ def _conditions(
         if name not in known:
             like = conditions.index[(conditions["series"] == series) & (conditions["rubber"] == rubber)]
             lawful = [c for c in like if declared.index["a_c"][c] >= 0]
-            if not lawful or not days.iloc[k] >= 0:
+            if not lawful or not 0 <= days.iloc[k] < np.inf:
                 notes[k].append(
                     f"condition {name} was not tested and has no fitted aging law: give a tested condition, "
                     "or other days of a tested series with three or more days"

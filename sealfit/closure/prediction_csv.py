@@ -126,8 +126,25 @@ def _numbers(cells: pd.Series) -> pd.Series:
     return cells.where(~missing, None)
 
 
+def _no_formula(cell: str) -> str:
+    """Return a cell of the points as it is, with an apostrophe before what a spreadsheet would execute.
+
+    Examples
+    --------
+    >>> _no_formula("=cmd()"), _no_formula("-2.5"), _no_formula("-A1"), _no_formula("oil")
+    ("'=cmd()", '-2.5', "'-A1", 'oil')
+    """
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}" if cell.lstrip()[:1] in ("=", "+", "-", "@") and cell.strip() else cell
+    return cell
+
+
 def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
     """Write the given rows and their predictions to `output`, completely or not at all; return the counts.
+
+    The cells of the points are written unchanged, except those that a spreadsheet would take as a formula.
 
     Raises
     ------
@@ -141,8 +158,9 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
     if output.exists() and not output.is_file():  # a device would be replaced by a file
         what = "a folder" if output.is_dir() else "no file"
         raise RequestError(f"--output {output} is {what}.", fix="Give a file name.")
-    # `answers` has the same rows in the same order; the cells of the points are written unchanged.
-    table = pd.concat([points.text, answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
+    # `answers` has the same rows in the same order.
+    table = pd.concat([points.text.map(_no_formula), answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
+    table.columns = [_no_formula(name) for name in table.columns]
     staged = output.with_name(f".{output.name}.{os.getpid()}")
     try:
         table.to_csv(staged, index=False, encoding="utf-8", lineterminator="\n")

@@ -1,0 +1,46 @@
+"""The program's entry, and what `predict` writes."""
+
+import builtins
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+
+from sealfit import __main__
+from sealfit.closure.prediction_csv import ANSWERS, read_points, write_answers
+
+
+def test_ctrl_c_while_the_program_loads_is_one_line_and_130(monkeypatch, capsys):
+    def interrupted(name, *rest, _import=builtins.__import__):
+        if name == "sealfit" and "cli" in (rest[2] or ()):
+            raise KeyboardInterrupt
+        return _import(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        __main__.main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "sealfit: interrupted; nothing was begun.\n"
+
+
+def test_python_m_sealfit_is_the_program():
+    done = subprocess.run([sys.executable, "-m", "sealfit", "--version"], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stdout.startswith("sealfit ")
+
+
+def test_what_is_written_holds_no_formula_and_all_numbers(tmp_path):
+    asked = tmp_path / "points.csv"
+    rows = ["oil,=x,speed_mm_s", "=cmd(),+1.5,-3", "@sum,-A1,-2.5e-3", " -x,a=b,1"]
+    asked.write_text("\n".join(rows) + "\n", "utf-8")
+    points = read_points(asked)
+    answers = pd.DataFrame({name: [0.0] * 3 for name in ANSWERS})
+    write_answers(points, answers, tmp_path / "answers.csv")
+    written = [line.split(",")[:3] for line in (tmp_path / "answers.csv").read_text("utf-8").splitlines()]
+    assert written == [
+        ["oil", "'=x", "speed_mm_s"],
+        ["'=cmd()", "+1.5", "-3"],
+        ["'@sum", "'-A1", "-2.5e-3"],
+        ["' -x", "a=b", "1"],
+    ]
