@@ -26,12 +26,16 @@ class DaskHere:
         How many, of one thread each.
     paths : tuple of Path
         Where the workers find modules beside those that are installed.
+    protocol : str
+        "tcp", or "tls" with its options in the environment.
     """
 
-    def __init__(self, folder: Path, workers: int = 2, paths: tuple[Path, ...] = ()) -> None:
+    def __init__(
+        self, folder: Path, workers: int = 2, paths: tuple[Path, ...] = (), protocol: str = "tcp"
+    ) -> None:
         self.file, self._paths = folder / "scheduler.json", paths
         self._log = (folder / "log.txt").open("w")
-        scheduler = "--host 127.0.0.1 --port 0 --no-dashboard --scheduler-file"
+        scheduler = f"--host {protocol}://127.0.0.1 --port 0 --no-dashboard --scheduler-file"
         self.scheduler = self._start("dask_scheduler", f"{scheduler} {self.file}")
         worker = (
             f"--scheduler-file {self.file} --nthreads 1 --no-nanny --no-dashboard --local-directory {folder}"

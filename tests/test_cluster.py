@@ -2,7 +2,10 @@
 
 import json
 import os
+import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -181,6 +184,42 @@ def campaign(tmp_path_factory):
         patch.setattr(loop, "JACKKNIFE_UNITS", 6)  # so that the folds search, few runs as there are
         run(folder / "c", folder / "here", steps=STEPS[:-1], workers=1)
     return folder / "c", results(folder / "here")
+
+
+OPENSSL = shutil.which("openssl")
+
+
+@pytest.mark.skipif(OPENSSL is None, reason="no openssl on PATH to make a certificate")
+def test_over_tls_only_who_has_the_certificate_connects(campaign, tmp_path, monkeypatch):
+    key, cert = tmp_path / "key.pem", tmp_path / "cert.pem"
+    make = f"req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=here -keyout {key} -out {cert}"
+    subprocess.run([OPENSSL, *make.split()], check=True, capture_output=True)
+    ours = {"REQUIRE_ENCRYPTION": "true", "TLS__CA_FILE": cert}
+    for role in ("SCHEDULER", "WORKER", "CLIENT"):
+        ours |= {f"TLS__{role}__CERT": cert, f"TLS__{role}__KEY": key}
+    with monkeypatch.context() as patch:
+        for name, value in ours.items():
+            patch.setenv(f"DASK_DISTRIBUTED__COMM__{name}", str(value))
+        made = DaskHere(tmp_path, workers=1, protocol="tls")
+        own = dict(os.environ)
+    others = {name: value for name, value in own.items() if not name.startswith("DASK_")}
+    try:
+        until = time.monotonic() + 60
+        while not made.file.exists() and time.monotonic() < until:
+            time.sleep(0.2)
+        assert json.loads(made.file.read_text("utf-8"))["address"].startswith("tls://")
+        command = [sys.executable, "-m", "sealfit", "check", str(campaign[0]), "--scheduler", str(made.file)]
+        plain = [*command[:-1], json.loads(made.file.read_text("utf-8"))["address"].replace("tls", "tcp")]
+        inside, outside, bare = (
+            subprocess.run(asked, env=environment, capture_output=True, text=True, timeout=120)
+            for asked, environment in ((command, own), (command, others), (plain, own))
+        )
+    finally:
+        made.stop()
+    assert inside.returncode == 0, inside.stderr
+    assert outside.returncode == bare.returncode == 1
+    assert "asks for a certificate, and none is set here" in outside.stderr
+    assert "is not encrypted" in bare.stderr
 
 
 def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(

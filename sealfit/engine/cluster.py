@@ -159,6 +159,7 @@ class Cluster:
 
 def _connected(scheduler: str) -> Client:
     try:
+        from dask import config as settings
         from distributed import Client
     except ImportError as error:
         raise RequestError("Dask is not installed.", fix="Run: pip install 'sealfit[cluster]'") from error
@@ -176,6 +177,17 @@ def _connected(scheduler: str) -> Client:
     if place is None:
         raise RequestError(
             f"'{scheduler}' is not an address of a scheduler.", fix=f"Write {EXAMPLE}, or its file."
+        )
+    encrypted = address.startswith("tls://")
+    if encrypted and settings.get("distributed.comm.tls.ca-file", None) is None:
+        raise RequestError(
+            f"{address} asks for a certificate, and none is set here.",
+            fix="Set Dask's TLS options as for the scheduler: see docs/how-to/cluster.md.",
+        )
+    if not encrypted and settings.get("distributed.comm.require-encryption", None):
+        raise RequestError(
+            f"{address} is not encrypted, and Dask's options here ask for it.",
+            fix="Give the scheduler's tls:// address, or unset require-encryption.",
         )
     try:  # checked first, because a client without a scheduler blocks for a minute
         socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
