@@ -36,7 +36,18 @@ def test_changes_are_what_is_new_other_or_gone(tmp_path):
     found = changes(tmp_path, known, Files())
     assert found.keys() == {"other.csv", "touched.csv", "gone.csv"}
     assert found["gone.csv"] == Fingerprint()
-    assert found["touched.csv"] == known["touched.csv"]._replace(mtime_ns=7)
+    ctime = found["touched.csv"].ctime_ns
+    assert found["touched.csv"] == known["touched.csv"]._replace(mtime_ns=7, ctime_ns=ctime)
     assert found["other.csv"].sha256 != known["other.csv"].sha256
     globbed = parse_config("[files]\nglob = '*.csv'", "rig")
     assert changes(tmp_path, known, globbed.files).keys() == found.keys() | {"new.csv"}
+
+
+def test_a_changed_file_whose_time_was_set_back_is_seen(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("1.25", "utf-8")
+    known = {"a.csv": fingerprint(path)}
+    path.write_text("7.25", "utf-8")
+    os.utime(path, ns=(known["a.csv"].mtime_ns, known["a.csv"].mtime_ns))
+    assert path.stat().st_mtime_ns == known["a.csv"].mtime_ns
+    assert changes(tmp_path, known, Files())["a.csv"].sha256 != known["a.csv"].sha256

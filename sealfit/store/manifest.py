@@ -44,11 +44,16 @@ UNSEEN = {
 
 
 class Fingerprint(NamedTuple):
-    """Size in bytes, time of last change in ns, and SHA-256 of one file; all None for a missing file."""
+    """Size in bytes, times of last change in ns, and SHA-256 of one file; all None for a missing file.
+
+    `mtime_ns` is that of the content, which programs may set; `ctime_ns` is that of the content or the entry,
+    which they may not.
+    """
 
     size: int | None = None
     mtime_ns: int | None = None
     sha256: str | None = None
+    ctime_ns: int | None = None
 
 
 Fingerprints = dict[str, Fingerprint]  # by file name
@@ -64,18 +69,19 @@ def fingerprint(path: Path | str) -> Fingerprint:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return Fingerprint()
-    return Fingerprint(status.st_size, status.st_mtime_ns, digest)
+    return Fingerprint(status.st_size, status.st_mtime_ns, digest, status.st_ctime_ns)
 
 
 def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
     """Return the fingerprint of a file from its bytes and its status."""
-    return Fingerprint(status.st_size, status.st_mtime_ns, hashlib.sha256(raw).hexdigest())
+    digest = hashlib.sha256(raw).hexdigest()
+    return Fingerprint(status.st_size, status.st_mtime_ns, digest, status.st_ctime_ns)
 
 
 def changes(folder: Path, known: Fingerprints, files: Files) -> dict[str, Fingerprint]:
     """Return the current fingerprints of a campaign's trace files that are new or differ from those `known`.
 
-    A file is read only if its size or time differ from those known. New ones are those that the glob of
+    A file is read only if its size or a time differ from those known. New ones are those that the glob of
     `files` finds.
     """
     place, changed = os.path.join(folder, ""), []
@@ -85,7 +91,11 @@ def changes(folder: Path, known: Fingerprints, files: Files) -> dict[str, Finger
         except OSError:
             changed.append(file)
             continue
-        if (status.st_size, status.st_mtime_ns) != mark[:2]:
+        if (status.st_size, status.st_mtime_ns, status.st_ctime_ns) != (
+            mark.size,
+            mark.mtime_ns,
+            mark.ctime_ns,
+        ):
             changed.append(file)
     changed += [file for file in glob_names(folder, files) if file not in known]
     return {file: fingerprint(place + file) for file in changed}
