@@ -92,7 +92,7 @@ def test_a_run_gives_every_table_with_its_schema(first):
         assert schema.names[: len(fixed)] == [column.name for column in fixed]
         assert [schema.field(column.name).type for column in fixed] == [column.dtype for column in fixed]
         assert all(schema.field(column.name).metadata[b"meaning"] for column in fixed)
-    assert {path.suffix for path in (out / "plots").iterdir()} == {".png", ".svg"}
+    assert {path.suffix for path in (out / "plots").iterdir()} == {".pdf", ".png", ".svg"}
     assert "<html" in (out / "report.html").read_text("utf-8")[:2000].lower()
 
 

@@ -1,4 +1,4 @@
-"""Plots as SVG and PNG files, and each panel as a separate SVG for the page, with a text for every point."""
+"""Plots as SVG, PNG and PDF files, and each panel as an SVG for the page, with a text for every point."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from sealfit.report.style import WIDTH, Plot, compose, look, panel_figure
 
 CSS = 96
 """Pixels of a page in an inch."""
+PRINT = 300
+"""Pixels of a PNG file in an inch."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,11 @@ class Image:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A plot as SVG, as PNG, and its panels."""
+    """A plot as SVG, as PNG and as PDF, and its panels."""
 
     svg: str
     png: bytes
+    pdf: bytes
     panels: tuple[Image, ...]
 
 
@@ -45,7 +48,9 @@ def draw(plot: Plot) -> Drawn:
         Image(_svg(panel_figure(panel)), round(CSS * WIDTH), round(CSS * panel.height))
         for panel in plot.panels
     )
-    return Drawn(_svg(whole), _saved(whole, "png", {"Software": None}), panels)
+    png = _saved(whole, "png", {"Software": None}, dpi=PRINT)
+    pdf = _saved(whole, "pdf", {"CreationDate": None, "Creator": None, "Producer": None})
+    return Drawn(_svg(whole), png, pdf, panels)
 
 
 def data_uri(text: str) -> str:
@@ -95,9 +100,9 @@ def _with_titles(svg: str, name: str, texts: Sequence[str]) -> str:
     return svg[:start] + group + svg[end:]
 
 
-def _saved(figure: Figure, form: str, metadata: dict) -> bytes:
+def _saved(figure: Figure, form: str, metadata: dict, **options) -> bytes:
     buffer = io.BytesIO()
     with look(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # the SVG has it as text
-        figure.savefig(buffer, format=form, metadata=metadata)
+        figure.savefig(buffer, format=form, metadata=metadata, **options)
     return buffer.getvalue()

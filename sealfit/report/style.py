@@ -206,7 +206,7 @@ BEFORE, AFTER, FLOOR, QUIET = VERMILION, BLUE, "#5f6670", "#8a9099"
 
 WIDTH = 3.55  # inches of one panel: 340 px of a page, so its text is as large as the page's small print
 HEIGHT = 2.55
-DPI = 150  # a half-page plot stays sharp in print
+DPI = 150  # of a figure on a screen
 _EDGE, _BOTTOM, _TOP = 0.14, 0.5, 0.32  # inches around the axes
 
 RC = {

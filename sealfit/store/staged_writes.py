@@ -50,8 +50,9 @@ class Staged:
         self._write(name, lambda path: path.write_bytes(text.encode("utf-8")))
 
     def figure(self, name: str, figure: Drawn) -> None:
-        """Write a drawn figure as `plots/<name>.png` and `.svg`."""
+        """Write a drawn figure as `plots/<name>.png`, `.pdf` and `.svg`."""
         self._write(f"plots/{name}.png", lambda path: path.write_bytes(figure.png))
+        self._write(f"plots/{name}.pdf", lambda path: path.write_bytes(figure.pdf))
         self.text(f"plots/{name}.svg", figure.svg)
 
     def folder(self) -> Path:

@@ -35,6 +35,7 @@ def test_settings_of_the_user_change_nothing():
         after = draw(PLOT)
     assert after.svg == before.svg
     assert after.png == before.png
+    assert after.pdf == before.pdf
 
 
 def test_a_matplotlibrc_changes_nothing(tmp_path):
