@@ -97,7 +97,7 @@ def predicted(home: Path, **options) -> pd.Series:
 # ---------------------------------------------------------------- what OUT brings along is not run
 def test_a_folder_named_in_the_model_or_the_state_of_out_is_never_run(home, monkeypatch):
     monkeypatch.setattr(
-        "sealfit.report.drawing._saved", lambda *given: b"<svg/>"
+        "sealfit.report.drawing._saved", lambda *given, **options: b"<svg/>"
     )  # four reports that nobody looks at
     out = home / "out"
     marks = [evil(out / "evil"), evil(home / "elsewhere")]
