@@ -89,6 +89,15 @@ def test_batches_of_one_condition_each_are_no_separate_variance():
     assert means.df == 3 * len(means.table)
 
 
+def test_batches_of_one_specimen_each_are_replicates():
+    table = specimens(law)
+    alone = means_of(table.assign(batch=[f"b{k}" for k in range(len(table))]))
+    plain = means_of(table)
+    assert alone.df == plain.df
+    assert alone.specimen_sd == pytest.approx(plain.specimen_sd)
+    npt.assert_allclose(alone.covariance, plain.covariance, rtol=1e-5, atol=1e-9)
+
+
 def test_the_law_and_its_rate_are_found():
     tables = fit_properties(specimens(law, sd=0.05), Config())
     fit = tables["aging_fit"].set_index(["series", "quantity", "parameter"])

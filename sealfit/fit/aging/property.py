@@ -149,13 +149,12 @@ def _variances(specimens: pd.DataFrame) -> tuple[float, float, tuple[int, int]]:
     kept = d > ROUNDING
     u, d = u[:, kept], d[kept]
     scores = u.T @ left
-    rest = float(left @ left - scores @ scores)
     if df <= 0:
         return np.nan, np.nan, (0, 0)
-    if d.size == 0:
-        return rest / df, np.nan, (df, 0)
-    if df == d.size:  # one specimen of each batch and condition
-        return np.nan, np.nan, (0, 0)
+    if d.size in (0, df):  # no batch is compared with another, or each has one specimen: they are independent
+        return float(left @ left) / df, np.nan, (df, 0)
+
+    rest = float(left @ left - scores @ scores)
 
     def variance(ratio: float) -> float:
         return (rest + float(np.sum(scores**2 / (1 + ratio * d**2)))) / df
