@@ -139,7 +139,7 @@ def _of_property(values: pd.DataFrame, fit: pd.DataFrame, laws: pd.DataFrame) ->
     named = own.set_index(own["parameter"].str.replace(f"{first['quantity']}:", "", regex=False))["value"]
     p_values = named[named.index == "lack_of_fit_p"].dropna() if means.df else named.iloc[:0]
     best = laws[laws["rank"] == 1]
-    energy = best[best["parameter"] == "E"]
+    energy = best[(best["parameter"] == "E") & best["identified"].astype(bool)]
     return {
         "rubber": first["rubber"],
         "quantity": first["quantity"],

@@ -78,9 +78,10 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
 
 def property_lines(properties: Sequence[Mapping]) -> list[str]:
     """Return the lines of properties: their values, their scatter, and how the laws fit them."""
-    found = []
+    found, several = [], len({one["rubber"] for one in properties}) > 1
     for one in properties:
-        found.append(line(one["quantity"], values_clause(one)))
+        of = f"rubber {one['rubber']}: " if several else ""
+        found.append(line(one["quantity"], of + values_clause(one)))
         if clause := lack_of_fit_clause(one["lack_of_fit_p"]):
             found.append(line("", f"law per series: it {clause}"))
         if one["law"]:
@@ -111,6 +112,8 @@ def _property_law(law: Mapping) -> str:
     if law["E"]:
         value, low, high = law["E"]
         text += f", E = {value:.3g} kJ/mol [{low:.3g}, {high:.3g}]"
+    elif "E" in law["drivers"]:
+        text += ", E not identified"
     clause = lack_of_fit_clause(law["lack_of_fit_p"])
     return f"{text}; it {clause}" if clause else text
 

@@ -155,6 +155,15 @@ def test_units_and_order_change_nothing_but_the_scale():
     npt.assert_allclose(scaled["se"][rows], 1e6 * plain["se"][rows], rtol=1e-4)
 
 
+def test_a_rate_that_is_not_determined_is_not_printed():
+    table = specimens(lambda t, day: 100.0)
+    one = summary(table, fit_properties(table, Config()))
+    assert one["law"]["E"] is None
+    assert any("E not identified" in line for line in property_lines([one]))
+    two = [one, {**one, "rubber": "other"}]
+    assert [line for line in property_lines(two) if "rubber other: " in line]
+
+
 def test_too_few_days_give_no_law_and_the_reason():
     fit = fit_properties(specimens(law, days=(0.0, 4.0)), Config())["aging_fit"]
     assert not fit["identified"].any()

@@ -311,15 +311,19 @@ class JointLaw:
         return self.aged.days * (self.rate(self.aged) if self.acts_on == "rate" else 1.0)
 
     def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
-        """Yield name, value, ends of the 95 % interval, and whether the values determine it."""
+        """Yield name, value, ends of the 95 % interval, and whether the values determine it.
+
+        Without a loss (a may be 0) its shape, E and kappa have no meaning.
+        """
         t = float(stdtrit(max(self._df(self.aged.replicates_df), 1), 0.975))
+        lost = bool(abs(self.x[1]) > t * np.sqrt(self.covariance[1, 1]))
         for k, name in enumerate(self.names):
             half = (self.t if name == "mu_0" else t) * float(np.sqrt(self.covariance[k, k]))
             if name in self.loss.parameters:
                 low, high = (float(np.exp(np.clip(self.x[k] + s * half, -700, 700))) for s in (-1, 1))
-                yield name, float(np.exp(self.x[k])), low, high, bool(2 * half < KNOWN)
+                yield name, float(np.exp(self.x[k])), low, high, bool(lost and 2 * half < KNOWN)
             else:
-                known = np.isfinite(half) and (name != "a" or abs(self.x[k]) > half)
+                known = np.isfinite(half) and (lost or name == "mu_0")
                 yield name, float(self.x[k]), float(self.x[k] - half), float(self.x[k] + half), bool(known)
 
 
