@@ -146,7 +146,8 @@ class Parts:
         self._called("report", config)
         assert set(tables) >= {"steady", "steady_fit", "aging_curves", "curves"}
         return SimpleNamespace(
-            html=f"<p>{closure['verdict']}</p>", figures={"one": SimpleNamespace(svg="<svg/>", png=b"PNG")}
+            html=f"<p>{closure['verdict']}</p>",
+            figures={"one": SimpleNamespace(svg="<svg/>", pdf=b"%PDF", png=b"PNG")},
         )
 
     def predict(self, model, points, own):
