@@ -132,10 +132,13 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         note += " steady_fit.parquet and aging_curves.parquet have all."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
     before = tables.get("aging_curves_before", curves.iloc[:0])
+    of_property = len(tables.get("property_values", ())) > 0
+    ends = [points["lo95"], points["hi95"]] if of_property else []  # of means, never without bound
     shown = pd.concat(
-        [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"]]
+        [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"], *ends]
     ).dropna()
-    span = padded(shown.quantile(0.002), shown.quantile(0.998))
+    out = 0.0 if of_property else 0.002  # share of a campaign's values that may lie outside
+    span = padded(shown.quantile(out), shown.quantile(1 - out))
     right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
     unaged = points["series"].map(is_unaged).astype(bool)
     panels = []
@@ -155,7 +158,6 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         alt += f"{symbol_plain(quantities[0])} starts at {number(first)}."
         panels.append(Panel(short(names(name)), alt, draw))
     legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
-    of_property = len(tables.get("property_values", ())) > 0
     of_point = "mean of a condition, 95 %" if of_property else "fit per condition, 95 %"
     legend += [Key(of_point, FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
     if len(before):
