@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,8 +90,9 @@ def read_properties(
 def _of_table(config: Config, columns: Columns) -> Config:
     """Return the config with the condition columns that the table has."""
     there = [name for name in config.condition if name in columns or name == DAYS]
+    condition = there if DAYS in there else [*there, DAYS]
     rubber = [name for name in config.rubber if name in columns]
-    return config.model_copy(update={"condition": [*dict.fromkeys([*there, DAYS])], "rubber": rubber})
+    return config.model_copy(update={"condition": condition, "rubber": rubber})
 
 
 def _properties(table: str, columns: Columns, config: Config, named: Sequence[str]) -> list[str]:
@@ -161,4 +161,4 @@ def _left_out(entries: Entries, rows: pd.DataFrame) -> list[Fault]:
 
 
 def _stop(table: str, check: str, reason: str, fix: str, **place) -> CampaignError:
-    return CampaignError([replace(Fault(check, reason, fix=fix, **place), file=table)])
+    return CampaignError([Fault(check, reason, fix=fix, file=table, **place)])

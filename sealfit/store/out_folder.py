@@ -140,12 +140,13 @@ class Store:
     ) -> Store:
         kept = State.read(out)
         hashes = {} if effects is None else effect_hashes(effects)
-        tables = [None if asked is None else asked.table for asked in (kept and kept.properties, properties)]
-        if kept is None or (not kept.steps and (kept.campaign != campaign or tables[0] != tables[1])):
+        table = properties.table if properties else None
+        former = kept.properties.table if kept and kept.properties else None
+        if kept is None or (not kept.steps and (kept.campaign != campaign or former != table)):
             state = State(campaign, source, properties, effects=hashes)
             return cls(out, state, known=False, kept=kept, effects=effects)
-        if tables[0] != tables[1]:
-            what = f"the campaign {kept.campaign}" if tables[0] is None else f"the table {tables[0]}"
+        if former != table:
+            what = f"the campaign {kept.campaign}" if former is None else f"the table {former}"
             raise OutError(f"holds the results of {what}.", file=out, fix="Choose another --out.")
         store_inputs, moved = kept.inputs, kept.campaign != campaign
         if moved:

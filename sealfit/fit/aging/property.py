@@ -24,8 +24,8 @@ from sealfit.config import Config
 from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, law_tables, laws_of, rubber_of
 from sealfit.fit.aging.joint_law import Aged, JointLaw
 from sealfit.fit.aging.law import Values
-from sealfit.fit.aging.law_table import DAYS_FOR_LAW, Curve, without_law
-from sealfit.fit.aging.series import SMALLEST, aging_curves, rubber_rows
+from sealfit.fit.aging.law_table import without_law
+from sealfit.fit.aging.series import SMALLEST, aging_curves, curves_of, rubber_rows
 from sealfit.tables import AGING_FIT
 
 # Largest ratio of the variance between batches to that between specimens that is searched.
@@ -219,15 +219,10 @@ def _law_per_series(means: Means, quantity: str, unit: str) -> list[dict]:
     days, series = table["aging_days"].to_numpy(float), table["series"]
     columns = [name for name in (TEMPERATURE, COMPRESSION) if name in table]
     order = table[days > 0].sort_values(columns, kind="stable")["series"] if columns else series[days > 0]
-    curves, place = [], 0
-    for name in dict.fromkeys(order):
-        tested = np.unique(days[(series == name) & (days > 0)])
-        enough = tested.size + bool((days == 0).any()) >= DAYS_FOR_LAW
-        curves.append(Curve(name, quantity, place if enough else -1, tested, bool((days == 0).any()), unit))
-        place += enough
-    if not place:
-        return [row for curve in curves for row in without_law(curve)]
+    curves = curves_of(table.assign(quantity=quantity), list(dict.fromkeys(order)), [quantity], unit)
     places = {curve.series: curve.place for curve in curves}
+    if max(places.values()) < 0:
+        return [row for curve in curves for row in without_law(curve)]
     number = np.array([-1 if day == 0 else places[name] for day, name in zip(days, series, strict=True)])
     kept = (days == 0) | (number >= 0)
     values = Values(

@@ -91,7 +91,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     aged = own[own["aging_days"].to_numpy(float) > 0]
     quantities = [name for name in pair if (found["quantity"] == name).any()]
     unit = str(found["unit"].iloc[0])
-    curves = _curves(found, list(dict.fromkeys(aged["series"])), quantities, unit)
+    curves = curves_of(found, list(dict.fromkeys(aged["series"])), quantities, unit)
     place = {(c.series, c.quantity): c.place for c in curves}
     number = np.array(
         [
@@ -133,7 +133,11 @@ def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str
     return found[~((found["parameter"] == pair[1]) & found["condition"].isin(few))]
 
 
-def _curves(found: pd.DataFrame, series: list[str], quantities: list[str], unit: str) -> list[Curve]:
+def curves_of(found: pd.DataFrame, series: list[str], quantities: list[str], unit: str) -> list[Curve]:
+    """Return the curves of some series and quantities; those with enough days are numbered.
+
+    `found` are the values, with their `series`, `quantity` and `aging_days`.
+    """
     unaged = set(found.loc[found["aging_days"] == 0, "quantity"])
     aged = found[found["aging_days"] > 0]
     tested = dict(
