@@ -169,7 +169,7 @@ class Files(Strict):
     compute: dict[str, str] = Field(default_factory=dict)
     """Our column = expression over the parts: `speed_mm_s = "sign * rpm"`."""
     units: dict[str, str] = Field(default_factory=dict)
-    """Unit of a part, or of a column made of parts: `temperature_C = "degF"`."""
+    """Unit of a part, of a column made of parts, or of a header field: `temperature_C = "degF"`."""
     date_format: Annotated[list[str], BeforeValidator(_as_list)] = Field(default_factory=list)
     """Formats of `started_at` as in Python's strptime, one or several, tried in order: `["%d.%m.%Y %H:%M",
     "%d.%m.%Y"]`; then ISO 8601 and Excel's serial numbers. A time with a zone (`%z`) is an instant, one

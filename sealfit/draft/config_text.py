@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from sealfit.draft.columns import Column
 from sealfit.draft.header_lines import When
 from sealfit.draft.vocabulary import Unit
+from sealfit.units import Units
 
 WIDTH = 110  # characters of a comment's line
 
@@ -19,6 +20,7 @@ SECTIONS = (
     "files.columns",
     "files.values",
     "files.compute",
+    "files.units",
     "files.runs_columns",
     "trace",
     "trace.columns",
@@ -82,7 +84,10 @@ class Notes:
 # The one place where a unit or a sign that is not the default, or a date that is not ISO 8601, becomes config
 # lines.
 
-DEFAULT_UNIT = {"time_s": "s", "displacement_mm": "mm", "force_N": "N", "load_N": "N"}
+
+def file_column(name: str | int, unit: Unit | None, ours: str) -> Value:
+    """Return a column of a file as a config writes it: with its unit where that is not the unit of `ours`."""
+    return name if unit is None or unit.name == Units().of(ours) else {"name": name, "unit": unit.name}
 
 
 def column_guesses(
@@ -90,7 +95,7 @@ def column_guesses(
 ) -> tuple[list[Guess], str]:
     """Return the config lines that bring a column into a slot, and the helper column they need, "" for none.
 
-    A column in another unit, or of the other sign, is read under a helper's name and computed.
+    A column of the other sign is read under a helper's name and computed.
 
     Parameters
     ----------
@@ -101,38 +106,16 @@ def column_guesses(
     sign : int
         -1 to change the sign.
     """
-    factor = 1.0 if unit is None else unit.factor
-    if factor == 1.0 and sign > 0:
-        return [Guess(f"trace.columns.{slot}", column.key, evidence)], ""
-    base = slot.rpartition("_")[0]
-    helper = f"{base}_raw" if factor == 1.0 or unit is None else f"{base}_{unit.name}"
-    why = f"from {unit.name} to {DEFAULT_UNIT[slot]}" if helper != f"{base}_raw" else ""
-    if sign < 0:
-        turned = (
-            "with the sign of the motion" if slot == "force_N" else "as a load that presses counts above 0"
-        )
-        why = f"{why}, and {turned}" if why else turned
-    expression = ("-" if sign < 0 else "") + scaled(helper, factor)
+    value = file_column(column.key, unit, slot)
+    if sign > 0:
+        return [Guess(f"trace.columns.{slot}", value, evidence)], ""
+    quantity, _, ours = slot.partition("_")
+    helper = f"{quantity}_raw_{ours}"
+    why = "with the sign of the motion" if slot == "force_N" else "as a load that presses counts above 0"
     return [
-        Guess(f"trace.columns.{helper}", column.key, evidence),
-        Guess(f"trace.compute.{slot}", expression, why),
+        Guess(f"trace.columns.{helper}", value, evidence),
+        Guess(f"trace.compute.{slot}", f"-{helper}", why),
     ], helper
-
-
-def scaled(name: str, factor: float) -> str:
-    """Return the expression of a column times a factor.
-
-    Examples
-    --------
-    >>> scaled("time_ms", 1e-3), scaled("force_kN", 1000.0), scaled("x", 1.0)
-    ('time_ms / 1000', 'force_kN * 1000', 'x')
-    """
-    if factor == 1.0:
-        return name
-    inverse = round(1.0 / factor, 9)
-    if factor < 1.0 and inverse == int(inverse):
-        return f"{name} / {int(inverse)}"
-    return f"{name} * {int(factor) if factor == int(factor) else repr(factor)}"
 
 
 def date_lines(when: When) -> tuple[Guess | None, tuple[str, ...]]:

@@ -111,15 +111,12 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     pattern = _number_pattern(texts)
     after, before = _around(rows, at)
     if after and (said := after_number(re.sub(r"[-_ /]", "", after))):
-        ours, factor = said
-        return _scaled(
-            Part(at, ours, "", pattern, texts, f"'{after}' stands after the number"), factor, before
-        )
+        ours, unit = said
+        why = f"'{after}' stands after the number"
+        return _as_height(Part(at, ours, "", pattern, texts, why, unit=unit), before)
     ours = before_number(before) if before else ""
     if ours and not (ours in NO_COUNTS and _counts_up(texts)):
-        return _scaled(
-            Part(at, ours, "", pattern, texts, f"'{before}' stands before the number"), 1.0, before
-        )
+        return _as_height(Part(at, ours, "", pattern, texts, f"'{before}' stands before the number"), before)
     return Part(
         at, "", "", pattern, texts, f"'{before}' stands before the number" if before else "a bare number"
     )
@@ -160,21 +157,17 @@ def _number_pattern(texts: Sequence[str]) -> str:
     return f"{sign}\\d+(?:{mark}\\d+)?" if marks else f"{sign}\\d+"
 
 
-def _scaled(part: Part, factor: float, before: str) -> Part:
-    """Return the part with the expression that gives our column."""
-    if part.ours == "compression_ratio_pct":
-        largest = max(as_float(text) for text in part.texts)
-        if largest < HEIGHT_FROM and before.lower() not in ("h", "height"):
-            doubt = (
-                f"{', '.join(part.texts[:4])} is taken as how much the rubber was compressed; "
-                "if it is the height that was left, let the part be called compression_ratio_pct"
-            )
-            return replace(part, expression="100 - {}", doubt=doubt)
-    if factor == 1.0:
+def _as_height(part: Part, before: str) -> Part:
+    """Return the part; a number that says how far the rubber was compressed gives the height left."""
+    if part.ours != "compression_ratio_pct" or before.lower() in ("h", "height"):
         return part
-    inverse = round(1.0 / factor, 9)
-    text = f"{{}} / {inverse:g}" if inverse == int(inverse) else f"{{}} * {factor!r}"
-    return replace(part, expression=text if factor != 25.4 / 60 else "{} * 25.4 / 60")
+    if max(as_float(text) for text in part.texts) >= HEIGHT_FROM:
+        return part
+    doubt = (
+        f"{', '.join(part.texts[:4])} is taken as how much the rubber was compressed; "
+        "if it is the height that was left, let the part be called compression_ratio_pct"
+    )
+    return replace(part, expression="100 - {}", doubt=doubt)
 
 
 def _with_bare_numbers(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> list[Part]:
@@ -233,7 +226,7 @@ def _without_doubles(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> 
             made.append(replace(part, ours="", why=f"{part.why}, said again later in the path"))
         else:
             doubt = f"a second number that looks like {part.ours}; it is kept as a channel"
-            made.append(replace(part, ours=f"part_{part.at}", group="", expression="", doubt=doubt))
+            made.append(replace(part, ours=f"part_{part.at}", group="", expression="", unit="", doubt=doubt))
     return made
 
 

@@ -36,7 +36,7 @@ class Part:
 
     `ours` is the column that it gives, "" for none; `group` names it in the pattern, "" for a piece that is
     matched only. `texts` are its different values; `expression` what computes the column where it is not the
-    number itself.
+    number itself; `unit` that of the number, "" for the column's own.
     """
 
     at: int
@@ -46,18 +46,20 @@ class Part:
     texts: tuple[str, ...]
     why: str
     expression: str = ""
+    unit: str = ""
     doubt: str = ""
 
 
 @dataclass(frozen=True)
 class Names:
-    """What names say, ready for a config: the pattern, value maps, expressions and templates of `[files]`."""
+    """What names say, ready for a config: the pattern, value maps, expressions, templates and units."""
 
     pattern: str | None
     parts: tuple[Part, ...] = ()
     values: Mapping[str, Mapping[str, float | str]] = field(default_factory=dict)
     compute: Mapping[str, str] = field(default_factory=dict)
     columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
     unmatched: tuple[str, ...] = ()
     matched: int = 0
 
@@ -139,7 +141,7 @@ def _date_pattern(text: str, kind: str) -> str:
 
 
 def settings_with(pattern: str, parts: Sequence[Part], middle: tuple[int, int] | None) -> Names:
-    """Return the value maps, expressions and templates that go with the pattern."""
+    """Return the value maps, expressions, templates and units that go with the pattern."""
     values: dict[str, dict[str, float | str]] = {}
     compute, columns = {}, {}
     for part in parts:
@@ -161,7 +163,8 @@ def settings_with(pattern: str, parts: Sequence[Part], middle: tuple[int, int] |
             compute[part.ours] = (part.expression or "{}").format(part.group)
     columns |= _date_template(pattern) | _specimen_template(parts)
     compute |= _signed_speed(parts, compute)
-    return Names(pattern, tuple(parts), values, compute, columns)
+    units = {part.ours: part.unit for part in parts if part.unit}
+    return Names(pattern, tuple(parts), values, compute, columns, units)
 
 
 def _date_template(pattern: str) -> dict[str, str]:

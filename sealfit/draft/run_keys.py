@@ -12,7 +12,7 @@ from pathlib import PurePosixPath
 
 from sealfit.config import AGING_CONDITION, Files
 from sealfit.draft.columns import Roles
-from sealfit.draft.config_text import Notes
+from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import Dialect
 from sealfit.draft.file_names import HEIGHT_FROM
 from sealfit.draft.files_found import Found
@@ -22,6 +22,7 @@ from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import name_parts
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import RUNS_CSV, natural
+from sealfit.units import Units, conversion
 
 NO_CONDITION = {
     "repeat", "specimen_id", "speed_mm_s", "load_N", "started_at", "run_id", "direction", "direction_set",
@@ -29,10 +30,7 @@ NO_CONDITION = {
 }  # fmt: skip
 AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
-SPEED_UNITS = {
-    60.0: ("mm/min", "{} / 60"), 1e-3: ("m/s", "{} * 1000"), 0.1: ("cm/s", "{} * 10"),
-    1e3: ("um/s", "{} / 1000"), 60 / 25.4: ("in/min", "{} * 25.4 / 60"), 1 / 25.4: ("in/s", "{} * 25.4"),
-}  # fmt: skip
+SPEED_UNITS = ("mm/min", "m/s", "cm/s", "um/s", "in/min", "in/s")
 MOST_LISTED = 20  # files that are excluded by name; more are said in a sentence
 
 
@@ -52,7 +50,11 @@ class Source:
 def settings_of(names: Names) -> Files:
     """Return the part of a config that reads the names."""
     return Files(
-        name_pattern=names.pattern, values=names.values, compute=names.compute, columns=names.columns
+        name_pattern=names.pattern,
+        values=names.values,
+        compute=names.compute,
+        columns=names.columns,
+        units=names.units,
     )
 
 
@@ -61,10 +63,11 @@ def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, 
     if names.pattern is None:
         return {file: {} for file in files}
     settings = settings_of(names)
+    conversions = {name: conversion(unit, Units().of(name)) for name, unit in names.units.items()}
     found = {}
     for file in files:
         try:
-            found[file] = dict(name_parts(file, settings).channels)
+            found[file] = dict(name_parts(file, settings, conversions).channels)
         except ConfigError:
             found[file] = {}
     return found
@@ -87,7 +90,7 @@ def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Name
         ratio = _ratio({f: v.get("speed_mm_s") for f, v in said.items()}, speeds)
         if ratio is None or abs(ratio - 1) <= AGREES:
             return names
-        return _speed_in_unit(names, "speed_mm_s", ratio, notes)
+        return _speed_in_unit(names, ratio, notes)
     for part in names.parts:
         if part.ours.startswith("part_") and len(part.texts) > 1:
             ratio = _ratio({f: v.get(part.ours) for f, v in said.items()}, speeds)
@@ -109,23 +112,19 @@ def _ratio(said: Mapping[str, object], measured: Mapping[str, float]) -> float |
     return middle if agree >= MOSTLY * len(ratios) else None
 
 
-def _speed_in_unit(names: Names, name: str, ratio: float, notes: Notes) -> Names:
-    """Return the names with the speed converted, where a unit explains the ratio; otherwise a doubt."""
-    part = next(part for part in names.parts if part.ours == name)
-    unit = next((said for factor, said in SPEED_UNITS.items() if abs(ratio / factor - 1) <= AGREES / 2), None)
-    if unit is None or part.expression:
+def _speed_in_unit(names: Names, ratio: float, notes: Notes) -> Names:
+    """Return the names with the unit of the speed, where one explains the ratio; otherwise a doubt."""
+    part = next(part for part in names.parts if part.ours == "speed_mm_s")
+    unit = next((u for u in SPEED_UNITS if abs(ratio * conversion(u, "mm/s").factor - 1) <= AGREES / 2), None)
+    if unit is None or part.unit:
         reason = f"speeds in names are {ratio:.3g} times those measured."
         notes.doubt(
             "files.name_pattern", reason, "Check the units of time and displacement, and the speed in names."
         )
         return names
-    spelled, expression = unit
-    why = f"{part.why}; {ratio:.3g} times the measured speed in mm/s, so it is in {spelled}"
-    compute = {**names.compute, name: expression.format("_speed")}
-    pattern = names.pattern.replace(f"(?P<{part.group}>", "(?P<_speed>")
-    values = {("_speed" if key == part.group else key): value for key, value in names.values.items()}
-    parts = tuple(replace(p, group="_speed", why=why) if p is part else p for p in names.parts)
-    return replace(names, pattern=pattern, compute=compute, values=values, parts=parts)
+    why = f"{part.why}; {ratio:.3g} times the measured speed in mm/s, so it is in {unit}"
+    parts = tuple(replace(p, unit=unit, why=why) if p is part else p for p in names.parts)
+    return replace(names, units={**names.units, "speed_mm_s": unit}, parts=parts)
 
 
 def _renamed(names: Names, part: Part, ours: str, why: str) -> Names:
@@ -158,15 +157,18 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
     notes.doubt(
         "files.name_pattern", reason, "It is not used; repeats are numbered in the order of the files."
     )
-    pattern = names.pattern.replace(f"(?P<{repeat.group}>", "(?:")
-    values = {key: value for key, value in names.values.items() if key != repeat.group}
-    compute = {key: value for key, value in names.compute.items() if key != "repeat"}
+    return _without(names, repeat)
+
+
+def _without(names: Names, part: Part) -> Names:
+    """Return the names without what one part says: it is matched only."""
     return replace(
         names,
-        pattern=pattern,
-        values=values,
-        compute=compute,
-        parts=tuple(p for p in names.parts if p is not repeat),
+        pattern=names.pattern.replace(f"(?P<{part.group}>", "(?:"),
+        values={key: value for key, value in names.values.items() if key != part.group},
+        compute={key: value for key, value in names.compute.items() if key != part.ours},
+        units={key: value for key, value in names.units.items() if key != part.ours},
+        parts=tuple(other for other in names.parts if other is not part),
     )
 
 
@@ -309,7 +311,9 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
     for group, mapped in names.values.items():
         notes.guess(f"files.values.{group}", dict(mapped), "how these are written in the names")
     for name, expression in names.compute.items():
-        notes.guess(f"files.compute.{name}", expression, "from the part of the name to our unit")
+        notes.guess(f"files.compute.{name}", expression, "computed from parts of the name")
+    for name, unit in names.units.items():
+        notes.guess(f"files.units.{name}", unit, "the unit of the number in the names")
 
 
 def _example(part: Part) -> str:
@@ -323,18 +327,11 @@ def _values(part: Part) -> str:
 
 def _table_keys(table: RunsTable, notes: Notes) -> None:
     for theirs, ours in table.ours.items():
-        if ours != theirs:
+        value = file_column(theirs, table.units.get(theirs), ours)
+        if value != ours:
             cell = next((cell for cell in table.cells[theirs] if cell), "")
-            notes.guess(
-                f"files.runs_columns.{ours}", theirs, f"column '{theirs}' of {table.file}, such as '{cell}'"
-            )
-    for theirs, unit in table.units.items():
-        ours, wanted = table.ours[theirs], 86400.0 if table.ours[theirs] == "aging_days" else 1.0
-        if unit.factor != wanted and unit.dimension not in ("temperature", "share", "none"):
-            reason = f"column '{theirs}' of {table.file} is in {unit.name}, and {ours} is not."
-            notes.doubt(
-                "files.runs_columns", reason, f"Convert it in the table, times {unit.factor / wanted:.6g}."
-            )
+            evidence = f"column '{theirs}' of {table.file}, such as '{cell}'"
+            notes.guess(f"files.runs_columns.{ours}", value, evidence)
     heights = next(
         (table.cells[theirs] for theirs, ours in table.ours.items() if ours == "compression_ratio_pct"), ()
     )
@@ -415,8 +412,5 @@ def needs_no_load(names: Names, roles: Roles) -> Names:
     """Return the names without load if a torque is measured: torque over load is no friction coefficient."""
     if roles.force is None or roles.force.unit is None or roles.force.unit.dimension == "force":
         return names
-    if "load_N" not in names.compute:
-        return names
-    compute = {name: text for name, text in names.compute.items() if name != "load_N"}
-    parts = tuple(replace(part, ours="") if part.ours == "load_N" else part for part in names.parts)
-    return replace(names, compute=compute, parts=parts)
+    load = next((part for part in names.parts if part.ours == "load_N"), None)
+    return names if load is None else _without(names, load)

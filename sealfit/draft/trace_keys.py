@@ -10,11 +10,12 @@ import numpy as np
 
 from sealfit.draft import motion
 from sealfit.draft.columns import BY_BEHAVIOUR, DIMENSION, Column, Roles
-from sealfit.draft.config_text import Notes, column_guesses, date_lines, scaled
+from sealfit.draft.config_text import Notes, column_guesses, date_lines, file_column
 from sealfit.draft.dialect import STRAYS, is_unchanged
 from sealfit.draft.files_found import Found
 from sealfit.draft.header_lines import Setting, settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
+from sealfit.units import Units, conversion
 
 LONG_S = 3600.0
 """A trace without a time unit is not taken to last longer than an hour at a sample per second or slower."""
@@ -165,7 +166,7 @@ def column_keys(
     if roles.force is not None and roles.force.unit is not None and _is_torque(roles.force):
         notes.guess(
             "quantities.force",
-            {"quantity": "torque", "unit": roles.force.unit.name.replace("pct", "%")},
+            {"quantity": "torque", "unit": roles.force.unit.name},
             f"{roles.force.place} is a torque",
         )
     if helpers:
@@ -236,12 +237,11 @@ def _follows_badly(column: Column, roles: Roles) -> bool:
 def _integrated(speed: Column, notes: Notes) -> list[str]:
     """Add what makes a displacement of a speed; return the helper column."""
     rotation = speed.unit is not None and speed.unit.dimension == "rotation"
-    helper = "speed_rpm" if rotation else "speed_column"
-    notes.guess(f"trace.columns.{helper}", speed.key, f"{speed.place}: by its name or unit")
-    scale = speed.unit is not None and not rotation and speed.unit.factor != 1.0
-    integrated = "speed_column_mm_s" if scale else helper
+    helper = "speed_rpm" if rotation else "speed_column_mm_s"
+    value = speed.key if rotation else file_column(speed.key, speed.unit, helper)
+    notes.guess(f"trace.columns.{helper}", value, f"{speed.place}: by its name or unit")
     evidence = "there is no column of displacement: it is the integral of the speed"
-    notes.guess("trace.integrate_displacement", integrated, evidence)
+    notes.guess("trace.integrate_displacement", helper, evidence)
     if rotation:
         notes.guess("trace.integrate_per", "min", "rpm")
         notes.guess("quantities.displacement", {"quantity": "angle", "unit": "turn"}, f"from {speed.place}")
@@ -249,9 +249,6 @@ def _integrated(speed: Column, notes: Notes) -> list[str]:
             "quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, f"from {speed.place}"
         )
         notes.guess("position_origin", "file", "an integral begins anew in every file")
-    elif scale:
-        notes.guess("trace.compute.speed_column_mm_s", scaled(helper, speed.unit.factor), "to mm/s")
-        return [helper, "speed_column_mm_s"]
     return [helper]
 
 
@@ -301,7 +298,7 @@ def _channel(column: Column, taken: set[str]) -> str:
     """Return a name for a column as a channel, none of those taken; "" for a ratio, a counter or a copy."""
     if column.copy_of or column.role not in CHANNELS or all(motion.rises(values) for values in column.values):
         return ""
-    unit = f"_{column.unit.name}" if column.unit is not None else ""
+    unit = f"_{column.unit.suffix}" if column.unit is not None else ""
     bases = [
         f"{column.role}_sensor",
         "_".join(plain(name_and_unit(column.label)[0]).split()),
@@ -337,12 +334,12 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
             reason = (
                 f"{column.place} has no unit; in seconds a file would last {hours}, so it is taken as ms."
             )
-            notes.doubt("trace.compute.time_s", reason, "Change the factor if it is another unit.")
+            notes.doubt("trace.columns.time_s", reason, "Change the unit if it is another.")
             return UNITS["ms"]
     if column.role != role:
         return None  # said where it is said that nothing but its behaviour speaks for it
     reason = f"{column.place} has no unit; {default} is assumed."
-    fix = f"If it is another, read it under a name such as {role}_raw and compute {slot} from it."
+    fix = f"If it is another, name it: {slot} = {{ name = ..., unit = ... }}."
     notes.doubt(f"trace.columns.{slot}", reason, fix)
     return None
 
@@ -372,14 +369,10 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
 
 
 def _setting_keys(one: Setting, notes: Notes) -> None:
-    factor = 1.0 if one.unit is None else one.unit.factor / (86400.0 if one.ours == "aging_days" else 1.0)
     evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
-    if factor == 1.0:
-        notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
-        return
-    base = one.ours.split("_")[0]
-    notes.guess(f"trace.header_fields._{base}", one.pattern, evidence)
-    notes.guess(f"trace.compute.{one.ours}", scaled(f"_{base}", factor), f"from {one.unit.name}")
+    notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
+    if one.unit is not None and one.unit.name != Units().of(one.ours):
+        notes.guess(f"files.units.{one.ours}", one.unit.name, f"the unit in header line {one.line}")
 
 
 def motion_keys(
@@ -393,13 +386,8 @@ def motion_keys(
         if roles.displacement is None:
             speeds[file] = [motion.mean_speed(roles.speed.values[i])]
             continue
-        factors = {
-            role: unit.factor if (unit := units.get(role)) else 1.0 for role in ("time", "displacement")
-        }
-        time, way = (
-            roles.time.values[i] * factors["time"],
-            roles.displacement.values[i] * factors["displacement"],
-        )
+        time = _in_ours(roles.time.values[i], units.get("time"), "s")
+        way = _in_ours(roles.displacement.values[i], units.get("displacement"), "mm")
         speeds[file] = motion.plateau_speeds(time, way)
     several = {file: found for file, all_ in speeds.items() if (found := motion.several_speeds(all_))}
     if several:
@@ -416,6 +404,10 @@ def motion_keys(
         for file, found in speeds.items()
         if found and file not in several
     }
+
+
+def _in_ours(values: np.ndarray, unit: Unit | None, ours: str) -> np.ndarray:
+    return values if unit is None else conversion(unit.name, ours)(values)
 
 
 def motion_words(roles: Roles, strokes: int) -> str:

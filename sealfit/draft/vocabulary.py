@@ -6,70 +6,61 @@ import re
 from dataclasses import dataclass
 
 # ---------------------------------------------------------------- units
-# What a unit measures, and what a number in it is multiplied by to be in the unit that our names say.
+# What a unit measures, and how a config spells it.
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit as files write it.
-
-    `factor` turns a number into s, mm, N, mm/s, days or what `dimension` is counted in; `name` can be part of
-    a column's name.
-    """
+    """A unit: what it measures, and its name in a config, which is pint's where it can be converted."""
 
     dimension: str
-    factor: float
     name: str
 
-
-_LBF = 4.4482216152605  # N, exact: 0.45359237 kg times 9.80665 m/s2
-_KGF = 9.80665  # N
-_LENGTHS = {"mm": 1.0, "m": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "in": 25.4, "inch": 25.4}
-_TIMES = {"s": 1.0, "sec": 1.0, "min": 60.0, "h": 3600.0}
-
-
-def _ascii(unit: str) -> str:
-    return unit.replace("µ", "u").replace("μ", "u")
+    @property
+    def suffix(self) -> str:
+        """The unit as the end of a column's name, e.g. "mm_s"."""
+        return {"degC": "C", "%": "pct"}.get(self.name, re.sub("[/ ]", "_", self.name))
 
 
+_LENGTHS = {"mm": "mm", "m": "m", "cm": "cm", "um": "um", "µm": "um", "μm": "um", "in": "in", "inch": "in"}
+_TIMES = {"s": "s", "sec": "s", "min": "min", "h": "h"}
+_SPELLINGS = {
+    ("time", "s"): ("s", "sec", "secs", "second", "seconds", "sek", "sekunden"),
+    ("time", "ms"): ("ms", "msec", "millisec", "milliseconds"),
+    ("time", "us"): ("us", "µs", "μs"),
+    ("time", "min"): ("min", "minutes", "minuten"),
+    ("time", "h"): ("h", "hr", "hours", "std", "stunden"),
+    ("time", "d"): ("d", "days", "day", "tage", "tag"),
+    ("length", "ft"): ("ft",),
+    ("force", "N"): ("N",),
+    ("force", "kN"): ("kN",),
+    ("force", "mN"): ("mN",),
+    ("force", "uN"): ("uN", "µN", "μN"),
+    ("force", "lbf"): ("lbf", "lb", "lbs"),
+    ("force", "kgf"): ("kgf", "kp", "kg"),
+    ("force", "gf"): ("gf", "g"),
+    ("rotation", "rpm"): ("rpm", "1/min", "U/min", "min-1"),
+    ("torque", "N m"): ("Nm", "N m"),
+    ("torque", "mN m"): ("mNm", "mN m"),
+    ("torque", "N cm"): ("Ncm", "N cm"),
+    ("angle", "deg"): ("deg", "°", "rad", "turn"),
+    ("temperature", "degC"): ("°C", "C", "degC", "deg C", "Grad C", "ºC"),
+    ("share", "%"): ("%", "pct", "percent", "prozent", "Prozent"),
+    ("pressure", "bar"): ("bar",),
+    ("pressure", "mbar"): ("mbar",),
+    ("pressure", "kPa"): ("kPa",),
+    ("stress", "MPa"): ("MPa",),
+    ("none", "1"): ("-", "1", "segments", "counts", "cycles"),
+}
 UNITS = {
+    **{spelled: Unit(*unit) for unit, spellings in _SPELLINGS.items() for spelled in spellings},
+    **{spelled: Unit("length", unit) for spelled, unit in _LENGTHS.items()},
     **{
-        spelled: Unit("time", 1.0, "s")
-        for spelled in ("s", "sec", "secs", "second", "seconds", "sek", "sekunden")
+        f"{length}/{time}": Unit("speed", f"{_LENGTHS[length]}/{_TIMES[time]}")
+        for length in _LENGTHS
+        for time in _TIMES
     },
-    **{spelled: Unit("time", 1e-3, "ms") for spelled in ("ms", "msec", "millisec", "milliseconds")},
-    **{spelled: Unit("time", 1e-6, "us") for spelled in ("us", "µs", "μs")},
-    **{spelled: Unit("time", 60.0, "min") for spelled in ("min", "minutes", "minuten")},
-    **{spelled: Unit("time", 3600.0, "h") for spelled in ("h", "hr", "hours", "std", "stunden")},
-    **{spelled: Unit("time", 86400.0, "d") for spelled in ("d", "days", "day", "tage", "tag")},
-    **{spelled: Unit("length", factor, _ascii(spelled)) for spelled, factor in _LENGTHS.items()},
-    "ft": Unit("length", 304.8, "ft"),
-    "N": Unit("force", 1.0, "N"),
-    "kN": Unit("force", 1e3, "kN"),
-    "mN": Unit("force", 1e-3, "mN"),
-    **{spelled: Unit("force", 1e-6, "uN") for spelled in ("uN", "µN", "μN")},
-    **{spelled: Unit("force", _LBF, "lbf") for spelled in ("lbf", "lb", "lbs")},
-    **{spelled: Unit("force", _KGF, "kgf") for spelled in ("kgf", "kp", "kg")},
-    **{spelled: Unit("force", _KGF / 1e3, "gf") for spelled in ("gf", "g")},
-    **{
-        f"{way}/{time}": Unit("speed", length / seconds, _ascii(f"{way}_{time}"))
-        for way, length in _LENGTHS.items()
-        for time, seconds in _TIMES.items()
-    },
-    **{spelled: Unit("rotation", 1.0, "rpm") for spelled in ("rpm", "1/min", "U/min", "min-1")},
-    **{
-        spelled: Unit("torque", 1.0, spelled.replace(" ", ""))
-        for spelled in ("Nm", "mNm", "N m", "mN m", "Ncm")
-    },
-    **{spelled: Unit("angle", 1.0, "deg") for spelled in ("deg", "°", "rad", "turn")},
-    **{spelled: Unit("temperature", 1.0, "C") for spelled in ("°C", "C", "degC", "deg C", "Grad C", "ºC")},
-    **{spelled: Unit("share", 1.0, "pct") for spelled in ("%", "pct", "percent", "prozent", "Prozent")},
-    "bar": Unit("pressure", 1.0, "bar"),
-    "mbar": Unit("pressure", 1e-3, "mbar"),
-    "kPa": Unit("pressure", 1e-2, "kPa"),
-    "MPa": Unit("stress", 1.0, "MPa"),
-    **{spelled: Unit("none", 1.0, spelled) for spelled in ("V", "mV", "A", "Hz", "mV/V", "mm/mm")},
-    **{spelled: Unit("none", 1.0, "1") for spelled in ("-", "1", "segments", "counts", "cycles")},
+    **{spelled: Unit("none", spelled) for spelled in ("V", "mV", "A", "Hz", "mV/V", "mm/mm")},
 }
 _BY_LOWER = {spelled.lower(): unit for spelled, unit in reversed(UNITS.items())}
 
@@ -79,8 +70,8 @@ def unit_of(text: str) -> Unit | None:
 
     Examples
     --------
-    >>> unit_of("[kN]").factor, unit_of("Sec").name, unit_of("(µm)").name, unit_of("Weg")
-    (1000.0, 's', 'um', None)
+    >>> unit_of("[kN]").name, unit_of("Sec").name, unit_of("(µm)").name, unit_of("Weg")
+    ('kN', 's', 'um', None)
     """
     bare = text.strip().strip("[]()<>{}").strip()
     return UNITS.get(bare) or _BY_LOWER.get(bare.lower())
@@ -103,7 +94,7 @@ def name_and_unit(text: str) -> tuple[str, Unit | None]:
     >>> name_and_unit("Weg [mm]")[0], name_and_unit("t/s")[1].name, name_and_unit("Kraft in kN")[1].name
     ('Weg', 's', 'kN')
     >>> name_and_unit("Speed_mm_s")[1].name, name_and_unit("Reibkraft")
-    ('mm_s', ('Reibkraft', None))
+    ('mm/s', ('Reibkraft', None))
     """
     for pattern in _NAME_AND_UNIT:
         if match := pattern.match(text.strip()):
@@ -219,22 +210,22 @@ BEFORE = {
     **dict.fromkeys(("S", "s", "P", "sp", "spec", "specimen", "sample", "probe", "rawdata"), "specimen_id"),
 }
 AFTER = {
-    **dict.fromkeys(("C", "degC", "°C", "grad", "deg"), ("temperature_C", 1.0)),
-    **dict.fromkeys(("pct", "%", "percent", "prozent"), ("compression_ratio_pct", 1.0)),
-    **dict.fromkeys(("d", "day", "days", "tag", "tage"), ("aging_days", 1.0)),
-    **dict.fromkeys(("h", "hours", "std"), ("aging_days", 1.0 / 24)),
-    **dict.fromkeys(("w", "wk", "weeks", "wochen"), ("aging_days", 7.0)),
-    **dict.fromkeys(("mms", "mm s", "mmps", "mm/s", "mmpers"), ("speed_mm_s", 1.0)),
-    **dict.fromkeys(("mmmin", "mm min", "mmpmin", "mmpermin"), ("speed_mm_s", 1.0 / 60)),
-    **dict.fromkeys(("ums", "um s"), ("speed_mm_s", 1e-3)),
-    **dict.fromkeys(("ipm", "inmin", "in min"), ("speed_mm_s", 25.4 / 60)),
-    **dict.fromkeys(("cms",), ("speed_mm_s", 10.0)),
-    **dict.fromkeys(("N",), ("load_N", 1.0)),
-    **dict.fromkeys(("kg", "kgf"), ("load_N", _KGF)),
-    **dict.fromkeys(("lbf", "lbs"), ("load_N", _LBF)),
-    **dict.fromkeys(("bar",), ("pressure_bar", 1.0)),
-    **dict.fromkeys(("rpm",), ("speed_rpm", 1.0)),
-    **dict.fromkeys(("Hz",), ("frequency_Hz", 1.0)),
+    **dict.fromkeys(("C", "degC", "°C", "grad", "deg"), ("temperature_C", "")),
+    **dict.fromkeys(("pct", "%", "percent", "prozent"), ("compression_ratio_pct", "")),
+    **dict.fromkeys(("d", "day", "days", "tag", "tage"), ("aging_days", "")),
+    **dict.fromkeys(("h", "hours", "std"), ("aging_days", "h")),
+    **dict.fromkeys(("w", "wk", "weeks", "wochen"), ("aging_days", "week")),
+    **dict.fromkeys(("mms", "mm s", "mmps", "mm/s", "mmpers"), ("speed_mm_s", "")),
+    **dict.fromkeys(("mmmin", "mm min", "mmpmin", "mmpermin"), ("speed_mm_s", "mm/min")),
+    **dict.fromkeys(("ums", "um s"), ("speed_mm_s", "um/s")),
+    **dict.fromkeys(("ipm", "inmin", "in min"), ("speed_mm_s", "in/min")),
+    **dict.fromkeys(("cms",), ("speed_mm_s", "cm/s")),
+    **dict.fromkeys(("N",), ("load_N", "")),
+    **dict.fromkeys(("kg", "kgf"), ("load_N", "kgf")),
+    **dict.fromkeys(("lbf", "lbs"), ("load_N", "lbf")),
+    **dict.fromkeys(("bar",), ("pressure_bar", "")),
+    **dict.fromkeys(("rpm",), ("speed_rpm", "")),
+    **dict.fromkeys(("Hz",), ("frequency_Hz", "")),
 }
 UNAGED = {
     "unaged",
@@ -278,6 +269,6 @@ def before_number(letters: str) -> str:
     return BEFORE.get(letters) or (BEFORE.get(letters.lower(), "") if len(letters) > 1 else "")
 
 
-def after_number(letters: str) -> tuple[str, float] | None:
-    """Return what a number followed by this unit is, and the factor to our unit; None if it does not say."""
+def after_number(letters: str) -> tuple[str, str] | None:
+    """Return what a number followed by this unit is, and its unit, "" for ours; None if it does not say."""
     return AFTER.get(letters) or (AFTER.get(letters.lower()) if len(letters) > 1 else None)

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from sealfit.config import TraceFormat
+from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, Fault
 from sealfit.store.manifest import Fingerprint, fingerprint, fingerprint_of
 
@@ -309,14 +309,17 @@ def split_line(line: str, delimiter: str) -> list[str]:
         return line.split(mark)
 
 
-def header_fields(header: tuple[str, ...], settings: TraceFormat) -> dict[str, float | str]:
-    """Return the channels the config reads from header lines: the first match of each, numbers as numbers."""
+def header_fields(header: tuple[str, ...], config: Config) -> dict[str, float | str]:
+    """Return the channels that a config reads from header lines: the first match of each, in our units."""
     found: dict[str, float | str] = {}
-    for name, pattern in settings.header_fields.items():
+    units = config.conversions("names")
+    for name, pattern in config.trace.header_fields.items():
         for line in header:
             if match := re.search(pattern, line):
                 value = (match.group(1) if match.re.groups else match.group()) or ""
-                number = as_number(value, settings.decimal)
+                number = as_number(value, config.trace.decimal)
+                if number is not None and name in units:
+                    number = units[name].of_cell(number)
                 found[name] = value.strip() if number is None else number
                 break
     return found

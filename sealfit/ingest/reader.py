@@ -212,7 +212,7 @@ def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | 
         header = read_arrays(raw, file, settings, head=True).header
     else:
         header = _text(raw, file, settings, head=True)[1].header
-    return header_fields(header, settings)
+    return header_fields(header, config)
 
 
 def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trace:
@@ -222,7 +222,7 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None:
         named = name_parts(file, config.files, config.conversions("names")).values
-        known = {**ref.channels, **named, **header_fields(layout.header, settings)}
+        known = {**ref.channels, **named, **header_fields(layout.header, config)}
     faults = list(cells.faults)
     good = ~cells.bad
     first = settings.drop_first_rows

@@ -8,10 +8,11 @@ from sealfit.config import parse_config
 from sealfit.draft import motion
 from sealfit.draft.dialect import sniff, sniffed_delimiter
 from sealfit.draft.draft import draft
-from sealfit.draft.vocabulary import column_role, name_and_unit
+from sealfit.draft.vocabulary import AFTER, UNITS, column_role, name_and_unit
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import as_utf8
 from sealfit.ingest.reader import read_trace
+from sealfit.units import Units, conversion
 
 SPEEDS = (1.0, 5.0)
 
@@ -98,7 +99,7 @@ def test_a_displacement_is_integrated_from_a_speed(tmp_path):
     made = campaign(tmp_path, columns, "Zeit [s],Geschwindigkeit [mm/min],Kraft [N]\n")
     trace = parse_config(made.text, "rig.toml").trace
     assert trace.integrate_displacement == "speed_column_mm_s"
-    assert trace.compute == {"speed_column_mm_s": "speed_column / 60"}
+    assert trace.columns["speed_column_mm_s"].unit == "mm/min"
 
 
 def test_a_time_of_day_is_a_doubt_with_its_fix(tmp_path):
@@ -117,7 +118,7 @@ def test_a_time_in_no_unit_that_would_last_for_hours_is_in_ms(tmp_path):
         tmp_path, lambda one: [one.time_s * 1000, *exports.slots(one)[1:]], "Time,Position,Force\n"
     )
     trace = parse_config(made.text, "rig.toml").trace
-    assert trace.compute == {"time_s": "time_ms / 1000"}
+    assert trace.columns["time_s"].unit == "ms"
     assert any("taken as ms" in doubt.reason for doubt in made.doubts)
 
 
@@ -128,7 +129,7 @@ def test_a_speed_of_names_in_mm_per_minute_is_seen_in_the_displacement(tmp_path)
             tmp_path, f"d4_v{60 * one.speed:g}.csv", header + exports.table(exports.slots(one), ",", 4)
         )
     config = parse_config(draft(tmp_path).text, "rig.toml")
-    assert config.files.compute == {"speed_mm_s": "_speed / 60"}
+    assert config.files.units == {"speed_mm_s": "mm/min"}
 
 
 def test_a_number_in_names_that_is_the_measured_speed_is_the_speed(tmp_path):
@@ -176,17 +177,29 @@ def test_names_of_columns_in_two_languages(name, role):
 
 
 @pytest.mark.parametrize(
-    ("text", "name", "factor"),
+    ("text", "name", "unit"),
     [
-        ("Weg [mm]", "Weg", 1.0), ("Kraft (kN)", "Kraft", 1e3), ("t / ms", "t", 1e-3), ("s in µm", "s", 1e-3),
-        ("Load_lbf", "Load", 4.4482216152605), ("Position, in", "Position", 25.4), ("Force N", "Force", 1.0),
-        ("v_mm_min", "v", 1 / 60),
+        ("Weg [mm]", "Weg", "mm"), ("Kraft (kN)", "Kraft", "kN"), ("t / ms", "t", "ms"),
+        ("s in µm", "s", "um"), ("Load_lbf", "Load", "lbf"), ("Position, in", "Position", "in"),
+        ("Force N", "Force", "N"), ("v_mm_min", "v", "mm/min"), ("Weg_inch", "Weg", "in"),
     ],
 )  # fmt: skip
-def test_units_in_names_of_columns(text, name, factor):
-    found, unit = name_and_unit(text)
-    assert found == name
-    assert unit.factor == pytest.approx(factor)
+def test_units_in_names_of_columns(text, name, unit):
+    found, known = name_and_unit(text)
+    assert (found, known.name) == (name, unit)
+
+
+OF_DIMENSION = {
+    "time": "s", "length": "mm", "force": "N", "speed": "mm/s", "temperature": "degC", "pressure": "bar",
+    "share": "%", "angle": "deg", "rotation": "rpm", "torque": "N*m",
+}  # fmt: skip
+
+
+def test_units_of_files_are_known_to_the_config():
+    for unit in {unit for unit in UNITS.values() if unit.dimension in OF_DIMENSION}:
+        conversion(unit.name, OF_DIMENSION[unit.dimension])
+    for ours, unit in AFTER.values():
+        assert not unit or conversion(unit, Units().of(ours)).factor != 1.0
 
 
 def test_sensors_beside_the_motion_are_channels_with_names_of_their_own(tmp_path):

@@ -159,7 +159,7 @@ def test_a_force_of_the_other_sign_is_turned(tmp_path):
     made, config, ingested = read(tmp_path)
     steady = ingested.tables["steady"]
     assert (np.sign(steady["force_N"]) == steady["direction"]).all()
-    assert config.trace.compute == {"force_N": "-force_raw"}
+    assert config.trace.compute == {"force_N": "-force_raw_N"}
     assert made.motion == "about 4 strokes in a file, both ways"
 
 
@@ -178,15 +178,12 @@ def test_headers_of_different_lengths_end_at_a_line(tmp_path):
     assert config.trace.header_lines is None
 
 
-def test_units_become_factors_and_the_helpers_are_dropped(tmp_path):
+def test_units_of_columns_are_named_in_the_config(tmp_path):
     exports.hbm(tmp_path)
     trace = parse_config(draft(tmp_path).text, "rig.toml").trace
-    assert trace.compute == {
-        "time_s": "time_ms / 1000",
-        "displacement_mm": "displacement_um / 1000",
-        "force_N": "force_kN * 1000",
-    }
-    assert trace.drop_columns == ["time_ms", "displacement_um", "force_kN"]
+    units = {name: column.unit for name, column in trace.columns.items()}
+    assert units == {"time_s": "ms", "displacement_mm": "um", "force_N": "kN"}
+    assert (trace.compute, trace.drop_columns) == ({}, [])
 
 
 def test_settings_and_dates_in_the_header_are_enough(tmp_path):

@@ -270,16 +270,19 @@ def test_runs_csv_with_paths_that_are_none_is_a_doubt(tmp_path):
     assert "raw/m1.csv" in doubt.reason
 
 
-def test_units_of_a_table_that_are_not_ours_are_doubts(tmp_path):
+def test_a_table_of_runs_in_other_units_is_converted_and_its_doubts_are_said(tmp_path):
     for number in (1, 2):
         (one,) = exports.records(days=(number,), speeds=(5.0,), repeats=(1,))
         exports.write(tmp_path, f"m{number}.csv", plain(one))
     table = "File,Aging time (h),Normal load (kg),Compression (%),Date\n"
     table += "m1.csv,24,5,20,3/14/2024\nm2.csv,96,5,20,3/15/2024\n"
     exports.write(tmp_path, "runs.csv", table)
-    reasons = " ".join(doubt.reason for doubt in draft(tmp_path).doubts)
-    assert "'Aging time (h)' of runs.csv is in h" in reasons
-    assert "'Normal load (kg)' of runs.csv is in kgf" in reasons
+    made = draft(tmp_path)
+    columns = parse_config(made.text, "rig.toml").files.runs_columns
+    assert (columns["aging_days"].name, columns["aging_days"].unit) == ("Aging time (h)", "h")
+    assert (columns["load_N"].name, columns["load_N"].unit) == ("Normal load (kg)", "kgf")
+    assert columns["compression_ratio_pct"].unit is None
+    reasons = " ".join(doubt.reason for doubt in made.doubts)
     assert "how much the rubber was compressed" in reasons
     assert "dates that are not ISO 8601, such as '3/14/2024'" in reasons
 

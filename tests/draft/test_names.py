@@ -2,17 +2,12 @@
 
 import pytest
 
-from sealfit.config import Files
 from sealfit.draft.file_names import read_names
-from sealfit.ingest.file_names import name_parts
+from sealfit.draft.run_keys import values_by_file
 
 
 def told(files, which=0):
-    names = read_names(files)
-    settings = Files(
-        name_pattern=names.pattern, values=names.values, compute=names.compute, columns=names.columns
-    )
-    return name_parts(files[which], settings).channels
+    return values_by_file(read_names(files), files)[files[which]]
 
 
 def made(template, **values):
