@@ -47,9 +47,12 @@ UNREPORTED = (  # of many rows, and nothing in the report needs them
 )  # fmt: skip
 TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
 REPORTED = {  # of tables with a row per bin, what the report looks at
-    f"residuals_{stage}": ["condition", "run_id", "file", "residual_N", "heldout_residual_N"]
+    f"residuals_{stage}": [
+        "condition", "run_id", "file", "stroke", "bin", "speed_mm_s", "displacement_mm", "force_N", "model_N",
+        "residual_N", "heldout_residual_N",
+    ]
     for stage in ("before", "after")
-}
+}  # fmt: skip
 FAULTY = ("warning", "error")  # severities that count as a fault
 
 Counted = tuple[int, str]

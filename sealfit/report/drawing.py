@@ -1,25 +1,36 @@
-"""Plots as SVG, PNG and PDF files, and each panel as an SVG for the page, with a text for every point."""
+"""Plots as SVG, PNG and PDF files; for the page each panel as SVG, texts of points and traces of runs."""
 
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
+import numpy as np
+import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from sealfit.config import Config
+from sealfit.report.notation import ConditionNames, given, plain
 from sealfit.report.style import WIDTH, Plot, compose, look, panel_figure
 
 CSS = 96
 """Pixels of a page in an inch."""
 PRINT = 300
 """Pixels of a PNG file in an inch."""
+
+MOST_BINS = 30_000
+"""Bins of all runs that a page carries, about 1 MB; of more, every second, third ... is left."""
+
+FEWEST_SHARE = 5
+"""Traces of which fewer than every fifth bin would be left are not in the page."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +80,48 @@ def explain(points: Line2D, texts: Sequence[str]) -> None:
         A text for each point, in their order.
     """
     points.explained = tuple(texts)  # an attribute that `_svg` looks for
+
+
+def run_traces(tables: Mapping[str, pd.DataFrame], config: Config) -> dict:
+    """Return the measured force and the model's along every run, which the page draws on a click.
+
+    Parameters
+    ----------
+    tables : mapping of str to DataFrame
+        Tables `residuals_after` and `residuals_before`; the model is that of the first that has rows.
+
+    Returns
+    -------
+    dict
+        Labels `x` and `y`, and `runs`: by run_id its label and its strokes with file, x, force and model.
+        They have every `every`-th bin. Without runs where the loop was not run or there are too many bins.
+    """
+    units = config.units
+    made = {"x": plain(units.label("displacement_mm")), "y": plain(units.label("force_N")), "runs": {}}
+    rows = next((t for s in ("after", "before") if len(t := tables[f"residuals_{s}"])), pd.DataFrame())
+    made["every"] = every = max(1, math.ceil(len(rows) / MOST_BINS))
+    if rows.empty or every > FEWEST_SHARE:
+        return made
+    names = ConditionNames.of(config)
+    for run_id, run in rows[rows["bin"] % every == 0].groupby("run_id", sort=False):
+        first = run.iloc[0]
+        speed = f"{given(abs(run['speed_mm_s'].mean()), 3)} {units.unit('speed')}"
+        strokes = [
+            {
+                "file": file,
+                "x": _rounded(own["displacement_mm"]),
+                "force": _rounded(own["force_N"]),
+                "model": _rounded(own["model_N"]),
+            }
+            for (file, _), own in run.sort_values("bin").groupby(["file", "stroke"])
+        ]
+        label = f"{names(first['condition'])}, {speed}, run {run_id}"
+        made["runs"][str(run_id)] = {"label": label, "strokes": strokes}
+    return made
+
+
+def _rounded(values: pd.Series) -> list[float | None]:
+    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]
 
 
 def _svg(figure: Figure) -> str:

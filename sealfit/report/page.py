@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
 from sealfit.report import page
-from sealfit.report.drawing import Drawn, data_uri, draw
+from sealfit.report.drawing import Drawn, data_uri, draw, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
 from sealfit.report.loop_tables import (
@@ -264,8 +265,10 @@ def build_report(
     with timed("plots", rows=len(plots), of="plots"):
         figures = {name: draw(plot) for name, plot in plots.items()}
     images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
+    # "<" is escaped, as a name could otherwise end the script.
+    runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
     html = _environment().from_string(_text("template.html")).render(
-        style=Markup(_text("style.css")), script=Markup(_text("report.js")), plots=images,
+        style=Markup(_text("style.css")), script=Markup(_text("report.js")), plots=images, runs=Markup(runs),
         script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(), **content
     )  # fmt: skip
     return Report(html, figures)

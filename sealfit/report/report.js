@@ -1,6 +1,7 @@
 "use strict";
-// The page is whole without this script. With it, points say their values under the pointer, tables are sorted by
-// a click on their heads, and tables and figures can be saved.
+// The page is whole without this script. With it, points say their values under the pointer, a click on the mean of
+// a run opens its trace, figures are enlarged and zoomed, tables are sorted by a click on their heads, and tables and
+// figures can be saved.
 
 const tip = document.body.appendChild(document.createElement("div"));
 tip.className = "tip";
@@ -24,6 +25,117 @@ function save(content, type, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
+// ---------------------------------------------------------------- dialog
+
+const dialog = document.body.appendChild(document.createElement("dialog"));
+dialog.addEventListener("close", () => document.body.append(tip));
+
+function open(title, note, ...content) {
+  const head = document.createElement("h2"), words = document.createElement("p");
+  head.textContent = title;
+  words.textContent = note;
+  words.className = "quiet";
+  dialog.replaceChildren(button("Close", "Close", () => dialog.close()), head, ...content, words, tip);
+  if (!dialog.open) dialog.showModal();
+}
+
+// The wheel zooms about the pointer, a drag moves the drawing, a double click shows the whole.
+function zoomable(svg) {
+  const whole = svg.getAttribute("viewBox").split(" ").map(Number);
+  let view = [...whole], from = null;
+  const set = (x, y, width) => {
+    const height = width * whole[3] / whole[2];
+    const inside = (at, size, k) => Math.max(whole[k], Math.min(at, whole[k] + whole[k + 2] - size));
+    view = [inside(x, width, 0), inside(y, height, 1), width, height];
+    svg.setAttribute("viewBox", view.join(" "));
+  };
+  const at = event => {
+    const shown = svg.getBoundingClientRect();
+    return [(event.clientX - shown.x) / shown.width, (event.clientY - shown.y) / shown.height];
+  };
+  svg.addEventListener("wheel", event => {
+    event.preventDefault();
+    const [u, v] = at(event), wanted = view[2] * 1.0015 ** event.deltaY;
+    const width = Math.min(whole[2], Math.max(whole[2] / 40, wanted));
+    const shrunk = 1 - width / view[2];
+    set(view[0] + u * view[2] * shrunk, view[1] + v * view[3] * shrunk, width);
+  }, { passive: false });
+  svg.addEventListener("pointerdown", event => { from = [at(event), view]; });
+  svg.addEventListener("pointermove", event => {
+    if (from === null || !event.buttons) return;
+    const [u, v] = at(event), [[a, b], start] = from;
+    set(start[0] + (a - u) * start[2], start[1] + (b - v) * start[3], start[2]);
+  });
+  svg.addEventListener("pointerup", () => { from = null; });
+  svg.addEventListener("dblclick", () => set(whole[0], whole[1], whole[2]));
+  return svg;
+}
+
+// ---------------------------------------------------------------- trace of a run
+
+const traces = JSON.parse(document.getElementById("runs").textContent);
+const [WIDE, HIGH, LEFT, RIGHT, TOP, BOTTOM] = [760, 420, 66, 12, 12, 46]; // The drawing and its margins.
+
+const SVG = new DOMParser().parseFromString("<svg></svg>", "text/html").querySelector("svg").namespaceURI;
+
+function drawn(name, attributes, text) {
+  const made = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text !== undefined) made.textContent = text;
+  return made;
+}
+
+// The axis through some values: its ends, its ticks and the digits that they need.
+function axis(values) {
+  const low = Math.min(...values), high = Math.max(...values), span = high - low || Math.abs(high) || 1;
+  const power = 10 ** Math.floor(Math.log10(span / 5));
+  const step = [1, 2, 5, 10].map(k => k * power).find(size => span / size <= 6);
+  const ticks = [];
+  for (let tick = Math.ceil(low / step); tick * step <= high; tick++) ticks.push(tick * step);
+  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  return { low: low - 0.04 * span, high: high + 0.04 * span, ticks, digits };
+}
+
+function trace(run) {
+  const finite = value => value !== null;
+  const across = axis(run.strokes.flatMap(one => one.x).filter(finite));
+  const up = axis(run.strokes.flatMap(one => [...one.force, ...one.model]).filter(finite));
+  const x = value => LEFT + (WIDE - LEFT - RIGHT) * (value - across.low) / (across.high - across.low);
+  const y = value => HIGH - BOTTOM - (HIGH - TOP - BOTTOM) * (value - up.low) / (up.high - up.low);
+  const svg = drawn("svg", { viewBox: `0 0 ${WIDE} ${HIGH}`, role: "img", "aria-label": run.label });
+  for (const tick of across.ticks)
+    svg.append(drawn("path", { d: `M${x(tick)} ${TOP}V${HIGH - BOTTOM}`, class: "grid" }),
+      drawn("text", { x: x(tick), y: HIGH - 28, "text-anchor": "middle" }, tick.toFixed(across.digits)));
+  for (const tick of up.ticks)
+    svg.append(drawn("path", { d: `M${LEFT} ${y(tick)}H${WIDE - RIGHT}`, class: "grid" }),
+      drawn("text", { x: LEFT - 8, y: y(tick) + 4, "text-anchor": "end" }, tick.toFixed(up.digits)));
+  svg.append(drawn("text", { x: (LEFT + WIDE) / 2, y: HIGH - 8, "text-anchor": "middle" }, traces.x),
+    drawn("text", { transform: `translate(14 ${HIGH / 2}) rotate(-90)`, "text-anchor": "middle" }, traces.y));
+  const points = [];
+  for (const one of run.strokes) {
+    const places = one.x.map((at, i) => i).filter(i => one.x[i] !== null && one.force[i] !== null);
+    const line = values =>
+      "M" + places.filter(i => values[i] !== null).map(i => `${x(one.x[i])} ${y(values[i])}`).join("L");
+    svg.append(drawn("path", { d: line(one.force), class: "measured" }));
+    for (const i of places) {
+      const point = drawn("circle", { cx: x(one.x[i]), cy: y(one.force[i]), r: 2.2, class: "measured" });
+      const left = one.model[i] === null ? "" : `\nresidual: ${(one.force[i] - one.model[i]).toPrecision(3)}`;
+      point.dataset.text = `${traces.y}: ${one.force[i]}${left}\n${traces.x}: ${one.x[i]}\n${one.file}`;
+      points.push(point);
+    }
+    svg.append(drawn("path", { d: line(one.model), class: "model" }));
+  }
+  svg.append(...points);
+  return explained(svg, points);
+}
+
+function openRun(id) {
+  const run = traces.runs[id], files = [...new Set(run.strokes.map(one => one.file))];
+  const each = traces.every === 1 ? "each bin" : `one of ${traces.every} bins`;
+  const words = `Measured in blue, a point for ${each} of the steady window; model in orange. ${files.join(", ")}`;
+  open(run.label, words, zoomable(trace(run)));
+}
+
 // ---------------------------------------------------------------- figures
 
 function drawingOf(image) {
@@ -31,8 +143,8 @@ function drawingOf(image) {
   return new TextDecoder().decode(bytes);
 }
 
-// An inline copy of a figure with points; its ids are made single in the page.
-function inline(text, image, number) {
+// A figure as an element whose ids are single in the page, and its points.
+function parsed(text, label, number) {
   const svg = new DOMParser().parseFromString(text, "image/svg+xml").documentElement;
   const points = [...svg.querySelectorAll("use > title")].map(title => {
     const use = title.parentElement;
@@ -40,7 +152,6 @@ function inline(text, image, number) {
     title.remove();
     return use;
   });
-  if (!points.length) return;
   svg.querySelectorAll("style").forEach(style => style.remove());
   for (const element of svg.querySelectorAll("*")) {
     for (const attribute of [...element.attributes]) {
@@ -52,19 +163,37 @@ function inline(text, image, number) {
   }
   svg.style.strokeLinejoin = "round";
   svg.setAttribute("role", "img");
-  svg.setAttribute("aria-label", image.alt);
-  svg.addEventListener("pointermove", event => show(event, points));
-  svg.addEventListener("pointerleave", () => tip.classList.remove("shown"));
-  image.replaceWith(svg);
+  svg.setAttribute("aria-label", label);
+  return { svg: explained(svg, points), points };
 }
 
-function show(event, points) {
+// A drawing whose points say their texts under the pointer, and open the run that a line of the text names.
+function explained(svg, points) {
+  const run = point => point?.dataset.text.split("\n").find(line => Object.hasOwn(traces.runs, line));
+  svg.addEventListener("pointermove", event => {
+    const nearest = near(event, points);
+    show(event, nearest);
+    svg.style.cursor = run(nearest) === undefined ? "" : "pointer";
+  });
+  svg.addEventListener("pointerleave", () => tip.classList.remove("shown"));
+  svg.addEventListener("click", event => {
+    const id = run(near(event, points));
+    if (id !== undefined) openRun(id);
+  });
+  return svg;
+}
+
+function near(event, points) {
   let nearest = null, least = NEAR;
   for (const point of points) {
     const box = point.getBoundingClientRect();
     const away = Math.hypot(box.x + box.width / 2 - event.clientX, box.y + box.height / 2 - event.clientY);
     if (away < least) [nearest, least] = [point, away];
   }
+  return nearest;
+}
+
+function show(event, nearest) {
   tip.classList.toggle("shown", nearest !== null);
   if (nearest === null) return;
   tip.textContent = nearest.dataset.text;
@@ -78,8 +207,15 @@ function show(event, points) {
   panel.className = "panel";
   image.replaceWith(panel);
   const name = `${image.alt.split(/[:;.]/)[0].replace(/[^\p{L}\p{N}]+/gu, "_").slice(0, 60)}.svg`;
-  panel.append(image, button("SVG", `Save as SVG: ${image.alt}`, () => save(text, "image/svg+xml", name)));
-  inline(text, image, number);
+  const tools = document.createElement("div");
+  tools.append(
+    button("Enlarge", `Enlarge: ${image.alt}`, () =>
+      open(image.alt, "The wheel zooms, a drag moves, a double click shows the whole figure.",
+        zoomable(parsed(text, image.alt, "large").svg))),
+    button("SVG", `Save as SVG: ${image.alt}`, () => save(text, "image/svg+xml", name)),
+  );
+  const { svg, points } = parsed(text, image.alt, number);
+  panel.append(points.length ? svg : image, tools);
 });
 
 // ---------------------------------------------------------------- tables

@@ -47,6 +47,26 @@ frame.onload = () => {
   point.closest("svg").dispatchEvent(new frame.contentWindow.PointerEvent("pointermove", at));
   found.shown = frame.contentWindow.getComputedStyle(tip).visibility;
   found.tip = tip.textContent;
+  const mean = [...page.querySelectorAll("#force-speed use[data-text]")][3];
+  const place = mean.getBoundingClientRect();
+  const mouse = name => new frame.contentWindow.PointerEvent(name, {
+    clientX: place.x + place.width / 2, clientY: place.y + place.height / 2, bubbles: true });
+  const dialog = page.querySelector("dialog");
+  found.mean = mean.dataset.text;
+  mean.closest("svg").dispatchEvent(mouse("click"));
+  found.run = dialog.querySelector("h2").textContent;
+  found.points = dialog.querySelectorAll("circle").length;
+  dialog.close();
+  page.querySelector("#force-speed .panel button").click();
+  const large = dialog.querySelector("svg");
+  const view = () => large.getAttribute("viewBox").split(" ").map(Number), whole = view();
+  const middle = large.getBoundingClientRect();
+  const wheel = { deltaY: -500, clientX: middle.x + middle.width / 2, clientY: middle.y + middle.height / 2 };
+  large.dispatchEvent(new frame.contentWindow.WheelEvent("wheel", wheel));
+  found.zoom = view()[2] / whole[2];
+  large.dispatchEvent(new frame.contentWindow.MouseEvent("dblclick"));
+  found.whole = view().join() === whole.join();
+  dialog.close();
   const head = page.querySelector("th.n.sorts"), table = head.closest("table");
   const column = () => [...table.tBodies[0].rows].map(row => row.cells[head.cellIndex].textContent.trim());
   head.click();
@@ -86,11 +106,15 @@ def html_of(make):
     return build_report(*make().arguments).html
 
 
-def test_points_speak_tables_sort_and_are_saved(tmp_path):
+def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_path):
     shown = loaded(DRIVE, html_of(aging_campaign), tmp_path)
     found = json.loads(html.unescape(re.search(r"<title>driven (.*?)</title>", shown, re.S)[1]))
     assert (found["hidden"], found["shown"]) == ("hidden", "visible")
     assert re.match(r"(before|after): .* N\n", found["tip"])
+    assert found["mean"].splitlines()[2] in found["run"]
+    assert found["points"] == 3 * 20  # repeats and bins of made_campaigns
+    assert 0.3 < found["zoom"] < 0.7
+    assert found["whole"]
     rising = [float(text.replace("\u2212", "-")) for text in found["rising"]]
     assert len(rising) > 1
     assert rising == sorted(rising)

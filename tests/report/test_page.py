@@ -11,6 +11,7 @@ from report.made_campaigns import NAMES, aging_campaign, not_run, paper_sized, t
 from report.made_tables import empty
 
 from sealfit.config import Config
+from sealfit.report.drawing import FEWEST_SHARE, MOST_BINS, run_traces
 from sealfit.report.page import build_report
 
 VOID = {"meta", "img", "br", "link", "path", "rect", "circle"}
@@ -90,7 +91,7 @@ def pages(reports):
 def test_the_page_asks_for_nothing(name, reports, pages):
     for address in pages[name].addresses:
         assert address.startswith(("#", "data:image/svg+xml;base64,"))
-    assert pages[name].tags.count("script") == 1
+    assert pages[name].tags.count("script") == 2
     script = re.search(r"<script>(.*?)</script>", reports[name].html, re.S)[1]
     own = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert f"script-src 'sha256-{own}'\"" in reports[name].html
@@ -184,10 +185,12 @@ def test_text_from_data_is_escaped(small):
     made.closure["effects"][0]["label"] = nasty
     made.closure["effects"][0]["form"] = nasty
     made.closure["next_runs"] = [{"why": nasty, "conditions": {nasty: nasty}}]
+    residuals = made.tables["residuals_after"]
+    made.tables["residuals_after"] = residuals.assign(run_id=nasty)
     made.provenance = {**made.provenance, "campaign": f"/data/{nasty.replace('/', '')}"}
     report = build_report(*made.arguments)
     page = Page(report.html)
-    assert page.tags.count("script") == 1
+    assert page.tags.count("script") == 2  # the traces of runs, and what works the page
     assert "b" not in page.tags
     assert nasty in page.text
     assert 'traces/a "quoted" <b>.csv' in page.text
@@ -249,6 +252,25 @@ def test_the_arguments_are_left_as_they_were(small, unsaved):
     assert made.closure["left"] == left
     for name, frame in before.items():
         pd.testing.assert_frame_equal(made.tables[name], frame)
+
+
+def test_traces_of_runs_are_in_the_page_thinned_where_they_are_many(small):
+    rows = small.tables["residuals_after"]
+    bins = rows["bin"].nunique()
+    made = run_traces(small.tables, small.config)
+    assert made["runs"].keys() == set(rows["run_id"])
+    first = next(iter(made["runs"].values()))["strokes"][0]
+    own = rows[rows["file"] == first["file"]]
+    assert first["force"] == pytest.approx(own["force_N"].to_numpy(), rel=1e-4)
+    assert first["model"] == pytest.approx(own["model_N"].to_numpy(), rel=1e-4)
+    for times, kept in ((2, 2), (FEWEST_SHARE + 1, None)):
+        more = pd.concat([rows] * (times * MOST_BINS // len(rows)))
+        many = run_traces({**small.tables, "residuals_after": more}, small.config)
+        assert many["every"] == times
+        assert bool(many["runs"]) == (kept is not None)
+    assert bins > 2
+    unfitted = {"residuals_after": rows[:0], "residuals_before": rows[:0]}
+    assert run_traces({**small.tables, **unfitted}, small.config)["runs"] == {}
 
 
 def test_paper_sized_campaign_gives_a_page_that_can_be_mailed():
