@@ -1,5 +1,10 @@
 """What the paper printed agrees with itself as far as it does, and is looked up where our tables have it."""
 
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import pandas as pd
 import pytest
 from paper_numbers import MEASURED, as_printed, compared, condition, printed_errors
@@ -52,3 +57,19 @@ def test_every_published_number_stands_beside_ours():
     assert len(lines) == len(MEASURED) + 6 + 2 + 2
     assert all(line.ours == line.published for line in lines[: len(MEASURED)])
     assert [line.ours for line in lines[-2:]] == [49.0, 35.0]
+
+
+def test_the_page_of_the_paper_is_made_in_short(tmp_path):
+    script = Path(__file__).resolve().parent.parent / "benchmarks" / "paper.py"
+    folders = ["--work", str(tmp_path / "work"), "--docs", str(tmp_path / "docs")]
+    done = subprocess.run([sys.executable, str(script), "--short", *folders], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "docs" / "README.md").read_text("utf-8")
+    assert "584 files" in page
+    assert "8 speeds, 1 repeat, 49.03 N" in page
+    assert "nothing missing" in page
+    numbers = re.findall(r"^\| 4\.4 \| Eq\. 15 for mu_s at day 16 \| 0\.7 \| (\S+)", page, re.M)
+    assert float(numbers[0]) == pytest.approx(0.7, abs=0.02)
+    drawn = re.findall(r"\((figure_\d+\.png)\)", page)
+    assert len(drawn) == 10
+    assert all((tmp_path / "docs" / name).stat().st_size > 10_000 for name in drawn)
