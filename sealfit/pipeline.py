@@ -194,7 +194,7 @@ def _do_steps(store: Store, steps: tuple[str, ...], options: Options, progress: 
         if why or options.force:
             if why and step in store.state.steps:
                 progress.say(why)
-            with timed(step) as part, store.step(step) as staged:
+            with timed(step) as part, store.step(step) as staged, progress.working(step):
                 part.rows, part.of = _WORK[step](store, staged, options.workers, progress)
             done.append(step)
         else:

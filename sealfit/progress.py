@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
@@ -13,10 +14,11 @@ from typing import TextIO
 from sealfit.errors import Fault, grouped, told
 
 # ---------------------------------------------------------------- progress
-# What a command says while it works: plain lines, or a moving bar where somebody watches a terminal.
+# What a command says while it works: plain lines, or one that moves where somebody watches a terminal.
 
 OnFile = Callable[[int, int], None]
 LINE_EVERY_S = 2.0  # plain progress ends up in log files: a line now and then
+BEAT_EVERY_S = 30.0  # without any line for so long, plain progress says that the step is still at work
 FAULTS_SHOWN = 20  # the rest are in the quality table, and `check` lists them all
 
 
@@ -33,6 +35,11 @@ class Silent:
         """List the faults found in a campaign."""
 
     @contextlib.contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Show that the work in the block goes on, and for how long."""
+        yield
+
+    @contextlib.contextmanager
     def counting(self, what: str) -> Iterator[OnFile]:
         """Give a function to call with (done, total)."""
         yield lambda done, total: None
@@ -43,9 +50,11 @@ class Lines(Silent):
 
     def __init__(self, stream: TextIO | None = None):
         self._stream = stream or sys.stderr
+        self._said_at = time.monotonic()
 
     def say(self, text: str) -> None:
         """Say what is being done."""
+        self._said_at = time.monotonic()
         print(text, file=self._stream, flush=True)
 
     def warn(self, text: str) -> None:
@@ -67,6 +76,25 @@ class Lines(Silent):
             self.say(f"... and {more} more: `sealfit check` lists them all, the quality table too.")
 
     @contextlib.contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Say in a line how long the work in the block has taken, where nothing else was said for a while."""
+        began, ended = time.monotonic(), threading.Event()
+
+        def beat() -> None:
+            while not ended.wait(BEAT_EVERY_S / 10):
+                now = time.monotonic()
+                if now - self._said_at >= BEAT_EVERY_S:
+                    self.say(f"{what}: still at work, {now - began:.0f} s")
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    @contextlib.contextmanager
     def counting(self, what: str) -> Iterator[OnFile]:
         """Give a function to call with (done, total); now and then it says so in a line."""
         said_at = time.monotonic()
@@ -81,25 +109,55 @@ class Lines(Silent):
 
 
 class Terminal(Lines):
-    """Lines, and a bar for what is counted."""
+    """Lines, and below them one that moves: what is being done, a bar, and how long it has taken."""
+
+    def __init__(self, stream: TextIO | None = None):
+        super().__init__(stream)
+        self._bar = None
+        self._task = None
+
+    def say(self, text: str) -> None:
+        """Say what is being done, in a line of its own and in the moving one."""
+        if self._bar is None:
+            super().say(text)
+            return
+        self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._bar.update(self._task, description=text)
+
+    @contextlib.contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Show the moving line."""
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.table import Column
+
+        text = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True))
+        columns = (text, BarColumn(bar_width=20), TimeElapsedColumn())
+        with Progress(*columns, console=Console(file=self._stream), transient=True) as bar:
+            self._bar, self._task = bar, bar.add_task(what, total=None)
+            try:
+                yield
+            finally:
+                self._bar = None
 
     @contextlib.contextmanager
     def counting(self, what: str) -> Iterator[OnFile]:
-        """Give a function to call with (done, total), which moves a bar."""
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        """Give a function to call with (done, total), which moves the bar."""
         last = 0
-        with Progress(*columns, console=Console(file=self._stream), transient=True) as bar:
-            task = bar.add_task(what, total=None)
+        with self.working(what) if self._bar is None else contextlib.nullcontext():
+            bar, counted = self._bar, self._bar.add_task(what, total=None)
+            bar.update(self._task, visible=False)
 
             def on_file(done: int, total: int) -> None:
                 nonlocal last
                 last = done
-                bar.update(task, completed=done, total=total)
+                bar.update(counted, description=f"{what}: {done} of {total}", completed=done, total=total)
 
-            yield on_file
+            try:
+                yield on_file
+            finally:
+                bar.remove_task(counted)
+                bar.update(self._task, visible=True)
         if last:
             self.say(f"{what}: {last}")
 

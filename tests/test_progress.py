@@ -1,5 +1,6 @@
 import io
 import sys
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -62,3 +63,31 @@ def test_silence_says_nothing(capsys):
     with silent.counting("x") as on_file:
         on_file(1, 1)
     assert capsys.readouterr() == ("", "")
+
+
+def test_plain_progress_says_that_long_work_goes_on(monkeypatch):
+    monkeypatch.setattr("sealfit.progress.BEAT_EVERY_S", 0.05)
+    stream = io.StringIO()
+    progress = Lines(stream)
+    with progress.working("close-loop"):
+        while "still" not in stream.getvalue():
+            time.sleep(0.01)
+    said = stream.getvalue()
+    assert said.startswith("close-loop: still at work, 0 s\n")
+    time.sleep(0.1)
+    assert stream.getvalue() == said
+
+
+def test_a_terminal_shows_what_is_done_and_for_how_long():
+    stream = io.StringIO()
+    progress = Terminal(stream)
+    with progress.working("close-loop"):
+        with progress.counting("folds") as on_fold:
+            on_fold(1, 2)
+        progress.say("[round] 1")
+        shown = [column.render(progress._bar.tasks[0]) for column in progress._bar.columns]
+        assert str(shown[0]) == "[round] 1"
+        assert str(shown[2]) == "0:00:00"
+    assert stream.getvalue().splitlines()[:2] == ["folds: 1", "[round] 1"]
+    progress.say("done")
+    assert stream.getvalue().endswith("done\n")
