@@ -45,17 +45,7 @@ def is_kept(term: Term, config: Config) -> bool:
 
 
 def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str:
-    """Return a text that says where an effect is zero, or that it is not removed.
-
-    Parameters
-    ----------
-    term : Term
-        The effect on its channels.
-    values : mapping of str to float
-        Its fitted parameters.
-    config : Config
-        Condition columns, and units of the channels.
-    """
+    """Return a text that says where an effect is zero, or that it is not removed."""
     if is_kept(term, config):
         return KEPT
     labels = {name: config.units.label(name) for name in term.channels}

@@ -33,7 +33,7 @@ from sealfit.ingest.quality import STILL_RISING
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 ROUNDING = 1e-9  # Relative rounding error of the mean of equal numbers.
 CALENDAR = ("run_order", "elapsed_h")  # correlated with conditions, which are tested one after the other
-ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")
+ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")  # proportional to one another at steady speed
 
 
 @dataclass(frozen=True)

@@ -273,27 +273,13 @@ def silent(text: str) -> None:
 
 @dataclass(frozen=True)
 class Context:
-    """Settings of every round of the loop.
-
-    Parameters
-    ----------
-    config : Config
-        Error rate, rounds, folds and units.
-    effects : mapping
-        The catalogue, the user's own effects included.
-    say : callable
-        Called with a line on what is being done.
-    compare : bool
-        Whether the held-out error of rivals is computed too.
-    workers : int
-        Number of processes.
-    """
+    """Settings of every round of the loop."""
 
     config: Config
-    effects: Mapping[str, Effect]
-    say: Callable[[str], None] = silent
-    compare: bool = True
-    workers: int = 1
+    effects: Mapping[str, Effect]  # the catalogue, the user's own effects included
+    say: Callable[[str], None] = silent  # called with a line on what is being done
+    compare: bool = True  # whether the held-out error of rivals is computed too
+    workers: int = 1  # processes
 
 
 def confirmed(
@@ -306,20 +292,7 @@ def confirmed(
 ) -> AcceptedEffect | None:
     """Return the first of a round's best proposals that has a gain on held-out data; None if none has.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model.
-    proposals : sequence of Proposal
-        Best first.
-    samples : DataFrame
-        Raw samples with `residual_N`.
-    context : Context
-        Folds, seed and units.
-    number : int
-        Number of the round.
-    refused : list of RefusedEffect
-        The best proposal and the reason are appended if none is confirmed.
+    If none is confirmed, the best proposal and the reason are appended to `refused`.
     """
     config = context.config
     failed: list[RefusedEffect] = []

@@ -45,19 +45,7 @@ PHASES = tuple(np.arange(4) * np.pi / 4)
 def terms_of(
     candidate: Candidate, channels: Mapping[str, Channel], fitted: Fitted, effects: Mapping[str, Effect]
 ) -> Iterator[tuple[Term, dict]]:
-    """Yield every form that fits a candidate, with a grid for each nonlinear parameter.
-
-    Parameters
-    ----------
-    candidate : Candidate
-        The candidate of the search.
-    channels : mapping
-        Channels by name.
-    fitted : Fitted
-        The current model.
-    effects : mapping
-        The catalogue, the user's own effects included.
-    """
+    """Yield every form that fits a candidate, with a grid for each nonlinear parameter."""
     target = (candidate.acts_on, candidate.operation)
     if candidate.pair:
         pair = [channels[name] for name in candidate.channels]
@@ -186,15 +174,6 @@ def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FR
 
     A spline of up to five knots has them at quantiles and no penalty; one of more has even knots and a
     penalty.
-
-    Parameters
-    ----------
-    channel : Channel
-        The channel.
-    acts_on, operation : str
-        The target.
-    knots : int
-        Largest number of knots; five at least.
     """
     if channel.numeric:
         places = _knots(np.unique(channel.values), max(knots, FREE_DF + 1))
@@ -224,19 +203,7 @@ def _knots(distinct: np.ndarray, count: int) -> tuple[float, ...]:
 def periodic_terms(
     fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
 ) -> Iterator[tuple[Term, dict, Candidate]]:
-    """Yield the terms that a periodic component may be, each with its grid and a candidate.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model.
-    peak : Peak
-        The component.
-    samples : DataFrame
-        The samples it was found on.
-    effects : mapping
-        The catalogue.
-    """
+    """Yield the terms that a periodic component may be, each with its grid and a candidate."""
     rows = fitted.rows
     effect = effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"]
     both = np.unique(np.sign(rows.speed)).size == 2
@@ -349,17 +316,7 @@ STARTS = 4  # Start values of a law's nonlinear parameter, in days.
 def richer_laws(
     fitted: Fitted, channels: Mapping[str, Channel], effects: Mapping[str, Effect]
 ) -> list[tuple[Candidate, Proposal]]:
-    """Return each richer aging law with its test, adjusted for their number; none with 30 specimens or more.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model.
-    channels : mapping
-        Channels by name.
-    effects : mapping
-        The catalogue.
-    """
+    """Return each richer aging law with its adjusted test; none with 30 specimens or more."""
     specimens = fitted.rows.groups.starts["specimen"].size
     lawful = any(fitted.model.declared.law.values())
     if (

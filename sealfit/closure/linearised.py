@@ -85,11 +85,6 @@ class Linearised:
     """Fits terms to the residual in the tangent space of a model.
 
     Amplitudes are fitted exactly, other parameters on a grid.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model.
     """
 
     def __init__(self, fitted: Fitted) -> None:

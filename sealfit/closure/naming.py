@@ -52,18 +52,7 @@ def propose(
 ) -> list[Proposal]:
     """Return jointly refitted proposals for the channels that explain most of the residual, best first.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model.
-    significant : sequence of Candidate
-        Significant candidates, strongest first.
-    channels : mapping
-        Channels by name.
-    effects : mapping
-        The catalogue, the user's own effects included.
-    also : sequence of Proposal, optional
-        Further proposals.
+    The `significant` candidates are sorted, strongest first. `also` are further proposals.
     """
     linearised = Linearised(fitted)
     forms = [
@@ -92,19 +81,7 @@ def propose(
 def propose_ripples(
     fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
 ) -> list[Proposal]:
-    """Return jointly refitted proposals for a periodic component, best first.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model.
-    peak : Peak
-        The component.
-    samples : DataFrame
-        The samples it was found on, with `residual_N`.
-    effects : mapping
-        The catalogue.
-    """
+    """Return jointly refitted proposals for a periodic component, best first."""
     linearised = Linearised(fitted)
     found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
     return named_among(fitted, _best_few(found))

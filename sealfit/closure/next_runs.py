@@ -47,14 +47,7 @@ class Alias:
 def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str, ...]) -> list[Alias]:
     """Return the physical effects that are not distinguishable from the model with these runs.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The final model.
-    effects : mapping
-        The catalogue.
-    taken : tuple of str
-        Channels that define a condition: the model already has parameters per series.
+    `taken` are the channels that define a condition: the model already has parameters per series.
     """
     known = set(fitted.rows.channels) - set(taken)
     own = [e for e in effects.values() if e.physical and CHANNEL not in e.reads and set(e.reads) <= known]
@@ -131,17 +124,6 @@ def next_runs(
 
     The runs of files that were left out come first: they are to be repeated. Then there is a run for each
     effect, which would distinguish it from its nearest rival, and a run for each alias, which would show it.
-
-    Parameters
-    ----------
-    selection : Selection
-        The result of the loop.
-    config : Config
-        The rig.
-    effects : mapping
-        The catalogue.
-    outliers : sequence of OutlierFile
-        Files that were left out.
 
     Returns
     -------

@@ -48,11 +48,6 @@ def outlier_files(rows: Rows) -> list[OutlierFile]:
     gain that would explain it is significant beside the scatter of the others. These are then judged without
     it. In linear regression the test is that of the deletion residual (Cook & Weisberg 1982, *Residuals and
     Influence in Regression*, section 2.2.2).
-
-    Parameters
-    ----------
-    rows : Rows
-        All rows of the campaign.
     """
     rows = rows.sparse(ROWS)
     fitted, found = fit_declared(rows), []
@@ -90,7 +85,7 @@ def _suspects(fitted: Fitted) -> list[int]:
 def _without(fitted: Fitted, number: int) -> tuple[OutlierFile, Fitted]:
     """Return the test of one file, and the fit to the others.
 
-    The file's gain is a further parameter of the model, at the estisame and the scatter of the others.
+    The file's gain is a further parameter of the model, with the estimates and the scatter of the others.
     """
     rows, own = fitted.rows, fitted.rows.codes("file") == number
     kept = fit(fitted.model, rows.subset(~own), fitted.scatter, turns=2)

@@ -22,25 +22,13 @@ from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import channel_candidates, search_pairs
 from sealfit.fit.joint.estimate import Fitted, fit
 
-"""Channels that are proportional to one another along every stroke at a steady speed."""
-
 
 @dataclass(frozen=True)
 class Renaming:
-    """What renaming an effect needs besides the model.
-
-    Parameters
-    ----------
-    channels : mapping
-        Channels by name.
-    samples : DataFrame
-        Raw samples with `residual_N`.
-    context : Context
-        The catalogue, folds, seed and units.
-    """
+    """What renaming an effect needs besides the model."""
 
     channels: Mapping[str, Channel]
-    samples: pd.DataFrame
+    samples: pd.DataFrame  # raw, with `residual_N`
     context: Context
 
     def earlier_renamed(

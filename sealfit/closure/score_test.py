@@ -131,13 +131,7 @@ def _squares(columns: np.ndarray) -> np.ndarray:
 
 
 class ScoreTests:
-    """Score tests of columns of the force on the residual of a fit.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model at its optimum.
-    """
+    """Score tests of columns of the force on the residual of a fit."""
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted

@@ -62,17 +62,7 @@ MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
 def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
-    """Return every candidate with its adjusted p-value, strongest evidence first.
-
-    Parameters
-    ----------
-    tests : ScoreTests
-        Score tests of the current model.
-    channels : sequence of Channel
-        Channels to search.
-    rng : Generator
-        For the sign flips.
-    """
+    """Return every candidate with its adjusted p-value, strongest evidence first."""
     candidates = [c for channel in channels for c in channel_candidates(tests, channel)]
     return adjust_all(tests, candidates, rng) if candidates else []
 
@@ -178,19 +168,7 @@ NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
 def search_pairs(
     tests: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
-    """Return candidates of pairs, with p-values adjusted over single channels and pairs, strongest first.
-
-    Parameters
-    ----------
-    tests : ScoreTests
-        Score tests of the current model.
-    channels : sequence of Channel
-        Channels to search.
-    singles : sequence of Candidate
-        Candidates of the search of single channels on this model.
-    rng : Generator
-        For the sign flips.
-    """
+    """Return candidates of pairs, with p-values adjusted over single channels and pairs, strongest first."""
     combined = itertools.combinations(_usable(channels), 2)
     found = [c for pair in combined for c in _pair_candidates(tests, *pair)]
     if not found:
@@ -206,15 +184,6 @@ def equivalent_pairs(
 
     a describes how mu changes with days, v_s how it changes with speed. The pair explains the same structure,
     so it is fitted as well as the single channel, whatever its own p-value. The fits decide.
-
-    Parameters
-    ----------
-    tests : ScoreTests
-        Score tests of the current model.
-    significant : sequence of Candidate
-        Its significant candidates.
-    channels : mapping
-        Channels by name.
     """
     best: dict[frozenset, list[Candidate]] = {}
     for single in significant:
@@ -347,16 +316,7 @@ def search_masked_pairs(
 ) -> list[MaskedPair]:
     """Return the pairs that are significant jointly, most significant first.
 
-    Parameters
-    ----------
-    tests : ScoreTests
-        Score tests of the current model.
-    channels : mapping
-        Channels by name.
-    candidates : sequence of Candidate
-        Candidates of the searches of single channels and of pairs on this model.
-    alpha : float
-        Level of the search, and of each of the two given the other.
+    `alpha` is the level of the search, and of each of the two given the other.
     """
     tested = [(two, _joint_test(tests, two, level)) for two, level in _pairs(tests, channels, candidates)]
     tested = [(two, test) for two, test in tested if test is not None]

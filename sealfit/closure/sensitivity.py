@@ -394,15 +394,6 @@ def undetectable_variables(
     An effect is not detectable if it cannot reach the required p-value, and the variable varies along
     strokes, is the direction, or varies between fewer than five specimens; or if the units between which it
     varies scatter strongly, and an effect that explains all of that scatter would not have been found.
-
-    Parameters
-    ----------
-    selection : Selection
-        The result of the loop.
-    entries : sequence of dict
-        As returned by `sensitivity`.
-    scatter : sequence of dict
-        closure.json's `scatter`.
     """
     starts = selection.after.rows.groups.starts
     undetectable = []

@@ -345,12 +345,7 @@ def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
 class ClusterTests:
     """Tests on one number per unit of a fit.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model at its optimum.
-    level : str
-        Level of the units. Its groups share only the model.
+    The groups of the level share only the model.
     """
 
     def __init__(self, fitted: Fitted, level: str = "specimen") -> None:

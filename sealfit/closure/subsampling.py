@@ -69,12 +69,7 @@ def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
 
     The last has all runs. The cost of the first search depends on the model, not on the number of files.
 
-    Parameters
-    ----------
-    rows : Rows
-        The campaign, made of bins as returned by `numbered`.
-    seed : int
-        Seed of the draw.
+    The rows are made of bins as returned by `numbered`.
     """
     every, most, searched_before = _merged(rows, rows, seed), STROKES, 0
     strokes, runs = (rows.groups.starts[level].size for level in ("stroke", "run"))
@@ -129,12 +124,7 @@ def merged_bins(bins: pd.DataFrame, seed: int) -> pd.DataFrame:
     With very many strokes, some files drawn evenly over the campaign keep several rows per stroke, in
     `MOST_ROWS` rows together. The others keep their mean only.
 
-    Parameters
-    ----------
-    bins : DataFrame
-        As returned by `numbered`.
-    seed : int
-        Seed of the draw.
+    The bins are those that `numbered` returns.
     """
     strokes = bins["stroke_id"].nunique()
     if LEAST_PER_STROKE * strokes <= MOST_ROWS:
@@ -173,18 +163,7 @@ def reselect_on_all(
     rivals, each time on all strokes. Rivals on targets that are excluded by this are removed. Ripples were
     tested on the samples and are kept.
 
-    Parameters
-    ----------
-    selection : Selection
-        The result of the search of a part.
-    every : Rows
-        The campaign, merged along the strokes.
-    samples : DataFrame
-        The part's raw samples, with `residual_N`.
-    config : Config
-        Folds and seed.
-    say : callable
-        Called with a line on what is being done.
+    `every` has all rows, merged along the strokes, and `samples` the raw samples of the part.
     """
     added, after = list(selection.added), selection.after
     whole = fit(after.model, every, after.scatter, turns=1)
@@ -276,15 +255,6 @@ def missed_by_subsample(fitted: Fitted, selection: Selection, config: Config) ->
     """Return the channel that still explains the residual of all strokes but not of those searched; or "".
 
     Channels that were significant there are known already.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        The final model, fitted to all strokes.
-    selection : Selection
-        The result of the search of a part.
-    config : Config
-        Error rate, channels.
     """
     alpha = config.loop.family_error
     channels = searched(channels_of(fitted.rows, config), fitted.rows)
