@@ -149,32 +149,23 @@ class RestrictedLikelihood:
         for (level, k), v in zip(self.places, variances, strict=True):
             size[level][k] = v
         own = self.variance + self.loads**2 @ size[self.finest]
-        loads, columns = self.loads / own[:, None], self.columns / own[:, None]
-        # B' V^-1 B: 11, 12 and 22, each (groups,).
-        square = (loads[:, 0], loads[:, 1], loads[:, 1] * self.loads[:, 1])
-        cross = (columns, columns * self.loads[:, 1:])  # B' V^-1 [X r], a row of each, (groups, p + 1)
+        columns = self.columns / own[:, None]
+        # B' V^-1 B, shape (groups, 2, 2), and B' V^-1 [X r], shape (groups, 2, p + 1).
+        square = self.loads[:, :, None] * (self.loads / own[:, None])[:, None, :]
+        cross = self.loads[:, :, None] * columns[:, None, :]
         gram = self.layout[self.finest].gram(self.columns, columns)
         value = float(np.log(own).sum())
-        steps = [(square, cross)]
-        inner = []
+        steps, inner = [(square, cross)], []
         for level in self.above:
-            summing, _ = self.groups[level]
-            q = tuple(summing @ part for part in square)
-            t = tuple(summing @ part for part in cross)
-            m, logdet = _shrinkage(q, size[level])
-            mt = _applied(m, t)
-            value += float(logdet.sum())
-            gram -= self.layout[level].gram(t[0], mt[0]) + self.layout[level].gram(t[1], mt[1])
-            mq = _product(m, q)
-            left = (1.0 - mq[0], -mq[1], -mq[2], 1.0 - mq[3])
-            inner.append((m, mt, left))
-            # q - q m q and t - q m t, for the groups of this level
-            square = (
-                q[0] * left[0] + q[1] * left[2],
-                q[0] * left[1] + q[1] * left[3],
-                q[1] * left[1] + q[2] * left[3],
-            )
-            cross = tuple(x - y for x, y in zip(t, _applied(q, mt), strict=True))
+            q, t = (self._sums(part, level) for part in (square, cross))
+            root = np.sqrt(size[level])
+            both = np.eye(2) + root[:, None] * q * root
+            m = root[:, None] * np.linalg.inv(both) * root
+            value += float(np.linalg.slogdet(both)[1].sum())
+            mt = m @ t
+            gram -= sum(self.layout[level].gram(t[:, kind], mt[:, kind]) for kind in range(2))
+            inner.append((m, mt, np.eye(2) - m @ q))
+            square, cross = q - q @ m @ q, t - q @ mt
             steps.append((square, cross))
         chol = _root_of(gram[:-1, :-1])
         half = solve_triangular(chol, gram[:-1, -1], lower=True)
@@ -195,25 +186,19 @@ class RestrictedLikelihood:
                     n, y = m, mt
                 else:
                     code = self.groups[self.above[k + 1]][1]
-                    n = tuple(
-                        x + z for x, z in zip(m, _sandwich(left, tuple(x[code] for x in n)), strict=True)
-                    )
-                    first, second = (x[code] for x in y)
-                    y = (
-                        mt[0] + left[0][:, None] * first + left[1][:, None] * second,
-                        mt[1] + left[2][:, None] * first + left[3][:, None] * second,
-                    )
+                    n, y = m + left @ n[code] @ left.swapaxes(1, 2), mt + left @ y[code]
                 code = self.groups[self.above[k]][1]
-                cross = tuple(
-                    x - z for x, z in zip(cross, _applied(square, tuple(x[code] for x in y)), strict=True)
-                )
-                taken = _sandwich((square[0], square[1], square[1], square[2]), tuple(x[code] for x in n))
-                square = tuple(x - z for x, z in zip(square, taken, strict=True))
+                square, cross = square - square @ n[code] @ square, cross - square @ y[code]
             level = self.above[k - 1] if k else self.finest
             for kind in (kind for place, kind in self.places if place == level):
-                taken = np.vdot(self.layout[level].gram(cross[kind], cross[kind]), turned)
-                slope[level, kind] = float(square[2 * kind].sum()) - float(taken)
+                taken = np.vdot(self.layout[level].gram(cross[:, kind], cross[:, kind]), turned)
+                slope[level, kind] = float(square[:, kind, kind].sum()) - float(taken)
         return 0.5 * value, 0.5 * np.array([slope[place] for place in self.places])
+
+    def _sums(self, values: np.ndarray, level: str) -> np.ndarray:
+        """Return the sums over the groups of a level of values of the next finer groups, (groups, ...)."""
+        found = self.groups[level][0] @ values.reshape(len(values), -1)
+        return found.reshape(-1, *values.shape[1:])
 
 
 def _root_of(gram: np.ndarray) -> np.ndarray:
@@ -227,41 +212,6 @@ def _root_of(gram: np.ndarray) -> np.ndarray:
             if not np.isfinite(gram).all() or ridge > max(largest, 1.0):
                 raise
             ridge = max(100 * ridge, 1e-12 * largest)
-
-
-Symmetric = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""2 x 2 matrices by entries 11, 12 and 22, shape (groups,) each; faster than products of stacked matrices."""
-
-
-def _shrinkage(q: Symmetric, size: np.ndarray) -> tuple[Symmetric, np.ndarray]:
-    """Return (S^-1 + q)^-1 and log det (1 + S q), shape (groups,), for S = diag(size), which may be 0."""
-    a, b, c = 1.0 + size[0] * q[0], np.sqrt(size[0] * size[1]) * q[1], 1.0 + size[1] * q[2]
-    det = a * c - b * b
-    return (size[0] * c / det, -np.sqrt(size[0] * size[1]) * b / det, size[1] * a / det), np.log(det)
-
-
-def _applied(m: Symmetric, rows: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return m times two rows of columns, each (groups, columns)."""
-    off = m[1][:, None]
-    return m[0][:, None] * rows[0] + off * rows[1], off * rows[0] + m[2][:, None] * rows[1]
-
-
-def _product(m: Symmetric, q: Symmetric) -> tuple[np.ndarray, ...]:
-    """Return m q by its entries 11, 12, 21 and 22."""
-    return (
-        m[0] * q[0] + m[1] * q[1],
-        m[0] * q[1] + m[1] * q[2],
-        m[1] * q[0] + m[2] * q[1],
-        m[1] * q[1] + m[2] * q[2],
-    )
-
-
-def _sandwich(left: Sequence[np.ndarray], n: Symmetric) -> Symmetric:
-    """Return L n L' for L by its entries 11, 12, 21 and 22."""
-    a, b, c, d = left
-    first, second = a * n[0] + b * n[1], a * n[1] + b * n[2]
-    third, fourth = c * n[0] + d * n[1], c * n[1] + d * n[2]
-    return first * a + second * b, first * c + second * d, third * c + fourth * d
 
 
 def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
