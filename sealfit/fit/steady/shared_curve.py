@@ -171,7 +171,7 @@ class _Curve:
         self.speed, self.load, self.force, weight = stacked(own)
         self.root = np.sqrt(weight / widened[:, None])
         grid = even_grid(*search_limits(self.speed.reshape(1, -1), weight.reshape(1, -1)), PER_DECADE)[0]
-        rss = self._along(grid)
+        rss = [self._solve(u)[0] for u in grid]
         best = int(np.argmin(rss))
         ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
         found = minimize_scalar(
@@ -185,26 +185,6 @@ class _Curve:
         """Return the weighted columns of mu_s and mu_c, shape (conditions, runs, 2)."""
         decay = np.exp(-((self.speed / np.exp(log_v_s)) ** 2))
         return np.stack([decay, 1 - decay], axis=-1) * (self.load * self.root)[..., None]
-
-    def _along(self, log_v_s: np.ndarray) -> np.ndarray:
-        """Return the sums of squares at v_s values, shape (g,) -> (g,), as `_solve`, by Gram-Schmidt."""
-        columns = np.moveaxis(self._columns(log_v_s[:, None, None]), -1, 0)  # (2, g, conditions, runs)
-        size = np.linalg.norm(columns, axis=-1, keepdims=True)
-        longer = size[0] >= size[1]
-        first, other = np.where(longer, columns, columns[::-1]) / np.maximum(size.max(axis=0), 1e-300)
-        other = other - (other * first).sum(axis=-1, keepdims=True) * first
-        beyond = np.linalg.norm(other, axis=-1, keepdims=True)
-        second = np.divide(other, beyond, out=np.zeros(other.shape), where=beyond > RANK)
-        residuals = []
-        for rest in (self.force * self.root, self.speed * self.root):  # F and |v|
-            for column in (first, second):
-                rest = rest - (rest * column).sum(axis=-1, keepdims=True) * column
-            residuals.append(rest)
-        force, speed = residuals
-        own, cross, size = (
-            (one * other).sum(axis=(1, 2)) for one, other in ((force, force), (force, speed), (speed, speed))
-        )
-        return own - np.divide(np.maximum(cross, 0.0) ** 2, size, out=np.zeros(size.shape), where=size > 0)
 
     def _solve(self, log_v_s: float) -> tuple[float, np.ndarray, float, int]:
         """Return the sum of squares, mu_s and mu_c, (conditions, 2), sigma_2, and the rank of the levels."""
