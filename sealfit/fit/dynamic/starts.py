@@ -400,15 +400,10 @@ def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
     if half == 1:
         smooth, rate = along, np.gradient(along)
     else:
-        padded = np.pad(along, half, mode="edge")
-        away = np.arange(-half, half + 1)
-        square = half * (half + 1) * (2 * half + 1) / 3
-        weight = (
-            (3 * half**2 + 3 * half - 1 - 5 * away**2)
-            * 3
-            / ((2 * half - 1) * (2 * half + 1) * (2 * half + 3))
-        )
-        smooth, rate = np.correlate(padded, weight, "valid"), np.correlate(padded, away / square, "valid")
+        from scipy.signal import savgol_filter  # imported here: scipy.signal takes half a second to load
+
+        width = 2 * half + 1
+        smooth, rate = (savgol_filter(along, width, 2, deriv=k, mode="nearest") for k in (0, 1))
     return smooth, np.maximum(rate / np.gradient(time), 0.0)
 
 
