@@ -112,8 +112,6 @@ def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 # Grid values of the stiffness. The length of the rise goes from a third of a step to the whole stroke.
 STIFFNESSES = 40
-# Every such grid value is tried first, then all values around the best.
-COARSE = 4
 # Grid values of the damping: tau as a share of the duration of the rise.
 DAMPINGS = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0])
 # Samples between these shares of the rise determine its length.
@@ -317,20 +315,11 @@ class Rises:
         steps = self.step[self.step > 0]
         lengths = np.geomspace(0.3 * np.median(steps), self.step.sum(axis=1).max(), STIFFNESSES)
         pace = float(np.median(self.speed.max(axis=1)))
-        found = {}
-
-        def try_all(some: Sequence[int]) -> int:
-            for k in set(some) - set(found):
-                tau = DAMPINGS * lengths[k] / pace
-                squares = self._squares(level / lengths[k], tau)
-                best = int(np.argmin(squares))
-                found[k] = squares[best], tau[best]
-            return min(found, key=found.get)
-
-        best = try_all([*range(0, STIFFNESSES, COARSE), STIFFNESSES - 1])
-        best = try_all(range(max(best - COARSE + 1, 0), min(best + COARSE, STIFFNESSES)))
+        squares = np.array([self._squares(level / length, DAMPINGS * length / pace) for length in lengths])
+        best, damping = np.unravel_index(np.argmin(squares), squares.shape)
         low, high = np.log(level / lengths[[-1, 0]])
-        return np.array([np.log(level / lengths[best]), found[best][1]]), (float(low), float(high))
+        tau = DAMPINGS[damping] * lengths[best] / pace
+        return np.array([np.log(level / lengths[best]), tau]), (float(low), float(high))
 
     def _squares(self, sigma_0: float, tau: np.ndarray) -> np.ndarray:
         """Return the sums of squares at one stiffness and all dampings, shape of `tau`."""
