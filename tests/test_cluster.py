@@ -16,11 +16,10 @@ pytest.importorskip("distributed")
 
 from dask_here import DaskHere
 
-from sealfit.closure import loop, spectrum
+from sealfit.closure import loop
 from sealfit.engine.cluster import Cluster
 from sealfit.engine.run_map import on_cluster, run_map
 from sealfit.errors import RequestError, WorkerError
-from sealfit.fit.joint.estimate import fit_declared
 from sealfit.ingest import partitions
 from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED, STEPS, run
 from sealfit.progress import Silent
@@ -244,25 +243,4 @@ def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
     kills = KillsAt(dask.workers[1], "fold 1 of")
     run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
     assert kills.killed
-    assert_same_results(tmp_path / "there", here, closure)
-
-
-def test_the_search_on_a_cluster_gives_the_same_although_a_worker_is_killed(
-    campaign, tmp_path, dask, monkeypatch
-):
-    folder, (here, closure) = campaign
-    monkeypatch.setattr(partitions, "PART_FILES", 12)
-    monkeypatch.setattr(spectrum, "WORTHWHILE", 0)
-    monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
-    killed = []
-
-    def fit_while_spectra_are_made(rows):
-        if not killed:
-            dask.workers[0].send_signal(signal.SIGKILL)
-            killed.append(rows)
-        return fit_declared(rows)
-
-    monkeypatch.setattr("sealfit.closure.selection.fit_declared", fit_while_spectra_are_made)
-    run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file))
-    assert killed
     assert_same_results(tmp_path / "there", here, closure)

@@ -279,7 +279,7 @@ class Context:
     effects: Mapping[str, Effect]  # the catalogue, the user's own effects included
     say: Callable[[str], None] = silent  # called with a line on what is being done
     compare: bool = True  # whether the held-out error of rivals is computed too
-    workers: int = 1  # processes
+    workers: int = 1  # processes for the folds
 
 
 def confirmed(

@@ -59,7 +59,7 @@ def close_loop(
     config : Config
         The rig.
     workers : int
-        Processes for the folds and for the spectra of many samples.
+        Processes for the folds.
     on_progress : callable, optional
         Called with a line on what is being done.
     """

@@ -27,7 +27,7 @@ class Ripples:
     samples : DataFrame
         Steady samples, as returned by `steady_samples`.
     context : Context
-        Error rate, rounds, folds; processes for the spectra of many samples.
+        Error rate, rounds and folds.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Ripples:
             else []
         )
         common_phase = self.context.config.position_origin == "rig"
-        peak = find_ripple(self.samples, common_phase=common_phase, known=known, workers=self.context.workers)
+        peak = find_ripple(self.samples, common_phase=common_phase, known=known)
         return peak if peak is not None and peak.p_value <= self.context.config.loop.family_error else None
 
 

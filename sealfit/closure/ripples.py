@@ -51,7 +51,7 @@ AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 
 
 def find_ripple(
-    samples: pd.DataFrame, *, common_phase: bool, known: Sequence[tuple[str, float]] = (), workers: int = 1
+    samples: pd.DataFrame, *, common_phase: bool, known: Sequence[tuple[str, float]] = ()
 ) -> Peak | None:
     """Return the strongest periodic component of the samples' residual, or None if none can be tested.
 
@@ -63,11 +63,9 @@ def find_ripple(
         Whether displacement means the same place in every file (`position_origin = "rig"`).
     known : sequence of (axis, wavelength)
         Components in the model. Near them the residual contains their scatter between files.
-    workers : int
-        Number of processes, used with many samples.
     """
     peaks, locked = [], []
-    for spectrum in spectra_of(samples, AXES, known, workers=workers):
+    for spectrum in spectra_of(samples, AXES, known):
         if common_phase and spectrum.axis == "displacement_mm":
             peaks += _coherent(spectrum)
         elif spectrum.axis == "time_s":  # a wave may be locked to the start of the strokes

@@ -13,7 +13,6 @@ from scipy.sparse import csr_array
 from scipy.special import digamma, polygamma
 
 from sealfit.closure.criteria import LEAST_SAMPLES_OF_STROKE, LOBE, NEIGHBOURS, REACHED
-from sealfit.engine.run_map import run_map
 
 # ---------------------------------------------------------------- stroke signals
 # Strokes along an axis, each of which is interpolated on an even grid.
@@ -45,14 +44,6 @@ class Strokes:
         good = (size >= LEAST_SAMPLES_OF_STROKE) & (high > low)
         unit, direction = (samples[name].to_numpy()[start[good]] for name in ("unit", "direction"))
         return cls(place, residual, start[good], size[good], low[good], (high - low)[good], unit, direction)
-
-    def only(self, chosen: np.ndarray) -> Strokes:
-        """Return a subset of the strokes and their samples."""
-        size = self.size[chosen]
-        start = np.cumsum(size) - size
-        own = np.repeat(self.start[chosen] - start, size) + np.arange(size.sum())
-        others = (getattr(self, name)[chosen] for name in ("low", "span", "unit", "direction"))
-        return Strokes(self.place[own], self.residual[own], start, size, *others)
 
     def on_grids(self, chosen: np.ndarray, step: float, size: int) -> np.ndarray:
         """Return residuals of chosen strokes on even grids from their start, shape (strokes, size)."""
@@ -160,13 +151,11 @@ def background(power: np.ndarray) -> np.ndarray:
 # The spectrum of strokes along an axis, summed over units. Amplitudes of single units are not kept.
 #
 # Strokes that share a grid are transformed together, and units are added block by block, so that memory does
-# not grow with the campaign. Blocks and sums do not depend on the number of workers.
+# not grow with the campaign.
 
 MOST_NUMBERS = 1 << 19  # Grid points of a block: 4 MB.
-WORTHWHILE = 400_000  # Samples from which the transforms take longer than the start of worker processes.
 LEAST_STROKES = 3  # Fewest strokes of a spectrum.
 LEAST_FREQUENCIES = 4  # Fewest frequencies of a spectrum.
-EXPONENTS = 64  # Powers of a phase factor that are computed directly; the others are products of two.
 
 
 @dataclass(frozen=True)
@@ -194,9 +183,9 @@ class Spectrum:
 
 
 def spectra_of(
-    samples: pd.DataFrame, axes: Sequence[str], known: Sequence[tuple[str, float]] = (), *, workers: int = 1
+    samples: pd.DataFrame, axes: Sequence[str], known: Sequence[tuple[str, float]] = ()
 ) -> Iterator[Spectrum]:
-    """Return the spectra along some axes, without those with too few strokes or frequencies.
+    """Yield the spectra along some axes, without those with too few strokes or frequencies.
 
     A parabola is subtracted from each stroke, which is then tapered (Hann) and transformed on a grid that
     divides twice the longest stroke. All strokes have the same frequencies then. The longest wavelength is
@@ -210,59 +199,46 @@ def spectra_of(
         Columns along which to search.
     known : sequence of (axis, wavelength)
         Components in the model.
-    workers : int
-        Number of processes, used with many samples.
     """
-    surveys = [survey for axis in axes if (survey := _survey(samples, axis)) is not None]
-    workers = workers if len(samples) >= WORTHWHILE else 1
-    made = run_map(_sums_of, _Blocks(surveys), workers=workers, together=1)
-    return _summed(surveys, made, known)
+    for axis in axes:
+        grid = _Grid.of(Strokes.of(samples, axis))
+        if grid is not None:
+            yield _spectrum(grid, axis, [wavelength for own, wavelength in known if own == axis])
 
 
 @dataclass(frozen=True)
-class _Block:
-    """Strokes of whole units, the task of a worker. Frequencies are multiples of 1 / `longest`."""
+class _Grid:
+    """Strokes and their frequencies, multiples of 1 / `longest`."""
 
     strokes: Strokes
     points: np.ndarray  # (m,) grid points of each stroke per `longest`
     reach: np.ndarray  # (m,) number of frequencies that each stroke reaches
     numbers: np.ndarray  # (f,) multiples that are the frequencies
     longest: float  # length, or time, that all grids divide
-    sides: np.ndarray  # directions
 
-    def only(self, chosen: np.ndarray) -> _Block:
-        own = self.strokes.only(chosen), self.points[chosen], self.reach[chosen]
-        return _Block(*own, self.numbers, self.longest, self.sides)
-
-
-@dataclass(frozen=True)
-class _Survey:
-    """All strokes along one axis, and their division into blocks."""
-
-    axis: str
-    whole: _Block
-    blocks: list[np.ndarray]
-
-
-def _survey(samples: pd.DataFrame, axis: str) -> _Survey | None:
-    strokes = Strokes.of(samples, axis)
-    if strokes.span.size < LEAST_STROKES:
-        return None
-    step = strokes.span / (strokes.size - 1)
-    longest = float(2 * strokes.span.max())
-    distinct, number = np.unique(np.clip(np.ceil(longest / step), 8, 2**15).astype(int), return_inverse=True)
-    points = np.array([next_fast_len(int(n), real=True) for n in distinct])[number]
-    frequency = np.arange(min(2**15, int(np.ceil(longest / np.quantile(step, 0.1)))) // 2 + 1) / longest
-    reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / step, side="right"))
-    # strokes, at each frequency
-    reaching = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]
-    use = (frequency >= 2 / np.median(strokes.span)) & (reaching[: frequency.size] >= REACHED * reach.size)
-    if use.sum() < LEAST_FREQUENCIES:
-        return None
-    first, last = np.flatnonzero(use)[[0, -1]]  # contiguous, as fewer strokes reach further
-    reached, numbers = np.clip(reach, first, last + 1) - first, np.arange(first, last + 1)
-    whole = _Block(strokes, points, reached, numbers, longest, np.unique(strokes.direction))
-    return _Survey(axis, whole, _parts(strokes.unit, points))
+    @classmethod
+    def of(cls, strokes: Strokes) -> _Grid | None:
+        if strokes.span.size < LEAST_STROKES:
+            return None
+        step = strokes.span / (strokes.size - 1)
+        longest = float(2 * strokes.span.max())
+        distinct, number = np.unique(
+            np.clip(np.ceil(longest / step), 8, 2**15).astype(int), return_inverse=True
+        )
+        points = np.array([next_fast_len(int(n), real=True) for n in distinct])[number]
+        most = min(2**15, int(np.ceil(longest / np.quantile(step, 0.1))))
+        frequency = np.arange(most // 2 + 1) / longest
+        reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / step, side="right"))
+        # strokes, at each frequency
+        reaching = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]
+        use = (frequency >= 2 / np.median(strokes.span)) & (
+            reaching[: frequency.size] >= REACHED * reach.size
+        )
+        if use.sum() < LEAST_FREQUENCIES:
+            return None
+        first, last = np.flatnonzero(use)[[0, -1]]  # contiguous, as fewer strokes reach further
+        reached, numbers = np.clip(reach, first, last + 1) - first, np.arange(first, last + 1)
+        return cls(strokes, points, reached, numbers, longest)
 
 
 def _parts(unit: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
@@ -274,22 +250,6 @@ def _parts(unit: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     begin = np.flatnonzero(np.r_[True, np.diff(code[order]) != 0])
     part = np.cumsum(points[order])[begin] // MOST_NUMBERS
     return np.split(order, begin[1:][np.diff(part) > 0])
-
-
-class _Blocks(Sequence):
-    """The blocks of all surveys, each created on access."""
-
-    def __init__(self, surveys: Sequence[_Survey]) -> None:
-        self.places = [(survey.whole, chosen) for survey in surveys for chosen in survey.blocks]
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-    def __getitem__(self, number):
-        if isinstance(number, slice):
-            return [whole.only(chosen) for whole, chosen in self.places[number]]
-        whole, chosen = self.places[number]
-        return whole.only(chosen)
 
 
 @dataclass(frozen=True)
@@ -313,17 +273,19 @@ class _Sums:
         return _Sums(*(getattr(self, part.name) + getattr(other, part.name) for part in fields(self)))
 
 
-def _sums_of(block: _Block) -> _Sums:
-    sides, width = block.sides, int(block.reach.max())
-    sums = _Sums.none(block.numbers.size, min(sides.size, 2))
+def _sums_of(grid: _Grid, chosen: np.ndarray) -> _Sums:
+    """Return the sums over the chosen strokes, which are those of whole units."""
+    direction, reach = grid.strokes.direction[chosen], grid.reach[chosen]
+    sides, width = np.unique(grid.strokes.direction), int(reach.max())
+    sums = _Sums.none(grid.numbers.size, min(sides.size, 2))
     if not width:  # the strokes reach none of the frequencies
         return sums
-    units, unit = np.unique(block.strokes.unit, return_inverse=True)
-    passes = unit * sides.size + np.searchsorted(sides, block.strokes.direction)
+    units, unit = np.unique(grid.strokes.unit[chosen], return_inverse=True)
+    passes = unit * sides.size + np.searchsorted(sides, direction)
     each = np.arange(unit.size)
     summing = csr_array((np.ones(unit.size), (passes, each)), (units.size * sides.size, unit.size))
-    known = summing @ (np.arange(width) < block.reach[:, None]).astype(float)
-    wave = summing @ _transformed(block) / np.maximum(known, 1)
+    known = summing @ (np.arange(width) < reach[:, None]).astype(float)
+    wave = summing @ _transformed(grid, chosen) / np.maximum(known, 1)
     wave, known = (part.reshape(units.size, sides.size, width) for part in (wave, known > 0))
     power = _power(wave)
     mean = power.sum(axis=2) / np.maximum(known.sum(axis=2), 1)
@@ -331,7 +293,7 @@ def _sums_of(block: _Block) -> _Sums:
     sums.square[:width] = power.sum(axis=(0, 1))
     sums.power[:width] = (power / np.maximum(mean, 1e-300)[:, :, None]).sum(axis=(0, 1))
     most = np.zeros(units.size, dtype=int)
-    np.maximum.at(most, unit, block.reach)
+    np.maximum.at(most, unit, reach)
     for k in range(sums.units.size):
         own = np.einsum("usf,s->uf", wave, sides) if k else wave.sum(axis=1)
         power = _power(own)
@@ -344,23 +306,20 @@ def _sums_of(block: _Block) -> _Sums:
     return sums
 
 
-def _transformed(block: _Block) -> np.ndarray:
+def _transformed(grid: _Grid, chosen: np.ndarray) -> np.ndarray:
     """Return complex amplitudes of strokes with phases from place 0, (strokes, most); 0 beyond reach."""
-    strokes, points, reach = block.strokes, block.points, block.reach
+    points, reach, low = grid.points[chosen], grid.reach[chosen], grid.strokes.low[chosen]
     found = np.zeros((reach.size, int(reach.max())), dtype=complex)
-    size = np.ceil(strokes.span * points / block.longest).astype(int)
+    size = np.ceil(grid.strokes.span[chosen] * points / grid.longest).astype(int)
     for length, count in np.unique(np.column_stack([points, size]), axis=0):
         same_size = np.flatnonzero((points == length) & (size == count))
         trend, taper = _on_grid(count)
-        value = strokes.on_grids(same_size, block.longest / length, count)
+        value = grid.strokes.on_grids(chosen[same_size], grid.longest / length, count)
         value -= (value @ trend) @ trend.T
         width = int(reach[same_size].max())
-        wave = np.fft.rfft(value * taper, length)[:, block.numbers[0] : block.numbers[0] + width]
+        wave = np.fft.rfft(value * taper, length)[:, grid.numbers[0] : grid.numbers[0] + width]
         found[same_size, :width] = np.where(np.arange(width) < reach[same_size, None], wave, 0.0)
-    turn = -2j * np.pi / block.longest * strokes.low[:, None]
-    many, few = np.divmod(block.numbers[: found.shape[1]], EXPONENTS)  # a product is cheaper than a power
-    found *= np.exp(turn * EXPONENTS * np.arange(many[-1] + 1))[:, many]
-    return found * np.exp(turn * np.arange(EXPONENTS))[:, few]
+    return found * np.exp(-2j * np.pi / grid.longest * low[:, None] * grid.numbers[: found.shape[1]])
 
 
 @lru_cache(maxsize=512)  # strokes of one speed share their grid
@@ -384,21 +343,17 @@ def _medians(values: np.ndarray, count: np.ndarray) -> np.ndarray:
     return found
 
 
-def _summed(
-    surveys: Sequence[_Survey], made: Iterator[_Sums], known: Sequence[tuple[str, float]]
-) -> Iterator[Spectrum]:
-    for survey in surveys:
-        numbers, longest = survey.whole.numbers, survey.whole.longest
-        sums = next(made)
-        for _ in survey.blocks[1:]:
-            sums = sums + next(made)
-        frequency, count = numbers / longest, np.maximum(sums.count, 1)
-        taken = np.zeros(frequency.size, dtype=bool)
-        for axis, wavelength in known:
-            taken |= (axis == survey.axis) & (np.abs(frequency - 1 / wavelength) <= LOBE / longest)
-        common = tuple(
-            Common(k == 0, sums.total[k], sums.scaled[k], int(units), sums.amplitude[k] / count)
-            for k, units in enumerate(sums.units)
-        )
-        amplitude = np.sqrt(sums.square / count)
-        yield Spectrum(survey.axis, frequency, sums.count, sums.power / count, amplitude, common, taken)
+def _spectrum(grid: _Grid, axis: str, known: Sequence[float]) -> Spectrum:
+    sums = _Sums.none(grid.numbers.size, min(np.unique(grid.strokes.direction).size, 2))
+    for chosen in _parts(grid.strokes.unit, grid.points):
+        sums = sums + _sums_of(grid, chosen)
+    frequency, count = grid.numbers / grid.longest, np.maximum(sums.count, 1)
+    taken = np.zeros(frequency.size, dtype=bool)
+    for wavelength in known:
+        taken |= np.abs(frequency - 1 / wavelength) <= LOBE / grid.longest
+    common = tuple(
+        Common(k == 0, sums.total[k], sums.scaled[k], int(units), sums.amplitude[k] / count)
+        for k, units in enumerate(sums.units)
+    )
+    amplitude = np.sqrt(sums.square / count)
+    return Spectrum(axis, frequency, sums.count, sums.power / count, amplitude, common, taken)

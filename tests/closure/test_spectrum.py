@@ -4,7 +4,6 @@ import pandas as pd
 import pytest
 
 from sealfit.closure import spectrum
-from sealfit.closure.ripples import AXES
 from sealfit.closure.spectrum import spectra_of
 
 LENGTH_MM, A_N, PHASE = 2.5, 0.3, 0.8
@@ -110,17 +109,3 @@ def test_what_is_in_the_model_already_is_taken():
     )
     step = found.frequency[1] - found.frequency[0]
     npt.assert_array_equal(found.taken, np.abs(found.frequency - 1 / 5.1) <= 4 * step)
-
-
-def test_spectra_of_two_workers_are_those_of_one(monkeypatch):
-    monkeypatch.setattr(spectrum, "WORTHWHILE", 0)
-    monkeypatch.setattr(spectrum, "MOST_NUMBERS", 3000)
-    samples = samples_of(many_strokes())
-    one, two = (list(spectra_of(samples, AXES, workers=workers)) for workers in (1, 2))
-    assert [found.axis for found in one] == list(AXES)
-    for left, right in zip(one, two, strict=True):
-        for name in ("frequency", "count", "power", "amplitude", "taken"):
-            npt.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
-        for a, b in zip(left.common, right.common, strict=True):
-            npt.assert_array_equal(a.total, b.total)
-            npt.assert_array_equal(a.amplitude, b.amplitude)
