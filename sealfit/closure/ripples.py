@@ -144,16 +144,19 @@ def _incoherent(spectrum: Spectrum) -> Peak:
 
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
-    """Return the wavelength at the parabola through the highest point of a peak and its two neighbours."""
+    """Return the wavelength at the highest point of a peak."""
     first = max(k - LOBE, 0)
-    k = first + int(np.argmax(power[first : k + LOBE + 1]))
+    return 1 / _summit(frequency, power, first + int(np.argmax(power[first : k + LOBE + 1])))
+
+
+def _summit(places: np.ndarray, power: np.ndarray, k: int) -> float:
+    """Return the maximum of a sampled curve, by the parabola through its highest point and two neighbours."""
     if 0 < k < power.size - 1:
         left, middle, right = power[k - 1 : k + 2]
         curvature = left - 2 * middle + right
         if curvature < 0:
-            shift = 0.5 * (left - right) / curvature
-            return float(1 / (frequency[k] + shift * (frequency[1] - frequency[0])))
-    return float(1 / frequency[k])
+            return float(places[k] + 0.25 * (left - right) / curvature * (places[k + 1] - places[k - 1]))
+    return float(places[k])
 
 
 # ---------------------------------------------------------------- stroke phases
@@ -165,7 +168,6 @@ def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
 # strokes of a pass share the sine and the cosine. The resolution is not limited by bins or frequencies, and a
 # wave of a few periods is separated from the trend.
 
-MOST_NUMBERS = 1 << 14  # Samples times wavelengths that are computed at once.
 AROUND = np.linspace(-0.5, 0.5, 101)  # Periods per stroke on each side of a peak that are refined.
 
 
@@ -205,23 +207,14 @@ def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
     axis : str
         Column along which the wave runs.
     """
-    return _waves(Strokes.of(samples, axis), lengths)
-
-
-def _waves(strokes: Strokes, lengths: np.ndarray) -> Waves:
-    square, product = (
-        np.zeros((strokes.size.size, lengths.size, 2, 2)),
-        np.zeros((strokes.size.size, lengths.size, 2)),
-    )
-    total, middle = np.zeros((2, strokes.size.size))
-    for size in np.unique(strokes.size).tolist():  # strokes of one size together, in parts that fit the cache
-        same_size = np.flatnonzero(strokes.size == size)
-        for some in np.array_split(
-            same_size, min(same_size.size, -(-same_size.size * size * lengths.size // MOST_NUMBERS))
-        ):
-            place, value = strokes.together(some)
-            square[some], product[some], total[some] = _normal_equations(place, value, lengths)
-            middle[some] = place.mean(axis=1)
+    strokes = Strokes.of(samples, axis)
+    count = strokes.size.size
+    square, product = np.zeros((count, lengths.size, 2, 2)), np.zeros((count, lengths.size, 2))
+    total, middle = np.zeros((2, count))
+    for k in range(count):
+        place, value = strokes.along(k)
+        square[k], product[k], total[k] = _normal_equations(place, value, lengths)
+        middle[k] = place.mean()
     order = np.lexsort((strokes.direction, strokes.unit))
     unit, direction = strokes.unit[order], strokes.direction[order]
     first = np.flatnonzero(np.r_[True, (np.diff(unit) != 0) | (np.diff(direction) != 0)][: order.size])
@@ -236,20 +229,17 @@ def _waves(strokes: Strokes, lengths: np.ndarray) -> Waves:
 
 def _normal_equations(
     place: np.ndarray, value: np.ndarray, lengths: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `square`, `product` and `total` of strokes of n samples each, shape (s, n), sorted by place."""
-    root = np.sqrt(np.hanning(place.shape[1] + 2)[1:-1])[:, None]
-    even = 2 * (place - place.mean(axis=1, keepdims=True)) / np.ptp(place, axis=1, keepdims=True)
-    trend, _ = np.linalg.qr(root * even[:, :, None] ** [2, 1, 0])
-    turn = 2 * np.pi * place[:, :, None] / lengths
-    columns = root * np.concatenate([np.sin(turn), np.cos(turn), value[:, :, None]], axis=2)
-    columns -= trend @ (trend.transpose(0, 2, 1) @ columns)
-    sine, cosine, y = columns[:, :, : lengths.size], columns[:, :, lengths.size : -1], columns[:, :, -1:]
-    product = np.stack([(sine * y).sum(axis=1), (cosine * y).sum(axis=1)], axis=-1)
-    square = np.empty((*product.shape, 2))
-    square[..., 0, 0], square[..., 1, 1] = (sine * sine).sum(axis=1), (cosine * cosine).sum(axis=1)
-    square[..., 0, 1] = square[..., 1, 0] = (sine * cosine).sum(axis=1)
-    return square, product, (y * y).sum(axis=(1, 2))
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return `square`, `product` and `total` of a stroke of n samples, shape (n,), sorted by place."""
+    root = np.sqrt(np.hanning(place.size + 2)[1:-1])[:, None]
+    even = 2 * (place - place.mean()) / np.ptp(place)
+    trend, _ = np.linalg.qr(root * np.vander(even, 3))
+    turn = 2 * np.pi * place[:, None] / lengths
+    columns = root * np.column_stack([np.sin(turn), np.cos(turn), value])
+    columns -= trend @ (trend.T @ columns)
+    waves, y = columns[:, :-1].reshape(place.size, 2, lengths.size), columns[:, -1]
+    square = np.einsum("nim,njm->mij", waves, waves)
+    return square, np.einsum("nim,n->mi", waves, y), float(y @ y)
 
 
 def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tuple[float, float]:
@@ -257,9 +247,8 @@ def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tu
 
     The error is a jackknife over files.
     """
-    strokes = Strokes.of(samples, axis)
-    lengths = 1 / (1 / wavelength + AROUND / np.median(strokes.span))
-    waves = _waves(strokes, lengths)
+    lengths = 1 / (1 / wavelength + AROUND / np.median(Strokes.of(samples, axis).span))
+    waves = waves_of(samples, lengths, axis)
     files, file = np.unique(waves.unit, return_inverse=True)
     share = np.zeros((len(files), lengths.size))
     np.add.at(share, file, waves.share)
@@ -269,13 +258,8 @@ def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tu
 
 
 def _top(lengths: np.ndarray, power: np.ndarray) -> float:
-    """Return the maximum of a sampled curve, by the parabola through its highest point and two neighbours."""
-    k = int(np.clip(np.argmax(power), 1, power.size - 2))
-    left, middle, right = power[k - 1 : k + 2]
-    curvature = left - 2 * middle + right
-    if curvature >= 0:
-        return float(lengths[k])
-    return float(lengths[k] + 0.25 * (left - right) / curvature * (lengths[k + 1] - lengths[k - 1]))
+    """Return the maximum of a sampled curve between its ends."""
+    return _summit(lengths, power, int(np.clip(np.argmax(power), 1, power.size - 2)))
 
 
 def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis: str) -> np.ndarray:

@@ -59,12 +59,6 @@ class Strokes:
         order = np.argsort(self.place[own], kind="stable")
         return self.place[own][order], self.residual[own][order]
 
-    def together(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return places and residuals of strokes of n samples each, sorted by place, both (strokes, n)."""
-        own = self.start[chosen, None] + np.arange(self.size[chosen[0]])
-        order = np.argsort(self.place[own], axis=1, kind="stable")
-        return np.take_along_axis(self.place[own], order, 1), np.take_along_axis(self.residual[own], order, 1)
-
 
 # ---------------------------------------------------------------- background
 # The background of a spectrum at each frequency, from its neighbours.
