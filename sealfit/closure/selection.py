@@ -381,31 +381,20 @@ def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitt
     The weakest is removed first, and after a removal all are tested again. Ripples are kept: they were tested
     on the raw samples.
     """
-    kept: set[int] = set()
     while True:
-        # An effect with a larger Wald statistic is not redundant, and is not refitted.
-        size = {
-            k: _wald_statistic(fitted, k) - 2 * a.proposal.bic_penalty
+        without = {
+            k: fit(
+                fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction
+            )
             for k, a in enumerate(added[:-1])
             if not a.proposal.term.effect.periodic
         }
-        k = min((k for k in size if size[k] <= 0 and k not in kept), key=size.__getitem__, default=None)
-        if k is None:
+        worth = {
+            k: other.deviance - fitted.deviance - added[k].proposal.bic_penalty
+            for k, other in without.items()
+        }
+        k = min(worth, key=worth.get, default=None)
+        if k is None or worth[k] >= 0:
             return fitted, added
-        without = fit(
-            fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction
-        )
-        if without.deviance - fitted.deviance < added[k].proposal.bic_penalty:
-            fitted = fit(without.model, fitted.rows, fitted.scatter, turns=1)
-            added, kept = [*added[:k], *added[k + 1 :]], set()
-        else:
-            kept.add(k)
-
-
-def _wald_statistic(fitted: Fitted, number: int) -> float:
-    """Return the Wald statistic of an effect's amplitudes."""
-    at = fitted.model.term_slice(number).start
-    effect, values = fitted.model.terms[number].effect, fitted.model.values[number]
-    places = [at + k for k, p in enumerate(effect.parameters) if p.linear]
-    amplitude = np.array([values[p.name] for p in effect.parameters if p.linear])
-    return float(amplitude @ np.linalg.pinv(fitted.covariance[np.ix_(places, places)]) @ amplitude)
+        fitted = fit(without[k].model, fitted.rows, fitted.scatter, turns=1)
+        added = [*added[:k], *added[k + 1 :]]

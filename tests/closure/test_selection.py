@@ -24,10 +24,6 @@ def fit(model, *given, **options):
     )
 
 
-def wald_statistic(fitted, number):
-    return DEVIANCE[fitted.model.without_term(number).terms] - fitted.deviance
-
-
 def effect(letter, *, periodic=False):
     form = SimpleNamespace(effect=SimpleNamespace(periodic=periodic))
     return SimpleNamespace(name=letter, proposal=SimpleNamespace(term=form, bic_penalty=PENALTY))
@@ -35,7 +31,6 @@ def effect(letter, *, periodic=False):
 
 def left(monkeypatch, added):
     monkeypatch.setattr(selection, "fit", fit)
-    monkeypatch.setattr(selection, "_wald_statistic", wald_statistic)
     fitted, kept = selection._remove_redundant(fit(Model("abc")), added)
     assert fitted.model.terms == "".join(a.name for a in kept)
     return fitted.model.terms
