@@ -46,7 +46,7 @@ def terms_of(
     candidate: Candidate, channels: Mapping[str, Channel], fitted: Fitted, effects: Mapping[str, Effect]
 ) -> Iterator[tuple[Term, dict]]:
     """Yield every form that fits a candidate, with a grid for each nonlinear parameter."""
-    target = (candidate.acts_on, candidate.operation)
+    target = candidate.target
     if candidate.pair:
         pair = [channels[name] for name in candidate.channels]
         alone = fitted.scatter.estimates("specimen") or all(c.unit != "specimen" for c in pair)

@@ -77,8 +77,7 @@ class Proposal:
         kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
         is_offset = self.source == ZERO_OFFSET  # amplifier offsets are commoner than one-sided friction
         position = -1 if is_offset else PREFERRED.index(self.term.acts_on)
-        target = (self.term.acts_on, self.term.operation)
-        return (kind, self.size, position, effect.acts_on.index(target) if effect.physical else 0)
+        return (kind, self.size, position, effect.acts_on.index(self.term.target) if effect.physical else 0)
 
 
 class Linearised:
@@ -101,7 +100,7 @@ class Linearised:
             point, most, shape = self._best(term, finer, self._made(term, finer))
         if not most > 0:
             return []
-        left = project(fitted, fitted.slope(term.acts_on, term.operation)[:, None] * shape)
+        left = project(fitted, fitted.slope(*term.target)[:, None] * shape)
         size = None
         if term.smoothness is None:
             amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
@@ -122,7 +121,7 @@ class Linearised:
         self, term: Term, points: list[dict[str, float]], shapes: np.ndarray
     ) -> tuple[dict[str, float], float, np.ndarray]:
         """Return the best point of a grid, the sum of squares it explains and its shapes, (n, amplitudes)."""
-        slope, count = self.fitted.slope(term.acts_on, term.operation), len(term.effect.linear)
+        slope, count = self.fitted.slope(*term.target), len(term.effect.linear)
         parts = range(0, shapes.shape[1], PART * count)
         chi2 = np.concatenate(
             [_explained(self.fitted, slope[:, None] * shapes[:, k : k + PART * count], count) for k in parts]

@@ -126,15 +126,11 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
             continue
         if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
-    known, most = {_target(p) for p in kept}, max((p.chi2 for p in found), default=0.0)
-    for target in dict.fromkeys(_target(p) for p in ranked if p.chi2 >= CONTENDER_SHARE * most):
+    known, most = {p.term.target for p in kept}, max((p.chi2 for p in found), default=0.0)
+    for target in dict.fromkeys(p.term.target for p in ranked if p.chi2 >= CONTENDER_SHARE * most):
         if target not in known:
-            kept += [p for p in ranked if _target(p) == target][:FORMS_EACH]
+            kept += [p for p in ranked if p.term.target == target][:FORMS_EACH]
     return kept
-
-
-def _target(proposal: Proposal) -> tuple[str, str]:
-    return proposal.term.acts_on, proposal.term.operation
 
 
 def _kind(proposal: Proposal) -> tuple[str, int]:
@@ -210,10 +206,7 @@ def _simpler(proposal: Proposal, best: Proposal) -> bool:
 
     A quantity of the declared model is preferred to a factor on the whole force.
     """
-    gain = (best.term.acts_on, best.term.operation) == (
-        "force",
-        "multiply",
-    ) and proposal.term.acts_on != "force"
+    gain = best.term.target == ("force", "multiply") and proposal.term.acts_on != "force"
     plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET or gain
     return plain and correlation(proposal, best) > SAME_EFFECT and proposal.bic - best.bic < 2 * EQUAL_BIC
 
@@ -292,7 +285,7 @@ def _refitted_under(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter)
     begun: dict[tuple[str, str], np.ndarray] = {}
     for proposal in found:
         model = fitted.model.with_term(proposal.term, proposal.values)
-        target = _target(proposal)
+        target = proposal.term.target
         if target in begun:
             model = solve_linear(replace(model, theta=begun[target]), rows, scatter, friction)
         else:

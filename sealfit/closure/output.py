@@ -286,7 +286,7 @@ def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
         return None
     rows = after.rows
     values = np.abs(rows.speed) if term.channels[0] == "speed_mm_s" else rows.values(term.channels[0])
-    free = free_term(Channel(term.channels[0], values, unit_of(values, rows)), term.acts_on, term.operation)
+    free = free_term(Channel(term.channels[0], values, unit_of(values, rows)), *term.target)
     model = after.model.without_term(number).with_term(free, {p.name: 0.0 for p in free.effect.parameters})
     fitted = fit(model, rows, after.scatter, turns=0)
     shape = free.effect.shape({free.effect.reads[0]: x, **free.fixed}, **fitted.model.values[-1])

@@ -140,9 +140,7 @@ class Renaming:
         found = sorted(finest.values(), key=lambda c: -c.chi2)
         own, values = fitted.model.terms[number], fitted.model.values[number]
         at_own_values = {p.name: (values[p.name],) for p in own.effect.nonlinear}
-        same_target = next(
-            (c for c in found if (c.acts_on, c.operation) == (own.acts_on, own.operation)), None
-        )
+        same_target = next((c for c in found if c.target == own.target), None)
         own_form = Linearised(without)(own, at_own_values, same_target) if same_target is not None else ()
         return propose(without, found, self.channels, self.context.effects, own_form)
 

@@ -236,12 +236,7 @@ def channels_of(term: Term, rows: Rows) -> list[str]:
     names = list(term.channels)
     both_ways = rows.speed.min() < 0 < rows.speed.max()
     coarse = all(FINER[unit_of(rows.values(name), rows)] > FINER["stroke"] for name in names)
-    if (
-        both_ways
-        and coarse
-        and (term.acts_on, term.operation) == ("force", "add")
-        and "direction" not in names
-    ):
+    if both_ways and coarse and term.target == ("force", "add") and "direction" not in names:
         names.insert(0, "direction")
     return names
 
@@ -377,7 +372,7 @@ def _largest(fitted: Fitted, candidates: Sequence[Candidate]) -> Candidate | Non
     best, most = None, 0.0
     root = np.sqrt(fitted.rows.weight)
     for candidate in candidates:
-        slope = fitted.slope(candidate.acts_on, candidate.operation)
+        slope = fitted.slope(*candidate.target)
         columns = candidate.columns * (slope * root)[:, None]
         found, *_ = np.linalg.lstsq(columns, fitted.residual * root, rcond=1e-10)
         explained = float(((columns @ found) ** 2).sum())

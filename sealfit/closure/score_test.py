@@ -86,9 +86,14 @@ class Candidate:
     pair: bool = False  # whether it is an interaction of two channels
 
     @property
+    def target(self) -> tuple[str, str]:
+        """What it acts on, and the operation."""
+        return self.acts_on, self.operation
+
+    @property
     def key(self) -> tuple:
         """Its channels and target."""
-        return (self.channels, self.acts_on, self.operation)
+        return (self.channels, *self.target)
 
     @property
     def consistent(self) -> bool:

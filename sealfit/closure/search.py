@@ -193,7 +193,9 @@ def equivalent_pairs(
         members = _usable([channels[name] for name in sorted(pair)])
         found = _pair_candidates(tests, *members) if len(members) == 2 else []
         strongest = [
-            max(own, key=lambda c: c.chi2) for t in MAIN_TARGETS if (own := [c for c in found if _on(c, t)])
+            max(own, key=lambda c: c.chi2)
+            for t in MAIN_TARGETS
+            if (own := [c for c in found if c.target == t])
         ]
         best[pair] = [
             replace(
@@ -202,10 +204,6 @@ def equivalent_pairs(
             for c in strongest
         ]
     return list(itertools.chain.from_iterable(best.values()))
-
-
-def _on(candidate: Candidate, target: tuple[str, str]) -> bool:
-    return (candidate.acts_on, candidate.operation) == target
 
 
 def _usable(channels: Sequence[Channel]) -> list[Channel]:
@@ -336,7 +334,7 @@ def _pairs(
     straight = [c for c in candidates if c.columns.shape[1] == 1 and c.claimable]
     between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
     level = {id(c): scatter_level(between[c.channels] or [channels["direction"]], rows) for c in straight}
-    lines = [c for c in straight if not c.pair and (c.acts_on, c.operation) in _targets(c)]
+    lines = [c for c in straight if not c.pair and c.target in _targets(c)]
     lines = list({c.key: c for c in reversed(lines)}.values())
     products = [c for c in straight if c.pair]
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
@@ -372,7 +370,7 @@ def _joint_test(
     Of several variants the weakest result counts. None if they are no pair.
     """
     fitted = tests.fitted
-    columns = np.column_stack([c.columns * fitted.slope(c.acts_on, c.operation)[:, None] for c in two])
+    columns = np.column_stack([c.columns * fitted.slope(*c.target)[:, None] for c in two])
     unit = min((c.unit for c in two), key=lambda name: fitted.rows.groups.starts[name].size)
     white = fitted.whitening(columns)
     numbers = tests.cluster_tests[level].along(_larger_column(white, fitted.rows.groups, level))

@@ -322,7 +322,7 @@ def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set
     """
     strongest: dict[str, Candidate] = {}
     for c in candidates:  # strongest evidence first
-        if c.p_value <= alpha and (c.acts_on, c.operation) in MAIN_TARGETS:
+        if c.p_value <= alpha and c.target in MAIN_TARGETS:
             strongest.setdefault(c.channels[-1], c)
     return {name for name, c in strongest.items() if not c.consistent} - {"direction"}
 
@@ -356,7 +356,7 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
     keys = {c.key for c in significant}
     for strong in significant:
         for c in candidates:
-            same_target = (c.acts_on, c.operation) == (strong.acts_on, strong.operation)
+            same_target = c.target == strong.target
             condition = strong.channels[0] in CALENDAR and c.unit == "specimen" and same_target
             same_channel = (
                 c.channels[-1:] == strong.channels[-1:]

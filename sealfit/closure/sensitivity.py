@@ -100,11 +100,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     entries = []
     for name, channel in selection.channels.items():
         target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
-        own = [
-            c
-            for c in selection.last
-            if (c.channels[-1], c.acts_on, c.operation) == (name, *target) and not c.pair
-        ]
+        own = [c for c in selection.last if (c.channels[-1], c.target) == (name, target) and not c.pair]
         own = sorted(own, key=lambda c: c.columns.shape[1])[:1]  # a straight line
         for level, part in _parts(selection, channel, own):
             smallest = None
@@ -215,7 +211,7 @@ class _Search:
 
     def _retested(self, candidate: Candidate) -> SmallSampleTest | None:
         """Return a candidate's small-sample test on the final model, which may have fewer effects."""
-        known, target = candidate.test_result.small_sample, (candidate.acts_on, candidate.operation)
+        known, target = candidate.test_result.small_sample, candidate.target
         if known is None:
             return None
         if known.level not in self.units:
@@ -259,7 +255,7 @@ class _Search:
         for one in (noise, effect):
             one.__dict__["basis"] = fitted.basis
         channel = self.channels[candidate.channels[-1]]
-        columns = candidate.columns * noise.slope(candidate.acts_on, candidate.operation)[:, None]
+        columns = candidate.columns * noise.slope(*candidate.target)[:, None]
         variants = tests.variants(columns, channel.unit)
         if all(enough_specimens(noise, left).all() for left in variants):
             return self._by_units(candidate, noise, effect, variants)
@@ -341,9 +337,10 @@ class _Search:
         spread = length / (np.sqrt(own * k * fdtri(k, units - k, 1 - tail)) + beyond)
         explained = length / (np.sqrt(chdtri(k, tail)) + beyond)
         if level == "run":
-            target = (candidate.acts_on, candidate.operation)
             runs = ClusterTests(noise, "run"), ClusterTests(effect, "run")
-            explained = max(explained, _by_numbers(*runs, left, target, tail, least=CONSTANT_IN_RUNS))
+            explained = max(
+                explained, _by_numbers(*runs, left, candidate.target, tail, least=CONSTANT_IN_RUNS)
+            )
         return max(margin, min(spread, explained))
 
 

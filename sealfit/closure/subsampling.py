@@ -151,9 +151,6 @@ def _one_per_group(order: np.ndarray, share: float, seed: int) -> np.ndarray:
     return drawn
 
 
-Target = tuple[str, str]  # (acts_on, operation)
-
-
 def reselect_on_all(
     selection: Selection, every: Rows, samples: pd.DataFrame, config: Config, say: Callable[[str], None]
 ) -> tuple[Selection, Fitted]:
@@ -182,9 +179,11 @@ def reselect_on_all(
                 item, after = _replaced(item, chosen, after, number, samples, config)
                 added, whole = [*added[:number], *added[number + 1 :], item], found[0].fitted
             if others_of is _on_other_quantities:
-                left = [_target(p) for p in found if p.bic - found[0].bic < RIVAL_BIC]
+                left = [p.term.target for p in found if p.bic - found[0].bic < RIVAL_BIC]
                 number = next(k for k, a in enumerate(added) if a is item)
-                added[number] = item = _with_rivals(item, [r for r in _rivals(item) if _target(r[0]) in left])
+                added[number] = item = _with_rivals(
+                    item, [r for r in _rivals(item) if r[0].term.target in left]
+                )
     return replace(selection, added=tuple(added), after=after), whole
 
 
@@ -196,13 +195,11 @@ def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
 def _on_other_quantities(item: AcceptedEffect) -> list[Proposal]:
     """Return an effect on the targets of its rivals, with its own values as start."""
     term = item.proposal.term
-    targets = (
-        target for target in dict.fromkeys(map(_target, item.rivals)) if target != _target(item.proposal)
-    )
+    targets = dict.fromkeys(rival.term.target for rival in item.rivals)
     return [
         replace(item.proposal, term=replace(term, acts_on=target[0], operation=target[1]))
         for target in targets
-        if target in term.effect.acts_on
+        if target != term.target and target in term.effect.acts_on
     ]
 
 
@@ -240,10 +237,6 @@ def _on_full_campaign(proposal: Proposal, every: Rows) -> Proposal:
     return replace(
         proposal, units=every.groups.starts[proposal.unit].size, values=_values(proposal), fitted=None
     )
-
-
-def _target(proposal: Proposal) -> Target:
-    return proposal.term.acts_on, proposal.term.operation
 
 
 def _values(proposal: Proposal) -> Mapping[str, float]:

@@ -41,6 +41,11 @@ class Term:
     fixed: Mapping[str, object] = field(default_factory=dict)
     smoothness: float | None = None
 
+    @property
+    def target(self) -> tuple[str, str]:
+        """What it acts on, and the operation."""
+        return self.acts_on, self.operation
+
     @cached_property
     def shape_key(self) -> tuple:
         """All that the shape depends on besides the rows and its parameters."""
@@ -95,7 +100,7 @@ class Term:
 
     def key(self) -> tuple:
         """Return the identity of the effect: two terms with the same key are one effect."""
-        return (self.effect.id, self.channels, self.acts_on, self.operation)
+        return (self.effect.id, self.channels, *self.target)
 
 
 def _hashable(value: object) -> object:
@@ -131,8 +136,6 @@ def term_derivatives(
     term: Term, values: Mapping[str, float], inputs: Mapping[str, np.ndarray], *, only_linear: bool = False
 ) -> list[np.ndarray]:
     """Return the shape's derivatives with respect to parameters, or to amplitudes only, shape (n,) each."""
-    if not term.effect.nonlinear and not only_linear:
-        return list(_linear_columns(term, inputs).T)
     result = []
     zero = {name: 0.0 for name in term.effect.linear}
     constant = () if only_linear else term.fixed.get("held", ())
