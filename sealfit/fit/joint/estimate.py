@@ -6,7 +6,7 @@ are fitted alternately until they converge. Priors are in `prior.py`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -51,6 +51,8 @@ class Fitted:
     white_jacobian: Tangent  # (n, p)
     deviance: float  # whitened sum of squares + log det: -2 log likelihood without its constant
     whitening: Whitening  # at this scatter and friction
+    # Results of `slope`, `unit_shares` and `unit_residual`.
+    cache: dict = field(default_factory=dict, init=False, compare=False, repr=False)
 
     @property
     def residual(self) -> np.ndarray:
@@ -62,23 +64,12 @@ class Fitted:
         """Orthonormal basis of the whitened tangent space, of shape (n, rank)."""
         return self.white_jacobian.orthonormal(1e-8)
 
-    @cached_property
-    def _widened(self) -> dict[str, np.ndarray]:
-        return {}
-
-    @cached_property
-    def _shares(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        return {}
-
-    @cached_property
-    def _slopes(self) -> dict[tuple[str, str], np.ndarray]:
-        return {}
-
     def slope(self, acts_on: str, operation: str) -> np.ndarray:
         """Return the force's derivative dF/dh for the shape h of a term not yet in the model, shape (n,)."""
-        if (acts_on, operation) not in self._slopes:
-            self._slopes[acts_on, operation] = term_slope(self.model, self.rows, acts_on, operation)
-        return self._slopes[acts_on, operation]
+        key = ("slope", acts_on, operation)
+        if key not in self.cache:
+            self.cache[key] = term_slope(self.model, self.rows, acts_on, operation)
+        return self.cache[key]
 
     def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
         """Return eigenvalues and eigenvectors of each group's block of the hat matrix.
@@ -86,12 +77,11 @@ class Fitted:
         Their shapes are (g, k) and (g, k, k). The eigenvectors are in the coordinates of the basis columns
         of the group's block.
         """
-        if level not in self._shares:
-            starts = self.rows.groups.starts[level]
-            self._shares[level] = np.linalg.eigh(
-                np.stack([b.T @ b for b in np.split(self.basis.values, starts[1:])])
-            )
-        return self._shares[level]
+        key = ("shares", level)
+        if key not in self.cache:
+            groups = np.split(self.basis.values, self.rows.groups.starts[level][1:])
+            self.cache[key] = np.linalg.eigh(np.stack([b.T @ b for b in groups]))
+        return self.cache[key]
 
     def unit_residual(self, level: str) -> np.ndarray:
         """Return the whitened residual times (I - H_gg)^(-1/2) in each group of a level, shape (n,).
@@ -99,7 +89,8 @@ class Fitted:
         H_gg is the group's block of the hat matrix. This is the CR2 correction (Bell & McCaffrey 2002, Survey
         Methodology 28(2), 169-181).
         """
-        if level not in self._widened:
+        key = ("residual", level)
+        if key not in self.cache:
             code = self.rows.codes(level)
             size, axes = self.unit_shares(level)
             size = np.clip(size, 0.0, 0.98)  # a leverage of 1 leaves no residual to correct
@@ -107,8 +98,8 @@ class Fitted:
             inner = self.basis.sums(self.rows.groups, level, self.white_residual).values
             rotated = np.einsum("gji,gj->gi", axes, inner) * grow
             back = np.einsum("gij,gj->gi", axes, rotated)
-            self._widened[level] = self.white_residual + (self.basis.values * back[code]).sum(axis=1)
-        return self._widened[level]
+            self.cache[key] = self.white_residual + (self.basis.values * back[code]).sum(axis=1)
+        return self.cache[key]
 
     @cached_property
     def covariance(self) -> np.ndarray:
