@@ -15,7 +15,6 @@ from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.search import (
     ROWS_FOR_START,
     bounds_of,
-    least_squares,
     least_squares_within,
     search_nonlinear,
     solve_linear,
@@ -61,7 +60,7 @@ def test_a_stribeck_speed_moves_only_for_what_its_prior_costs(gained, moves, mon
     model, rows, curved = astray(one_specimen=False, aging=False)
     stands = model.vector()
 
-    def solved(at, *_, ceiling=np.inf):
+    def solved(at, *_):
         return 100.0 - gained * float(np.abs(at.vector() - stands).max() > 1.0), at
 
     monkeypatch.setattr(search, "_linear_optimum", solved)
@@ -84,31 +83,6 @@ def test_a_search_never_ends_worse_than_it_began(gain, noise):
     assert after <= before
 
 
-def within(normal, gradient, low, high):
-    return least_squares_within(normal, gradient, low, high, least_squares(normal, gradient))
-
-
-def test_bounds_are_asked_only_where_the_best_so_far_could_be_beaten(monkeypatch):
-    model, rows, _ = astray(one_specimen=False, aging=True)
-    solved = []
-
-    def counted(*given, **told):
-        solved.append(given)
-        return lsq_linear(*given, **told)
-
-    monkeypatch.setattr("sealfit.fit.joint.search.lsq_linear", counted)
-    found = search_nonlinear(model, rows, SCATTER)
-    few, solved[:] = len(solved), []
-    every = joint_search._linear_optimum
-
-    def without_limit(*given, ceiling=np.inf):
-        return every(*given)
-
-    monkeypatch.setattr(joint_search, "_linear_optimum", without_limit)
-    npt.assert_array_equal(search_nonlinear(model, rows, SCATTER).vector(), found.vector())
-    assert few < len(solved) / 2
-
-
 def test_series_are_searched_on_their_own_rows_as_on_all(monkeypatch):
     model, rows, curved = astray(one_specimen=False, aging=True)
     moving, still = joint_search._split_by_action(model, rows, [int(curved[0])])
@@ -124,14 +98,16 @@ def test_least_squares_within_bounds(seed):
     rng = np.random.default_rng(seed)
     columns, force = rng.normal(size=(30, 4)), rng.normal(size=30)
     low, high = -rng.uniform(0.0, 0.2, 4), rng.uniform(0.0, 0.2, 4)
-    found = within(columns.T @ columns, columns.T @ force, low, high)
+    found = least_squares_within(columns.T @ columns, columns.T @ force, low, high)
     npt.assert_allclose(found, lsq_linear(columns, force, (low, high), tol=1e-14).x, atol=1e-6)
 
 
 def test_least_squares_within_bounds_of_columns_that_are_alike():
     column = np.linspace(1.0, 2.0, 9)[:, None]
     both = np.hstack([column, column])
-    found = within(both.T @ both, both.T @ column[:, 0], np.array([-1.0, -1.0]), np.array([0.3, 2.0]))
+    found = least_squares_within(
+        both.T @ both, both.T @ column[:, 0], np.array([-1.0, -1.0]), np.array([0.3, 2.0])
+    )
     npt.assert_allclose(found.sum(), 1.0, rtol=1e-6)
     assert found[0] <= 0.3
 
@@ -139,7 +115,7 @@ def test_least_squares_within_bounds_of_columns_that_are_alike():
 def test_a_column_that_does_nothing_stays_where_it_is():
     columns = np.column_stack([np.linspace(1.0, 2.0, 9), np.zeros(9), np.full(9, 1e-160)])
     low, high = np.array([-0.2, -1.0, 0.0]), np.array([0.3, 1.0, np.inf])
-    found = within(columns.T @ columns, columns.T @ (2 * columns[:, 0]), low, high)
+    found = least_squares_within(columns.T @ columns, columns.T @ (2 * columns[:, 0]), low, high)
     npt.assert_allclose(found[:2], [0.3, 0.0], atol=1e-6)
     assert np.isfinite(found).all()
 
@@ -148,7 +124,7 @@ def test_the_bounds_of_a_column_that_does_nothing_may_be_beyond_what_numbers_res
     """An amplitude of 8e29 at a shape that underflows: its bounds less its value are equal."""
     columns = np.column_stack([np.linspace(1.0, 2.0, 9), np.full(9, 1e-30)])
     low, high = np.array([-0.2, -8e29]), np.array([0.3, -8e29])
-    found = within(columns.T @ columns, columns.T @ (2 * columns[:, 0]), low, high)
+    found = least_squares_within(columns.T @ columns, columns.T @ (2 * columns[:, 0]), low, high)
     npt.assert_allclose(found, [0.3, -8e29], rtol=1e-6)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.optimize import lsq_linear
 
@@ -126,7 +124,6 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
     which the group does not act have the same normal equations at every grid value; these are computed once.
     """
     low, high = bounds_of(model, rows)
-    prior = _linear_prior(model)
     precision = np.diag(precision_of(model))[group]  # of the prior, which is centred at the present values
     acted_on, others = _split_by_action(model, rows, group)
     whitening = Whitening(scatter, acted_on.force, acted_on.groups)
@@ -134,17 +131,18 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
         None if others is None else _equations(model, others, Whitening(scatter, others.force, others.groups))
     )
 
-    def optimum(trial: Model, ceiling: float = np.inf) -> tuple[float, Model]:
-        own = _equations(trial, acted_on, whitening)
-        equations = own if constant is None else own.plus(constant)
-        return _linear_optimum(trial, equations, prior, (low, high), ceiling=ceiling)
+    def optimum(trial: Model) -> tuple[float, Model]:
+        equations = _equations(trial, acted_on, whitening)
+        if constant is not None:
+            equations = tuple(own + other for own, other in zip(equations, constant, strict=True))
+        return _linear_optimum(trial, equations, (low, high))
 
     least_cost, best = optimum(model)
     for value in np.linspace(low[group[0]], high[group[0]], GRID_POINTS):
         vector = model.vector()
         penalty = float(precision @ (value - vector[group]) ** 2)
         vector[group] = value
-        cost, solved = optimum(model.at(vector), least_cost - penalty)
+        cost, solved = optimum(model.at(vector))
         if cost + penalty < least_cost - 1e-9:
             least_cost, best = cost + penalty, solved
     return model.at(np.clip(best.vector(), low, high))
@@ -176,80 +174,48 @@ def solve_linear(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarra
     """
     bounds = bounds_of(model, rows)
     equations = _equations(model, rows, Whitening(scatter, friction, rows.groups))
-    solved = _linear_optimum(model, equations, _linear_prior(model), bounds)[1]
+    solved = _linear_optimum(model, equations, bounds)[1]
     return model.at(np.clip(solved.vector(), *bounds))
 
 
-def _linear_prior(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Return precision, shape (k, k), and mean, shape (k,), of the prior of the linear parameters."""
-    linear = ~model.nonlinear
-    return precision_of(model)[np.ix_(linear, linear)], centre_of(model)[linear]
+Equations = tuple[np.ndarray, np.ndarray, float]
+"""Normal matrix, (k, k), and gradient, (k,), of the linear parameters, and the sum of squares."""
 
 
-class _Equations(NamedTuple):
-    """Normal equations of a step of the linear parameters, and the sum of squares without a step."""
-
-    normal: np.ndarray  # (k, k)
-    gradient: np.ndarray  # (k,)
-    square: float
-
-    def plus(self, other: _Equations) -> _Equations:
-        """Return the equations of these rows and of others that are independent of them."""
-        return _Equations(
-            self.normal + other.normal, self.gradient + other.gradient, self.square + other.square
-        )
-
-    def penalised(self, precision: np.ndarray, away: np.ndarray) -> _Equations:
-        """Return the equations with a prior; `away`, shape (k,), is the parameters less the prior's mean."""
-        square = self.square + float(away @ precision @ away)
-        return _Equations(self.normal + precision, self.gradient - precision @ away, square)
-
-    def cost(self, step: np.ndarray) -> float:
-        """Return the sum of squares after a step, shape (k,)."""
-        return self.square - 2 * float(step @ self.gradient) + float(step @ self.normal @ step)
-
-
-def _equations(model: Model, rows: Rows, whitening: Whitening) -> _Equations:
+def _equations(model: Model, rows: Rows, whitening: Whitening) -> Equations:
     force, jacobian = evaluate(model, rows)
     residual = whitening((rows.force - force)[:, None])[:, 0]
-    return _Equations(
-        *whitening.normal(jacobian.columns(~model.nonlinear), residual), float(residual @ residual)
-    )
+    linear = jacobian.columns(~model.nonlinear)
+    return *whitening.normal(linear, residual), float(residual @ residual)
 
 
 def _linear_optimum(
-    model: Model,
-    equations: _Equations,
-    prior: tuple[np.ndarray, np.ndarray],
-    bounds: tuple[np.ndarray, np.ndarray],
-    *,
-    ceiling: float = np.inf,
+    model: Model, equations: Equations, bounds: tuple[np.ndarray, np.ndarray]
 ) -> tuple[float, Model]:
     """Return the penalised sum of squares and the model, its linear parameters optimal within the bounds.
 
-    Without bounds, a wrong v_s could fit best with negative friction. Bounds can only raise the sum of
-    squares, so they are ignored where it is not below `ceiling` without them.
+    Without bounds, a wrong v_s could fit best with negative friction.
     """
     linear, vector = ~model.nonlinear, model.vector()
-    precision, centre = prior
-    equations = equations.penalised(precision, vector[linear] - centre)
-    step = least_squares(equations.normal, equations.gradient)
-    if equations.cost(step) < ceiling:
-        low, high = (bound[linear] - vector[linear] for bound in bounds)
-        step = least_squares_within(equations.normal, equations.gradient, low, high, step)
+    precision = precision_of(model)[np.ix_(linear, linear)]
+    away = (vector - centre_of(model))[linear]
+    normal, gradient, square = equations
+    normal, gradient = normal + precision, gradient - precision @ away
+    low, high = (bound[linear] - vector[linear] for bound in bounds)
+    step = least_squares_within(normal, gradient, low, high)
     vector[linear] += step
-    return equations.cost(step), model.at(vector)
-
-
-def least_squares(normal: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Return the x of least norm that minimises x' normal x / 2 - gradient' x, shape (k,)."""
-    return np.linalg.lstsq(normal, gradient, rcond=1e-10)[0]
+    cost = square + away @ precision @ away - 2 * step @ gradient + step @ normal @ step
+    return float(cost), model.at(vector)
 
 
 def least_squares_within(
-    normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, free: np.ndarray
+    normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Return the minimiser of `least_squares` within bounds, shape (k,); `free` is the one without bounds."""
+    """Return the x within bounds that minimises x' normal x / 2 - gradient' x, shape (k,).
+
+    Inside the bounds it is the solution of least norm.
+    """
+    free = np.linalg.lstsq(normal, gradient, rcond=1e-10)[0]
     inside = np.clip(free, low, high)  # stays for columns of zeros
     if np.all(inside == free):
         return free
