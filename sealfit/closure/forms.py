@@ -344,9 +344,7 @@ def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tupl
     if after is None:
         return None
     place = len(after.model.terms) - 1
-    without = reestimated(
-        fit(after.model.without_term(place), before.rows, before.scatter, turns=0, friction=before.friction)
-    )
+    without = reestimated(before.refitted(after.model.without_term(place)))
     gain = min(before.deviance, without.deviance) - after.deviance
     units = fitted.rows.groups.starts["specimen"].size
     q, left = len(effect.parameters), units - fitted.model.declared.mu_parameter_count
@@ -387,7 +385,7 @@ def _best(before: Fitted, term: Term) -> Fitted | None:
             number: day,
         }
         model = before.model.with_term(term, {p.name: start[p.name] for p in effect.parameters})
-        found.append(reestimated(fit(model, rows, before.scatter, turns=0, friction=before.friction)))
+        found.append(reestimated(before.refitted(model)))
     return min(found, key=lambda f: f.deviance, default=None)
 
 

@@ -266,9 +266,7 @@ def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
     """Return a proposal fitted jointly with the model, under the current scatter."""
     model = fitted.model.with_term(proposal.term, proposal.values)
     model = solve_linear(model, fitted.rows, fitted.scatter, fitted.friction)
-    return replace(
-        proposal, fitted=fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
-    )
+    return replace(proposal, fitted=fitted.refitted(model))
 
 
 def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:

@@ -44,7 +44,7 @@ class Renaming:
             name = self._channel(item)
             if name is None:
                 continue
-            without = self._without(fitted, number)
+            without = fitted.refitted(fitted.model.without_term(number))
             proposals = self._proposals_on(fitted, number, without, [name], item.proposal.p_value)
             # A grid may rank the right form of a large missing effect too low for it to be refitted.
             if not proposals or proposals[0].bic > fitted.deviance + item.proposal.bic_penalty + RIVAL_BIC:
@@ -64,8 +64,8 @@ class Renaming:
     ) -> AcceptedEffect | None:
         """Return an effect of a fit with its own name, confirmed given the others; None if not confirmed."""
         model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
-        own = fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
-        return self._confirmed(without, [replace(item.proposal, fitted=own)], item.round)
+        own = replace(item.proposal, fitted=fitted.refitted(model))
+        return self._confirmed(without, [own], item.round)
 
     def merged_with_earlier(
         self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, pending: bool = False
@@ -95,7 +95,7 @@ class Renaming:
         names = self._channel(earlier), self._channel(new)
         if None in names:
             return None
-        without = self._without(fitted, number)
+        without = fitted.refitted(fitted.model.without_term(number))
         p_value = min(earlier.proposal.p_value, new.proposal.p_value)
         proposals = self._proposals_on(fitted, number, without, self._channels_near(*names), p_value)
         proposals = sorted([*proposals, *self._products(without, names, p_value)], key=lambda p: p.bic)
@@ -123,10 +123,6 @@ class Renaming:
         found = search_pairs(ScoreTests(without), [self.channels[name] for name in names], [], rng)
         found = sorted((replace(c, p_value=p_value) for c in found), key=lambda c: -c.chi2)
         return propose(without, found, self.channels, self.context.effects)
-
-    def _without(self, fitted: Fitted, number: int) -> Fitted:
-        model = fitted.model.without_term(number)
-        return fit(model, fitted.rows, fitted.scatter, turns=0, friction=fitted.friction)
 
     def _proposals_on(
         self, fitted: Fitted, number: int, without: Fitted, names: Sequence[str], p_value: float

@@ -197,8 +197,7 @@ class _Loop:
         if both:
             later, earlier = both
             own = earlier.proposal.fitted
-            without = own.model.without_term(len(own.model.terms) - 1)
-            self.fitted = fit(without, self.rows, own.scatter, turns=0, friction=own.friction)
+            self.fitted = own.refitted(own.model.without_term(len(own.model.terms) - 1))
             self.added = [*self.added, later]
             self.add(earlier)
         return bool(both)
@@ -383,9 +382,7 @@ def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitt
     """
     while True:
         without = {
-            k: fit(
-                fitted.model.without_term(k), fitted.rows, fitted.scatter, turns=0, friction=fitted.friction
-            )
+            k: fitted.refitted(fitted.model.without_term(k))
             for k, a in enumerate(added[:-1])
             if not a.proposal.term.effect.periodic
         }

@@ -207,14 +207,13 @@ def _replaced(
     item: AcceptedEffect, chosen: Proposal, after: Fitted, number: int, samples: pd.DataFrame, config: Config
 ) -> tuple[AcceptedEffect, Fitted]:
     """Return an effect replaced by another proposal, its own now a rival, and the fit of the part with it."""
-    rows, scatter, friction = after.rows, after.scatter, after.friction
-    without = fit(after.model.without_term(number), rows, scatter, turns=0, friction=friction)
+    without = after.refitted(after.model.without_term(number))
     model = without.model.with_term(chosen.term, _values(chosen))
-    chosen = replace(chosen, fitted=fit(model, rows, scatter, turns=0, friction=friction))
+    chosen = replace(chosen, fitted=after.refitted(model))
     gain = heldout_gain(without, chosen, config.loop.folds, config.loop.seed, samples, {})
     rest = [r for r in _rivals(item) if r[0].term is not chosen.term]
     item = _with_rivals(item, [(item.proposal, item.left_N), *rest])
-    after = fit(chosen.fitted.model, rows, scatter, turns=2)
+    after = fit(chosen.fitted.model, after.rows, after.scatter, turns=2)
     return replace(item, proposal=chosen, gain_N=gain.rmse_N, left_N=gain.left_N), after
 
 

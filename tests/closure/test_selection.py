@@ -19,9 +19,7 @@ class Model:
 
 
 def fit(model, *given, **options):
-    return SimpleNamespace(
-        model=model, deviance=DEVIANCE[model.terms], rows=None, scatter=None, friction=None
-    )
+    return SimpleNamespace(model=model, deviance=DEVIANCE[model.terms], rows=None, scatter=None, refitted=fit)
 
 
 def effect(letter, *, periodic=False):

@@ -64,6 +64,10 @@ class Fitted:
         """Orthonormal basis of the whitened tangent space, of shape (n, rank)."""
         return self.white_jacobian.orthonormal(1e-8)
 
+    def refitted(self, model: Model) -> Fitted:
+        """Return another model fitted to the same rows, to be compared: scatter and friction are the same."""
+        return fit(model, self.rows, self.scatter, turns=0, friction=self.friction)
+
     def slope(self, acts_on: str, operation: str) -> np.ndarray:
         """Return the force's derivative dF/dh for the shape h of a term not yet in the model, shape (n,)."""
         key = ("slope", acts_on, operation)
