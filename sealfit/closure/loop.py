@@ -109,19 +109,14 @@ def close_loop(
             models = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
             selection, models = _only_gains(selection, models, heldout, say)
         break
-    before, after, held_before, held_after = (
-        models.before,
-        models.after,
-        models.held_before,
-        models.held_after,
-    )
+    before, after = models.before, models.after
     drawn = _drawn_tables(selection, before, after, config)
     document = closure_document(selection, models, heldout.level, config, effects, outliers)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their original order
     tables = {
         "effects": effect_table([e for e in document["effects"] if not e["candidate"]], selection.added),
-        "residuals_before": _residual_table(bins, before, held_before),
-        "residuals_after": _residual_table(bins, after, held_after),
+        "residuals_before": _residual_table(bins, before, models.held_before),
+        "residuals_after": _residual_table(bins, after, models.held_after),
         **drawn,
     }
     return Closure(document, to_record(before, after, config), tables, after)

@@ -17,6 +17,7 @@ import pandas as pd
 from sealfit.closure.criteria import NEAR_TESTED_SPEED
 from sealfit.closure.intervals import Sandwich, mean_half_width, t_quantile
 from sealfit.closure.output import from_record
+from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.errors import RequestError
@@ -28,10 +29,7 @@ from sealfit.ingest.categorical import add_keys
 from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # Relative tolerance of the tested range.
-ANSWERS = (
-    "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N",
-    "meas_lo95_N", "meas_hi95_N",
-)  # fmt: skip
+FORCES = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
 
@@ -61,7 +59,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     before, after, conditions, code = _conditions(before, after, conditions, table, notes, config)
     _check_values(table, after, model, notes)
     good = np.array([not note for note in notes]) & (code >= 0)
-    answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in ANSWERS})
+    answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in FORCES})
     if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
         for k in np.flatnonzero(good):
             notes[k].append(TESTED_ONLY)
@@ -91,7 +89,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         half = mean_half_width(tangent, np.array(model["covariance"]), model["df"], others)
         half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, mean))
         spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
-        answer.loc[good, list(ANSWERS)] = np.column_stack(
+        answer.loc[good, FORCES] = np.column_stack(
             [
                 evaluate(before, at, jacobian=False)[0],
                 mean,
@@ -103,7 +101,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         )
     bad = answer["force_after_N"].isna().to_numpy()
     return points.reset_index(drop=True).assign(
-        **{name: answer[name] for name in ANSWERS},
+        **{name: answer[name] for name in FORCES},
         extrapolated=np.where(bad, False, extrapolated),
         note=["; ".join(note) for note in notes],
     )

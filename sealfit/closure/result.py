@@ -266,16 +266,9 @@ def form_of(term: Term) -> str:
 def parameter_unit(unit: str, term: Term, units: Units) -> str:
     """Return a parameter's unit: {x} and {z} stand for those of the channels, {y} for that of the effect."""
     channel, second = units.of(term.channels[0]), units.of(term.channels[-1])
-    if term.operation == "multiply":
-        given = ""
-    elif term.acts_on == "force":
-        given = units.unit("force")
-    elif term.acts_on == "sigma_2":
-        given = f"{units.unit('force')}/({units.unit('speed')})"
-    elif term.acts_on == "v_s":
-        given = units.unit("speed")
-    else:
-        given = ""
+    force, speed = units.unit("force"), units.unit("speed")
+    added = {"force": force, "sigma_2": f"{force}/({speed})", "v_s": speed}
+    given = added.get(term.acts_on, "") if term.operation == "add" else ""
     return fill_unit(unit, channel, given, second)
 
 
