@@ -20,33 +20,14 @@ SAMPLED = ("displacement_mm", "time_s", "force_N")  # columns of the samples tha
 
 
 class Ripples:
-    """The periodic effects of a campaign.
-
-    Parameters
-    ----------
-    samples : DataFrame
-        Steady samples, as returned by `steady_samples`.
-    context : Context
-        Error rate, rounds and folds.
-
-    Attributes
-    ----------
-    samples : DataFrame
-        The samples with `residual_N`: the force less the ripples added so far.
-    added : list of AcceptedEffect
-        Confirmed ripples.
-    refused : list of RefusedEffect
-        Significant ripples that are not confirmed.
-    found : Peak or None
-        The significant ripple that is not in the model yet.
-    """
+    """The periodic effects of a campaign, from its steady samples as returned by `steady_samples`."""
 
     def __init__(self, samples: pd.DataFrame, context: Context) -> None:
         self.context = context
-        self.added: list[AcceptedEffect] = []
-        self.refused: list[RefusedEffect] = []
-        self.samples = samples.assign(residual_N=samples["force_N"])
-        self.found = self._find()
+        self.added: list[AcceptedEffect] = []  # confirmed
+        self.refused: list[RefusedEffect] = []  # significant, but not confirmed
+        self.samples = samples.assign(residual_N=samples["force_N"])  # less the ripples added so far
+        self.found = self._find()  # significant, not in the model yet
 
     def added_to(self, fitted: Fitted, fine: Rows | None) -> Fitted:
         """Return a fit with every ripple that is significant and confirmed on held-out data.

@@ -125,24 +125,14 @@ APART = 1e-10
 
 @dataclass(frozen=True)
 class Stroke:
-    """A stroke from the start of motion to steady sliding.
+    """A stroke from the start of motion to steady sliding."""
 
-    Attributes
-    ----------
-    file, run : int
-        Number of its file and run, or of the stroke itself if there is only one file or run.
-    share : float
-        Ratio of its steady bristle force to that of the condition's curve.
-    distance_mm, speed_mm_s, force_N : ndarray, shape (n,)
-        Smoothed distance slid; speed; force opposing the motion.
-    """
-
-    file: int
-    run: int
-    share: float
-    distance_mm: np.ndarray
-    speed_mm_s: np.ndarray
-    force_N: np.ndarray
+    file: int  # number of its file, or of the stroke itself if there is only one file
+    run: int  # the same of its run
+    share: float  # ratio of its steady bristle force to that of the condition's curve
+    distance_mm: np.ndarray  # (n,) smoothed distance slid
+    speed_mm_s: np.ndarray  # (n,)
+    force_N: np.ndarray  # (n,) opposing the motion
 
 
 @dataclass(frozen=True)
@@ -190,20 +180,13 @@ class Curve:
 class Tangent:
     """Residual of the forces at (log sigma_0, tau), and its derivative; strokes are padded with zeros.
 
-    Attributes
-    ----------
-    level, begin : ndarray, shape (strokes,)
-        Force relative to the curve, and bristle force at the start in N: the linear parameters.
-    residual : ndarray, shape (strokes, rows)
-        Measured minus model.
-    jacobian : ndarray, shape (2, strokes, rows)
-        Derivative of the residual, the linear parameters at their optimum.
+    The linear parameters, `level` and `begin`, are at their optimum.
     """
 
-    level: np.ndarray
-    begin: np.ndarray
-    residual: np.ndarray
-    jacobian: np.ndarray
+    level: np.ndarray  # (strokes,) force relative to the curve
+    begin: np.ndarray  # (strokes,) bristle force at the start, in N
+    residual: np.ndarray  # (strokes, rows) measured minus model
+    jacobian: np.ndarray  # (2, strokes, rows) derivative of the residual
 
     @property
     def rss(self) -> float:

@@ -31,22 +31,12 @@ LONGEST = 50.0
 
 @dataclass(frozen=True)
 class Ramp:
-    """The motion along a fitted ramp.
+    """The motion along a fitted ramp, at the fitted rows."""
 
-    Attributes
-    ----------
-    distance_mm, speed_mm_s : ndarray, shape (n,)
-        Distance and speed at the fitted rows.
-    final_mm_s : float
-        Speed after the ramp.
-    rms_mm : float
-        RMS residual of the displacement.
-    """
-
-    distance_mm: np.ndarray
-    speed_mm_s: np.ndarray
-    final_mm_s: float
-    rms_mm: float
+    distance_mm: np.ndarray  # (n,)
+    speed_mm_s: np.ndarray  # (n,)
+    final_mm_s: float  # speed after the ramp
+    rms_mm: float  # RMS residual of the displacement
 
 
 @dataclass(frozen=True)
@@ -208,23 +198,13 @@ LEAST = 4
 
 @dataclass(frozen=True)
 class Sliding:
-    """A straight line through the force at the beginning of steady sliding, before much warming or wear.
+    """A straight line through the force at the beginning of steady sliding, before much warming or wear."""
 
-    Attributes
-    ----------
-    force_N, distance_mm, slope_N_mm : float
-        Mean force, mean distance slid, and slope of the force.
-    rows : int
-        Number of samples.
-    extent_mm : float
-        Square root of the sum of squared deviations from `distance_mm`.
-    """
-
-    force_N: float
-    distance_mm: float
+    force_N: float  # mean
+    distance_mm: float  # mean distance slid
     slope_N_mm: float
-    rows: int
-    extent_mm: float
+    rows: int  # number of samples
+    extent_mm: float  # square root of the sum of squared deviations from `distance_mm`
 
     @classmethod
     def of(cls, distance_mm: np.ndarray, force_N: np.ndarray) -> Sliding:
@@ -239,59 +219,31 @@ class Sliding:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of one stroke; distance and force are positive in its direction.
+    """A part of one stroke; distance and force are positive in its direction."""
 
-    Attributes
-    ----------
-    row : int
-        Its row in table `steady`.
-    distance_mm, force_N : ndarray, shape (n,)
-        Distance slid, not decreasing, and force.
-    sliding : Sliding
-        Force at the beginning of steady sliding.
-    """
-
-    row: int
-    distance_mm: np.ndarray
-    force_N: np.ndarray
-    sliding: Sliding
+    row: int  # in table `steady`
+    distance_mm: np.ndarray  # (n,) distance slid, not decreasing
+    force_N: np.ndarray  # (n,)
+    sliding: Sliding  # force at the beginning of steady sliding
 
 
 @dataclass(frozen=True)
 class Start(Part):
-    """The start of one stroke, with smoothed displacement.
+    """The start of one stroke, with smoothed displacement."""
 
-    Attributes
-    ----------
-    speed_mm_s : ndarray, shape (n,)
-        Rate of the distance.
-    """
-
-    speed_mm_s: np.ndarray
+    speed_mm_s: np.ndarray  # (n,) rate of the distance
 
 
 @dataclass(frozen=True)
 class Along:
-    """A stroke with a steady window; displacement and force are positive in its direction.
+    """A stroke with a steady window; displacement and force are positive in its direction."""
 
-    Attributes
-    ----------
-    row : int
-        Its row in table `steady`.
-    pace_mm_s : float
-        Steady speed.
-    time_s, along_mm, force_N : ndarray, shape (n,)
-        Time, displacement and force.
-    steady : ndarray of bool, shape (n,)
-        Mask of the steady window.
-    """
-
-    row: int
-    pace_mm_s: float
-    time_s: np.ndarray
-    along_mm: np.ndarray
-    force_N: np.ndarray
-    steady: np.ndarray
+    row: int  # in table `steady`
+    pace_mm_s: float  # steady speed
+    time_s: np.ndarray  # (n,)
+    along_mm: np.ndarray  # (n,) displacement
+    force_N: np.ndarray  # (n,)
+    steady: np.ndarray  # (n,) bool: mask of the steady window
 
     @cached_property
     def until(self) -> int:

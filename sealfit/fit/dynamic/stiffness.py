@@ -39,38 +39,18 @@ OPEN = np.log(3.0)
 
 @dataclass(frozen=True)
 class Stiffness:
-    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with covariance of (log sigma_0, tau) between units.
-
-    Attributes
-    ----------
-    sigma_0, tau_s : float
-        Estimates.
-    covariance : ndarray, shape (2, 2)
-        Covariance of log sigma_0 and tau; NaN from fewer than two units.
-    df : ndarray, shape (2,)
-        Satterthwaite's degrees of freedom of the two.
-    within : int
-        Number of samples inside the rise.
-    gain : float
-        Rise of the sum of squares, in residual variances, for a force that is constant from the start.
-    files : int
-        Number of files.
-    forces_N : tuple of ndarray, shape (n,) each
-        Fitted force of every stroke.
-    rmse_N, noise_N : float
-        RMS residual, and standard deviation of a sample from second differences.
-    """
+    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with their scatter between units."""
 
     sigma_0: float
     tau_s: float
-    covariance: np.ndarray
-    df: np.ndarray
-    within: int
-    gain: float
+    covariance: np.ndarray  # (2, 2) of log sigma_0 and tau; NaN from fewer than two units
+    df: np.ndarray  # (2,) Satterthwaite's degrees of freedom of the two
+    within: int  # samples inside the rise
+    gain: float  # rise of the sum of squares, in residual variances, for a force constant from the start
     files: int
-    forces_N: tuple[np.ndarray, ...]
-    rmse_N: float
-    noise_N: float
+    forces_N: tuple[np.ndarray, ...]  # (n,) each: fitted force of every stroke
+    rmse_N: float  # RMS residual
+    noise_N: float  # standard deviation of a sample, from second differences
 
     @property
     def seen(self) -> bool:

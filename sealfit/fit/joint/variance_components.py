@@ -47,22 +47,12 @@ KINDS = ("offset", "gain")
 
 @dataclass(frozen=True)
 class GroupMeans:
-    """Means over the m finest groups.
+    """Means over the m finest groups."""
 
-    Attributes
-    ----------
-    residual, force : ndarray, shape (m,)
-        Means of the residual and of the model's force, signed, in N.
-    variance : ndarray, shape (m,)
-        Variance of each mean due to row noise, in N^2.
-    groups : Groups
-        Nested groups of the m means.
-    """
-
-    residual: np.ndarray
-    variance: np.ndarray
-    force: np.ndarray
-    groups: Groups
+    residual: np.ndarray  # (m,) in N
+    variance: np.ndarray  # (m,) of each mean due to row noise, in N^2
+    force: np.ndarray  # (m,) of the model, signed, in N
+    groups: Groups  # nested groups of the m means
 
 
 def reml(

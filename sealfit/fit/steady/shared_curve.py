@@ -45,18 +45,10 @@ RANK = 1e-8
 
 @dataclass(frozen=True)
 class Levels:
-    """Values of mu_s and mu_c (F_s and F_c) and the covariance of their measurement.
+    """Values of mu_s and mu_c (F_s and F_c) and the covariance of their measurement."""
 
-    Attributes
-    ----------
-    table : DataFrame
-        `condition`, `quantity` and `value`, and the condition's columns of `steady_fit`.
-    covariance : ndarray, shape (n, n)
-        Covariance of the values.
-    """
-
-    table: pd.DataFrame
-    covariance: np.ndarray
+    table: pd.DataFrame  # `condition`, `quantity`, `value`, and the condition's columns of `steady_fit`
+    covariance: np.ndarray  # (n, n)
 
 
 def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
