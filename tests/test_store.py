@@ -519,6 +519,54 @@ def test_a_lock_of_another_host_is_not_taken_over(out, campaign):
     assert Store.open(out).read("steady").shape[0] == 2  # reading needs no lock
 
 
+@contextmanager
+def without_locks(monkeypatch, number=errno.ENOLCK):
+    """A file system on which flock fails, as on NFS without a lock daemon."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*_given):
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fcntl, "flock", refuse)
+        yield
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_without_locks_a_process_that_runs_is_not_disturbed(out, campaign, monkeypatch, number):
+    with writer(out, campaign) as run, without_locks(monkeypatch, number):
+        with pytest.raises(
+            OutError, match=rf"process {run.pid}\) is writing.*is no sealfit, delete .*\.lock"
+        ):
+            do_all(out, campaign)
+        run.kill()
+        run.wait()
+        do_all(out, campaign)
+    assert stale(out) == []
+    assert not (out / LOCK).exists()
+
+
+def test_results_written_while_they_are_read_are_not_mixed(out, campaign):
+    do_all(out, campaign, rows=2)
+    reader = Store.open(out)
+    assert len(reader.read("steady")) == 2
+    (campaign / "a.csv").write_text("changed")
+    do_all(out, campaign, rows=5)
+    with pytest.raises(OutError, match=r"was written while it was read\. Run the command again"):
+        reader.read("steady_fit")
+    assert len(Store.open(out).read("steady_fit")) == 5
+
+
+def test_every_folder_in_which_a_step_puts_files_is_synced(tmp_path, campaign, monkeypatch):
+    out, synced = tmp_path / "new" / "out", []
+    for module in ("out_folder", "staged_writes", "lock"):
+        monkeypatch.setattr(f"sealfit.store.{module}.sync", lambda path: synced.append(Path(path)))
+    with Store.writing(out, campaign, ConfigCopy.at(None)) as store, store.step("ingest") as staged:
+        staged.table("steady", small("steady"))
+        staged.text("plots/a.svg", "<svg/>")
+    assert {tmp_path, out.parent, out, out / "plots"} <= set(synced)
+
+
 # ---------------------------------------------------------------- kills and full disks
 KILLED = """
 import os, signal, sys

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from sealfit.errors import OutError
 from sealfit.store.manifest import STATE
-from sealfit.store.staged_writes import STAGING, disk
+from sealfit.store.staged_writes import STAGING, disk, sync
 
 # ---------------------------------------------------------------- interrupts
 # Ctrl-C is delayed while files are moved, because an incomplete move leaves OUT stale.
@@ -54,7 +54,7 @@ def only_writer(folder: Path) -> Iterator[None]:
 
     The kernel drops the lock with the process that held it, however that ended, so the lock of a dead process
     of this host is taken over at once. Another host's lock is never taken over: what runs there cannot be
-    seen from here.
+    seen from here. Where the file system has no locks, the process that the file names is looked for.
 
     Raises
     ------
@@ -63,17 +63,32 @@ def only_writer(folder: Path) -> Iterator[None]:
         written.
     """
     path = folder / LOCK
-    handle = _take(path)
+    with taken(path) as handle:
+        try:
+            _sign(handle, path)
+            yield
+        finally:
+            with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
+                path.unlink()
+
+
+@contextlib.contextmanager
+def taken(path: Path, option: str = "--out") -> Iterator[int]:
+    """Open and lock the file at `path`, and give its descriptor; it is created if missing.
+
+    Raises
+    ------
+    OutError
+        If another process has locked it, or if it cannot be written; the fix names the `option`.
+    """
+    handle = _take(path, option)
     try:
-        _sign(handle, path)
-        yield
+        yield handle
     finally:
-        with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
-            path.unlink()
         os.close(handle)
 
 
-def _take(path: Path) -> int:
+def _take(path: Path, option: str) -> int:
     while True:
         try:
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -81,11 +96,12 @@ def _take(path: Path) -> int:
             raise OutError(
                 f"cannot be written ({error.strerror}).",
                 file=path.parent,
-                fix="Choose another --out, or fix its rights.",
+                fix=f"Choose another {option}, or fix its rights.",
             ) from error
         try:
-            if _locked(handle) and _same_file(handle, path):
-                _refuse_live_owner(handle, path)
+            locked = _locked(handle)
+            if locked is not False and _same_file(handle, path):
+                _refuse_live_owner(handle, path, option, known=locked is None)
                 return handle
         except BaseException:
             os.close(handle)
@@ -94,10 +110,11 @@ def _take(path: Path) -> int:
         gone = not _same_file(handle, path)
         os.close(handle)
         if not gone:  # otherwise its owner has just removed it: try again
-            raise _busy(path, busy)
+            raise _busy(path, busy, option)
 
 
-def _locked(handle: int) -> bool:
+def _locked(handle: int) -> bool | None:
+    """Lock a file, and return whether that was possible; None where the file system has no locks."""
     if fcntl is None:
         return True
     try:
@@ -105,7 +122,7 @@ def _locked(handle: int) -> bool:
     except BlockingIOError:
         return False
     except OSError:
-        return True  # a file system without locks: only the name in the file is known
+        return None  # only the name in the file is known
     return True
 
 
@@ -124,18 +141,33 @@ def _owner(handle: int) -> dict:
     return owner if isinstance(owner, dict) else {}
 
 
-def _refuse_live_owner(handle: int, path: Path) -> None:
+def _refuse_live_owner(handle: int, path: Path, option: str, *, known: bool) -> None:
+    """Raise OutError if the file names another host or, if only the name is `known`, a process that runs."""
     owner = _owner(handle)
     if owner and owner.get("host") != socket.gethostname():
-        raise _busy(path, owner, f" If no sealfit runs on that host any more, delete {path}.")
+        raise _busy(path, owner, option, f" If no sealfit runs on that host any more, delete {path}.")
+    if known and _runs(owner.get("pid")):
+        raise _busy(path, owner, option, f" If that process is no sealfit, delete {path}.")
 
 
-def _busy(path: Path, owner: dict, more: str = "") -> OutError:
+def _runs(pid: object) -> bool:
+    if not isinstance(pid, int):
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it runs, and is another user's
+        return True
+    return True
+
+
+def _busy(path: Path, owner: dict, option: str, more: str = "") -> OutError:
     host, pid = owner.get("host", "an unknown host"), owner.get("pid", "unknown")
     return OutError(
         f"another sealfit (host {host}, process {pid}) is writing here.",
         file=path.parent,
-        fix=f"Wait for it to end, or choose another --out.{more}",
+        fix=f"Wait for it to end, or choose another {option}.{more}",
     )
 
 
@@ -192,6 +224,9 @@ def _make(out: Path) -> bool:
                 fix="Choose another --out.",
             )
         return False
+    missing = [folder for folder in (out, *out.absolute().parents) if not folder.exists()]
     with disk(out):
         out.mkdir(parents=True)
+        for folder in missing:
+            sync(folder.absolute().parent)
     return True

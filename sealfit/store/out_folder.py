@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shlex
 import time
 from collections.abc import Iterator, Mapping
@@ -61,6 +62,7 @@ class Store:
         self.warnings: list[str] = []
         self._checksums: dict[str, str | None] = {}  # of files that this process has read
         self._keys: dict[str, str] | None = None  # of every step for the present campaign
+        self._opened: tuple | None = None  # status of state.json when it was opened for reading
         self.anew = False  # whether stored results are to be recomputed
         self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
         if state.campaign.is_dir():
@@ -84,6 +86,7 @@ class Store:
         ConfigError
             If `effects` may not be run, as `own_effects_folder`.
         """
+        opened = _status_of(out)  # before it is read
         state = State.read(out)
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
@@ -93,9 +96,10 @@ class Store:
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
         hashes = effects_seen(effects, state.effects, state.config, config)
-        return cls(
-            out, replace(state, config=config, effects=hashes), known=True, kept=state, effects=effects
-        )
+        now = replace(state, config=config, effects=hashes)
+        store = cls(out, now, known=True, kept=state, effects=effects)
+        store._opened = opened
+        return store
 
     @classmethod
     @contextlib.contextmanager
@@ -123,6 +127,7 @@ class Store:
         with held(out):
             if campaign is None or source is None:
                 store = cls.open(out, effects)
+                store._opened = None
             else:
                 folder = own_effects_folder(effects, source, out, campaign)
                 store = cls._of_campaign(out, campaign.resolve(), source, folder, properties)
@@ -285,7 +290,18 @@ class Store:
         """Return a table, or those columns of it; `which` as `parquet.read`."""
         from sealfit.store import parquet
 
-        return parquet.read(self._parts_of(table) or self.out / f"{table}{PARQUET}", columns, **which)
+        try:
+            return parquet.read(self._parts_of(table) or self.out / f"{table}{PARQUET}", columns, **which)
+        finally:
+            self._require_unchanged()
+
+    def _require_unchanged(self) -> None:
+        """Raise OutError if another process has written since this one opened OUT for reading.
+
+        State.json changes before any other file does, so what was read until now is of one state.
+        """
+        if self._opened is not None and _status_of(self.out) != self._opened:
+            raise OutError("was written while it was read.", file=self.out, fix="Run the command again.")
 
     def _parts_of(self, table: str) -> list[Path]:
         files = (file for done in self.state.steps.values() for file in done.files)
@@ -306,7 +322,10 @@ class Store:
         """Return `<name>.json`."""
         import json
 
-        return json.loads((self.out / f"{name}.json").read_text("utf-8"))
+        try:
+            return json.loads((self.out / f"{name}.json").read_text("utf-8"))
+        finally:
+            self._require_unchanged()
 
     def seen_config(self, step: str) -> Config:
         """Return the config as `step` uses it."""
@@ -372,7 +391,8 @@ class Store:
             for file in self._left_over(old, files):
                 (self.out / file).unlink(missing_ok=True)
             staged.move(PROVENANCE)
-            sync(self.out)
+            for folder in {self.out, *((self.out / file).parent for file in files)}:
+                sync(folder)
             staged.move("ended.json", STATE)
             sync(self.out)
             self.state = ended
@@ -396,6 +416,15 @@ class Store:
 
         done = self.state.steps.get("ingest")
         return known_parts(self.out, done.files) if done and not self.anew else {}
+
+
+def _status_of(out: Path) -> tuple | None:
+    """Return what tells a state.json from any other; None without one."""
+    try:
+        status = os.stat(out / STATE)
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _same_config(kept: ConfigCopy, config: ConfigCopy) -> bool:

@@ -101,7 +101,7 @@ def disk(out: Path) -> Iterator[None]:
         reason = error.strerror or str(error)
         fix = "Fix the rights of the folder, or choose another --out."
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            fix = "Free some space and run the command again; the earlier results are unchanged."
+            fix = "Free some space and run the command again."
         raise OutError(f"cannot be written ({reason}).", file=out, fix=fix) from error
 
 
