@@ -1,6 +1,7 @@
 """The program's entry, and what `predict` writes."""
 
 import builtins
+import os
 import subprocess
 import sys
 
@@ -44,3 +45,20 @@ def test_what_is_written_holds_no_formula_and_all_numbers(tmp_path):
         ["'@sum", "'-A1", "-2.5e-3"],
         ["' -x", "a=b", "1"],
     ]
+
+
+def test_answers_are_on_the_disk_before_they_take_their_place(tmp_path, monkeypatch):
+    asked, output = tmp_path / "points.csv", tmp_path / "answers.csv"
+    asked.write_text("speed_mm_s\n1\n")
+    output.write_text("earlier")
+    (tmp_path / ".answers.csv.part").write_text(
+        "left by a process that was killed, and longer than the answers"
+    )
+    calls, real = [], os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: calls.append("fsync"))
+    monkeypatch.setattr(os, "replace", lambda *paths: (calls.append("replace"), real(*paths)))
+    write_answers(read_points(asked), pd.DataFrame({name: [0.0] for name in ANSWERS}), output)
+    assert calls == ["fsync", "replace", "fsync"]  # the last is that of the folder
+    assert output.read_text().startswith("speed_mm_s,force_before_N")
+    assert output.read_text().endswith("0.0,0.0\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["answers.csv", "points.csv"]

@@ -11,7 +11,9 @@ from pathlib import Path
 import pandas as pd
 
 from sealfit.errors import RequestError
+from sealfit.store.lock import taken
 from sealfit.store.paths import existing_file
+from sealfit.store.staged_writes import sync
 
 MISSING = ("", "nan", "NaN", "NA", "null")
 ANSWERS = (
@@ -161,16 +163,28 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
     # `answers` has the same rows in the same order.
     table = pd.concat([points.text.map(_no_formula), answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     table.columns = [_no_formula(name) for name in table.columns]
-    staged = output.with_name(f".{output.name}.{os.getpid()}")
     try:
-        table.to_csv(staged, index=False, encoding="utf-8", lineterminator="\n")
-        os.replace(staged, output)
+        _replace(output, table.to_csv(index=False, lineterminator="\n").encode("utf-8"))
     except OSError as error:
         raise RequestError(
             f"{output} cannot be written ({error.strerror}).", fix="Choose another --output."
         ) from error
-    finally:
-        staged.unlink(missing_ok=True)
     answered = answers["force_after_N"].notna()
     extrapolated = answers["extrapolated"].fillna(False).astype(bool) & answered
     return {"rows": len(answers), "answered": int(answered.sum()), "extrapolated": int(extrapolated.sum())}
+
+
+def _replace(output: Path, content: bytes) -> None:
+    """Write a file completely or not at all; what a killed process left of an earlier one is replaced."""
+    staged = output.with_name(f".{output.name}.part")
+    with taken(staged, "--output") as handle:
+        try:
+            with open(handle, "wb", closefd=False) as file:
+                file.truncate(0)
+                file.write(content)
+            os.fsync(handle)
+            os.replace(staged, output)
+        except OSError:
+            staged.unlink(missing_ok=True)
+            raise
+        sync(output.absolute().parent)
