@@ -94,6 +94,19 @@ def test_a_map_survives_a_killed_worker(dask):
         assert first + list(made) == [n * n for n in range(30)]
 
 
+def test_a_lost_scheduler_is_a_clear_error_wherever_it_is_missed(dask, tmp_path):
+    with on_cluster(str(dask.file)):
+        made = run_map(slow_square, range(30), together=1)
+        next(made)
+        dask.scheduler.kill()
+        dask.scheduler.wait()
+        for missed in (lambda: list(made), lambda: list(run_map(square, range(3)))):
+            with pytest.raises(
+                WorkerError, match=r"went away\. Look at the scheduler, and run the command again"
+            ):
+                missed()
+
+
 def test_work_that_kills_every_worker_is_a_clear_error(dask, monkeypatch):
     monkeypatch.setattr("sealfit.engine.cluster.ALONE_S", 3.0)
     with on_cluster(str(dask.file)), pytest.raises(WorkerError, match=r"no workers left.*start them again"):

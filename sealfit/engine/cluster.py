@@ -7,7 +7,9 @@ often as it likes.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import logging
 import re
 import socket
 import threading
@@ -76,7 +78,9 @@ class Cluster:
     def require_folders(self, *folders: Path) -> None:
         """Raise RequestError unless every worker sees these folders."""
         for folder in folders:
-            for worker, there in self._client.run(_is_folder, str(folder.resolve())).items():
+            with self._reached():
+                found = self._client.run(_is_folder, str(folder.resolve()))
+            for worker, there in found.items():
                 if not there:
                     raise RequestError(
                         f"the worker {worker} does not see the folder {folder.resolve()}.",
@@ -85,8 +89,23 @@ class Cluster:
                     )
 
     def threads(self) -> int:
-        """Return the present number of threads of the cluster."""
-        return sum(self._client.nthreads().values())
+        """Return the present number of threads of the cluster; WorkerError if its scheduler went away."""
+        with self._reached():
+            return sum(self._client.nthreads().values())
+
+    @contextlib.contextmanager
+    def _reached(self) -> Iterator[None]:
+        """Raise WorkerError if the scheduler does not answer in the block, or did not before."""
+        try:
+            if self._client.scheduler is None:  # it did not come back, and the client has ended
+                raise ConnectionError
+            yield
+        except OSError as error:
+            raise self._went_away() from error
+
+    def _went_away(self) -> WorkerError:
+        fix = "Look at the scheduler, and run the command again."
+        return WorkerError(f"the cluster {self.scheduler} went away.", fix=fix)
 
     def close(self) -> None:
         """Disconnect from the cluster, which keeps running."""
@@ -131,13 +150,11 @@ class Cluster:
         except (CancelledError, OSError) as error:
             if sent and sent[0].status == "error":  # raised by the work itself
                 raise
-            raise WorkerError(
-                f"the cluster {self.scheduler} went away.",
-                fix="Look at the scheduler, and run the command again.",
-            ) from error
+            raise self._went_away() from error
         finally:
-            if sent:
-                self._client.cancel(list(sent))
+            if sent and self._client.scheduler is not None:
+                with contextlib.suppress(OSError):  # the scheduler went away
+                    self._client.cancel(list(sent))
 
     def _result(self, future: Future) -> list:
         """Return the result of a chunk; WorkerError after `ALONE_S` without workers."""
@@ -189,6 +206,8 @@ def _connected(scheduler: str) -> Client:
             f"{address} is not encrypted, and Dask's options here ask for it.",
             fix="Give the scheduler's tls:// address, or unset require-encryption.",
         )
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # our own error says it in one line
     try:  # checked first, because a client without a scheduler blocks for a minute
         socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
         return Client(address, timeout=CONNECT_S, set_as_default=False)
