@@ -12,6 +12,13 @@ def main() -> None:
     except KeyboardInterrupt:
         print("sealfit: interrupted; nothing was begun.", file=sys.stderr)
         sys.exit(INTERRUPTED)
+    except (MemoryError, ImportError) as error:
+        from sealfit.errors import MEMORY, MORE_MEMORY, memory_ran_out
+
+        if not memory_ran_out(error):
+            raise
+        print(f"sealfit: {MEMORY} {MORE_MEMORY}", file=sys.stderr)
+        sys.exit(1)
     cli.main()
 
 

@@ -17,7 +17,7 @@ from typer.core import TyperCommand
 
 from sealfit import __version__
 from sealfit.engine import one_thread
-from sealfit.errors import SealfitError, grouped, told
+from sealfit.errors import MEMORY, MORE_MEMORY, SealfitError, grouped, memory_ran_out, told
 
 # ---------------------------------------------------------------- options
 # Arguments and options that several commands share.
@@ -92,6 +92,8 @@ def exit_code(app: typer.Typer) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
+        if memory_ran_out(error):
+            return _fail(f"sealfit: {MEMORY} {MORE_MEMORY}", [{**_error(MEMORY), "fix": MORE_MEMORY}], 1)
         # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they
         # can do.
         if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):

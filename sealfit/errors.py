@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import re
 import shlex
 from collections.abc import Callable, Iterable, Sequence
@@ -291,3 +292,39 @@ class FitError(SealfitError):
 
 class WorkerError(SealfitError):
     """A worker process died (killed, or out of memory) before it had answered."""
+
+
+# ---------------------------------------------------------------- memory
+
+MEMORY = "memory ran out; what was complete before is kept."
+MORE_MEMORY = "Use fewer workers (--workers 1), or a computer with more memory."
+
+
+def memory_ran_out(error: BaseException) -> bool:
+    """Whether an error, or one that led to it, says that the system had no memory left.
+
+    Libraries say so in several ways: a shared object that cannot be mapped is an ImportError, a mapped file
+    an OSError, a thread a RuntimeError.
+
+    Examples
+    --------
+    >>> memory_ran_out(ImportError("libm.so: failed to map segment from shared object"))
+    True
+    >>> memory_ran_out(ImportError("No module named 'scipy'"))
+    False
+    """
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    if isinstance(error, ImportError | OSError | RuntimeError) and any(
+        sign in str(error) for sign in _NO_MEMORY
+    ):
+        return True
+    before = error.__cause__ or error.__context__
+    return before is not None and memory_ran_out(before)
+
+
+_NO_MEMORY = (
+    "failed to map segment from shared object",
+    "annot allocate memory",
+    "can't start new thread",
+)

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sealfit.engine import claim_memory
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.progress import Silent, timed
@@ -185,6 +186,7 @@ def single(step: str, out: Path, *, progress: Silent | None = None, **options) -
 def _do_steps(store: Store, steps: tuple[str, ...], options: Options, progress: Silent) -> dict:
     from sealfit.report import summary
 
+    claim_memory()
     for warning in store.warnings:
         progress.warn(warning)
     store.anew = options.force

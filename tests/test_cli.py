@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import re
@@ -207,6 +208,30 @@ def test_a_bug_under_json_leaves_one_object(sealfit, monkeypatch, arguments, at)
     assert error["reason"] == "ZeroDivisionError: a bug"
     assert {"file", "line", "column", "value", "fix", "reason"} <= set(error)
     assert "Traceback (most recent call last):" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("array"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+        RuntimeError("can't start new thread"),
+        ImportError("a.so: failed to map segment from shared object"),
+    ],
+)
+def test_no_memory_is_one_line_and_1(sealfit, monkeypatch, error):
+    def broken(*given, **named):
+        try:
+            raise error
+        except type(error) as first:
+            raise ValueError("what a library made of it") from first
+
+    monkeypatch.setattr("sealfit.commands.effects", broken)
+    ended = sealfit("effects", "--json")
+    assert ended.code == 1
+    (told,) = ended.json["errors"]
+    assert ended.stderr == f"sealfit: {told['reason']} {told['fix']}\n"
+    assert told["reason"].startswith("memory ran out")
 
 
 def test_a_reader_that_leaves_early_is_no_fault():

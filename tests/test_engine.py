@@ -228,3 +228,23 @@ def test_a_death_of_the_server_that_starts_workers_is_a_clear_error(tmp_path):
         env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
     )
     assert "WorkerError: a worker process died before it had answered" in run.stderr
+
+
+NO_ROOM = """
+import resource
+from sealfit.engine import BUFFERS, claim_memory, one_thread
+one_thread()
+import scipy.linalg
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + BUFFERS // 2, used + BUFFERS // 2))
+try:
+    claim_memory()
+except MemoryError:
+    print("no room")
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the size of a process is not known here")
+def test_no_room_for_the_buffers_of_linear_algebra_is_said_and_not_waited_for():
+    run = subprocess.run([sys.executable, "-c", NO_ROOM], capture_output=True, text=True, timeout=60)
+    assert run.stdout == "no room\n", run.stderr

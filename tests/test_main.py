@@ -25,6 +25,30 @@ def test_ctrl_c_while_the_program_loads_is_one_line_and_130(monkeypatch, capsys)
     assert capsys.readouterr().err == "sealfit: interrupted; nothing was begun.\n"
 
 
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (MemoryError(), 1),
+        (ImportError("liblapack.so: failed to map segment from shared object"), 1),
+        (ImportError("No module named 'scipy'"), None),
+    ],
+)
+def test_no_memory_to_load_the_program_is_one_line_and_1(monkeypatch, capsys, error, code):
+    def refused(name, *rest, _import=builtins.__import__):
+        if name == "sealfit" and "cli" in (rest[2] or ()):
+            raise error
+        return _import(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", refused)
+    with pytest.raises(SystemExit if code else ImportError) as ended:
+        __main__.main()
+    if code:
+        assert ended.value.code == code
+        assert capsys.readouterr().err.startswith(
+            "sealfit: memory ran out; what was complete before is kept."
+        )
+
+
 def test_python_m_sealfit_is_the_program():
     done = subprocess.run([sys.executable, "-m", "sealfit", "--version"], capture_output=True, text=True)
     assert done.returncode == 0

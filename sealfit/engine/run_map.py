@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, TypeVar
 
-from sealfit.engine import one_thread
+from sealfit.engine import claim_memory, one_thread
 from sealfit.errors import WorkerError
 
 if TYPE_CHECKING:
@@ -239,6 +239,10 @@ def _start_worker() -> None:
     if sys.platform == "win32":
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     one_thread()
+    try:
+        claim_memory()
+    except MemoryError:
+        os._exit(1)  # the parent says so
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -172,6 +172,8 @@ def _readable(path: Path) -> Iterator[None]:
     """Raise OutError for a damaged or missing file."""
     try:
         yield
+    except MemoryError:  # Arrow's own is an ArrowException, too
+        raise
     except (OSError, KeyError, pa.ArrowException) as error:
         fix = "Make all results again: sealfit run CAMPAIGN --out OUT --force"
         raise OutError("is missing or damaged.", file=path, fix=fix) from error
