@@ -29,6 +29,8 @@ from sealfit.errors import ConfigError, did_you_mean, nearest
 from sealfit.units import Conversion, Units, conversion
 
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
+MOST = 10**9  # largest whole number of a config: no file has more lines
+LONGEST_PATTERN = 1000  # characters; a longer one takes long to compile
 
 
 class Strict(BaseModel):
@@ -96,19 +98,19 @@ class TraceFormat(Strict):
     """One character, `"tab"` or `"whitespace"`."""
     decimal: Literal[".", ","] = "."
     """`"."` or `","`."""
-    header_lines: int | None = Field(None, ge=0)
+    header_lines: int | None = Field(None, ge=0, le=MOST)
     """Lines before the first data row, column names included."""
     header_ends_at: str | None = None
     """Regular expression; the header ends with the line that it matches."""
     names: Literal["header", "none"] = "header"
     """`"none"`: there is no line of names, columns are given by position."""
-    names_line: int | None = None
+    names_line: int | None = Field(None, ge=1, le=MOST)
     """The line of names, counted back from the header's end: 1 = the last."""
     units_row: bool = False
     """A row of units follows the names."""
     trailing_separator: bool = False
     """Lines end in stray separators; they are stripped."""
-    drop_first_rows: int = Field(0, ge=0)
+    drop_first_rows: int = Field(0, ge=0, le=MOST)
     """Data rows to leave out at the start of each file."""
     columns: FileColumns = Field(
         default_factory=lambda: {
@@ -148,7 +150,22 @@ def _glob(pattern: str | None) -> str | None:
     parts = PurePosixPath(pattern or "*").parts
     if not parts or any("**" in part and part != "**" for part in parts):
         raise ValueError('a pattern for paths is needed, in which "**" stands alone: "traces/**/*.csv"')
+    if parts.count("**") > 3:  # each of them walks through all folders again
+        raise ValueError('"**" stands for any number of folders, and three times are enough')
     return pattern
+
+
+def _not_regular(pattern: str) -> str:
+    """Return why a text is no regular expression that can be used; "" if it is one."""
+    import regex  # here, so that commands that read no pattern start quickly
+
+    if len(pattern) > LONGEST_PATTERN:
+        return f"it has more than {LONGEST_PATTERN} characters"
+    try:
+        regex.compile(pattern)
+    except (regex.error, RecursionError, OverflowError) as error:
+        return str(error)
+    return ""
 
 
 class Files(Strict):
@@ -208,7 +225,7 @@ class Files(Strict):
             try:
                 day = datetime(2024, 2, 1, 9, 30, tzinfo=UTC).strftime(one)
                 datetime.strptime(day, one)
-            except ValueError as error:
+            except (ValueError, re.error) as error:
                 raise ValueError(
                     f"{one!r} is no date format: {error}. Write for example '%d.%m.%Y %H:%M'"
                 ) from None
@@ -244,7 +261,7 @@ class Strokes(Strict):
     """Displacement is smoothed over this many samples to find where it turns."""
     min_travel_mm: float | None = Field(None, gt=0)
     """Shorter strokes are not strokes."""
-    min_samples: int = Field(20, ge=4)
+    min_samples: int = Field(20, ge=4, le=MOST)
     """A steady window with fewer samples is too short."""
     speed_tolerance: float = Field(0.1, gt=0)
     """Steady: smoothed speed within this share of its plateau."""
@@ -259,7 +276,7 @@ class Bins(Strict):
 
     per_stroke: int = Field(40, ge=1, le=1000)
     """Bins in a stroke."""
-    min_samples: int = Field(4, ge=1)
+    min_samples: int = Field(4, ge=1, le=MOST)
     """Bins with fewer samples are left out."""
 
 
@@ -278,7 +295,7 @@ class Quality(Strict):
     """Gaps that hide more of the time leave the stroke out."""
     saturated_share: float = Field(0.05, gt=0, le=1)
     """Share of samples at the very extreme that counts as saturated."""
-    stuck_samples: int = Field(50, ge=3)
+    stuck_samples: int = Field(50, ge=3, le=MOST)
     """This many equal force samples in a row are stuck."""
     spike_sigma: float = Field(12.0, gt=3)
     """A sample this many robust standard deviations off its neighbours is a spike."""
@@ -309,7 +326,7 @@ class Loop(Strict):
     """Effects added at most."""
     folds: int = Field(5, ge=2, le=100)
     """Folds of the cross-validation."""
-    seed: int = Field(1, ge=0)
+    seed: int = Field(1, ge=0, le=MOST)
     """Seed of the random numbers."""
     ignore_channels: list[str] = Field(default_factory=list)
     """Channels that are not tested."""
@@ -365,11 +382,8 @@ class Config(Strict):
             ("trace.header_ends_at", self.trace.header_ends_at),
             *((f"trace.header_fields.{k}", v) for k, v in self.trace.header_fields.items()),
         ):
-            if pattern is not None:
-                try:
-                    re.compile(pattern)
-                except re.error as error:
-                    raise ValueError(f"{place} is not a regular expression: {error}") from None
+            if pattern is not None and (reason := _not_regular(pattern)):
+                raise ValueError(f"{place} is not a regular expression: {reason}")
         return self
 
     @model_validator(mode="after")
@@ -485,12 +499,12 @@ def parse_config(text: str, name: str) -> Config:
     """
     try:
         return Config.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
     except ValidationError as error:
         raise ConfigError(
             explain(error, Config), file=name, fix="docs/reference/config.md has every key."
         ) from error
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, or lists in lists
+        raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import regex
 
 from sealfit.config import Files
 from sealfit.errors import ConfigError, shortened
 from sealfit.ingest.categorical import Columns, taken
 from sealfit.ingest.expression import evaluate, parse
-from sealfit.ingest.files import as_number
+from sealfit.ingest.files import PATTERN_S, as_number, found_by
 from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- refs
@@ -100,7 +101,7 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
     Raises
     ------
     ConfigError
-        If a template or an expression reads a part that the pattern does not have.
+        If a template or an expression reads a part that the pattern does not have, or as `found_by`.
 
     Examples
     --------
@@ -114,7 +115,7 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
     texts: dict[str, str] = {}
     values: dict[str, float | str] = {}
     if settings.name_pattern is not None:
-        match = re.fullmatch(settings.name_pattern, file)
+        match = found_by(settings.name_pattern, file, whole=True)
         if match is None:
             return NameParts(False, {})
         for name, text in match.groupdict(default="").items():
@@ -152,21 +153,25 @@ def matched_part(pattern: str, file: str) -> tuple[str, str]:
     ('T80_', 'd(?P<aging_days>\\\\d+)[.]csv')
     """
     for part, length in _parts_of(pattern):
-        if found := part.match(file):
+        try:
+            found = part.match(file, timeout=PATTERN_S)
+        except TimeoutError:
+            break
+        if found:
             return found.group(), pattern[length:]
     return "", pattern
 
 
 @cache
-def _parts_of(pattern: str) -> list[tuple[re.Pattern, int]]:
+def _parts_of(pattern: str) -> list[tuple[regex.Pattern, int]]:
     """Return the valid beginnings of a pattern, with open groups closed, and their lengths, longest first."""
     found = []
     for length in range(len(pattern), 0, -1):
         begin = pattern[:length]
         for closing in ("", ")", "))", ")))") if not _OPEN.search(begin) else ():
-            with suppress(re.error), warnings.catch_warnings():
+            with suppress(regex.error), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of half a set
-                found.append((re.compile(begin + closing), length))
+                found.append((regex.compile(begin + closing), length))
                 break
     return found
 
@@ -178,7 +183,7 @@ def unmatched(file: str, pattern: str) -> tuple[str, str]:
     where = f"{up_to} the pattern has {_short(rest)} and the path {_short(file[len(begin) :])}"
     reason = f"the whole path below the campaign folder does not match files.name_pattern: {where}."
     fix = "Rename it, widen the pattern, or list it under files.exclude."
-    if "/" in file and re.fullmatch(pattern, file.rpartition("/")[2]):
+    if "/" in file and found_by(pattern, file.rpartition("/")[2], whole=True):
         fix = "The pattern matches the name without its folders: begin it with '(?:.*/)?'."
     return reason, fix
 

@@ -8,12 +8,14 @@ import os
 import re
 import stat
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import regex
 
 from sealfit.config import Config, TraceFormat
-from sealfit.errors import BadFile, Fault
+from sealfit.errors import BadFile, ConfigError, Fault, shortened
 from sealfit.store.manifest import Fingerprint, fingerprint, fingerprint_of
 
 # ---------------------------------------------------------------- folder
@@ -273,6 +275,8 @@ def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
     ------
     BadFile
         If no line matches `header_ends_at`, or the header is longer than the file.
+    ConfigError
+        As `found_by`.
     """
     lines = text[:HEAD_BYTES].decode("utf-8", "ignore").split("\n")
     count = _header_lines(lines, settings, file)
@@ -309,13 +313,36 @@ def split_line(line: str, delimiter: str) -> list[str]:
         return line.split(mark)
 
 
+# Longest time of a pattern of the config on one line or name, in s. Ordinary patterns take microseconds;
+# repeats within repeats can take years.
+PATTERN_S = 0.5
+_compiled = cache(regex.compile)
+
+
+def found_by(pattern: str, text: str, *, whole: bool = False) -> regex.Match | None:
+    """Return the first place in a text where a pattern of the config matches; with `whole`, all of the text.
+
+    Raises
+    ------
+    ConfigError
+        If that takes longer than `PATTERN_S`.
+    """
+    match = _compiled(pattern).fullmatch if whole else _compiled(pattern).search
+    try:
+        return match(text, timeout=PATTERN_S)
+    except TimeoutError:
+        reason = f"the pattern '{shortened(pattern)}' takes too long on '{shortened(text)}'."
+        fix = "Write it without repeats within repeats, such as (a+)+."
+        raise ConfigError(reason, fix=fix) from None
+
+
 def header_fields(header: tuple[str, ...], config: Config) -> dict[str, float | str]:
     """Return the channels that a config reads from header lines: the first match of each, in our units."""
     found: dict[str, float | str] = {}
     units = config.conversions("names")
     for name, pattern in config.trace.header_fields.items():
         for line in header:
-            if match := re.search(pattern, line):
+            if match := found_by(pattern, line):
                 value = (match.group(1) if match.re.groups else match.group()) or ""
                 number = as_number(value, config.trace.decimal)
                 if number is not None and name in units:
@@ -371,7 +398,7 @@ def without_strays(line: str, settings: TraceFormat) -> str:
 def _header_lines(lines: list[str], settings: TraceFormat, file: str) -> int:
     if settings.header_ends_at is not None:
         for number, line in enumerate(lines, start=1):
-            if re.search(settings.header_ends_at, line):
+            if found_by(settings.header_ends_at, line):
                 return number
         reason = f"no line matches header_ends_at = {settings.header_ends_at!r}."
         raise _bad(
