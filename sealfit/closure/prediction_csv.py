@@ -16,6 +16,7 @@ from sealfit.store.paths import existing_file
 from sealfit.store.staged_writes import sync
 
 MISSING = ("", "nan", "NaN", "NA", "null")
+FORMULA = tuple("=+-@＝＋－＠")  # what a formula of a spreadsheet begins with
 ANSWERS = (
     "force_before_N",
     "force_after_N",
@@ -139,7 +140,7 @@ def _no_formula(cell: str) -> str:
     try:
         float(cell)
     except ValueError:
-        return f"'{cell}" if cell.lstrip()[:1] in ("=", "+", "-", "@") and cell.strip() else cell
+        return f"'{cell}" if cell.lstrip()[:1] in FORMULA and cell.strip() else cell
     return cell
 
 
@@ -177,6 +178,8 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
 def _replace(output: Path, content: bytes) -> None:
     """Write a file completely or not at all; what a killed process left of an earlier one is replaced."""
     staged = output.with_name(f".{output.name}.part")
+    if staged.is_symlink():  # it would be written through
+        staged.unlink()
     with taken(staged, "--output") as handle:
         try:
             with open(handle, "wb", closefd=False) as file:

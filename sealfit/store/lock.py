@@ -223,6 +223,7 @@ def _make(out: Path) -> bool:
                 file=out,
                 fix="Choose another --out.",
             )
+        _refuse_links(out)
         return False
     missing = [folder for folder in (out, *out.absolute().parents) if not folder.exists()]
     with disk(out):
@@ -230,3 +231,10 @@ def _make(out: Path) -> bool:
         for folder in missing:
             sync(folder.absolute().parent)
     return True
+
+
+def _refuse_links(out: Path) -> None:
+    """Raise OutError for a link to a folder in `out`: files would be written and removed elsewhere."""
+    for path in out.iterdir():
+        if path.is_symlink() and path.is_dir():
+            raise OutError(f"'{path.name}' is a link to a folder.", file=out, fix="Delete the link.")

@@ -24,9 +24,11 @@ from trace_helpers import HEADER, ROWS, campaign, config, csv_of
 
 import sealfit
 from sealfit import cli, commands
+from sealfit.closure.prediction_csv import ANSWERS, read_points, write_answers
 from sealfit.draft.draft import draft
-from sealfit.errors import CampaignError, ConfigError, SealfitError
+from sealfit.errors import CampaignError, ConfigError, OutError, SealfitError
 from sealfit.ingest.campaign import ingest_campaign
+from sealfit.pipeline import run
 from sealfit.simulation import load_spec, simulate
 
 SOURCE = Path(sealfit.__file__).parent
@@ -173,6 +175,32 @@ def test_a_config_cannot_exhaust_the_program(text):
 
 
 # ---------------------------------------------------------------- what is written
+def test_a_link_in_out_is_not_written_through(tmp_path):
+    campaign(tmp_path / "campaign", RUNS, files=("a.csv", "b.csv"))
+    (tmp_path / "rig.toml").write_text(DAYS)
+    given = (tmp_path / "campaign", tmp_path / "out", tmp_path / "rig.toml")
+    run(*given, steps=("ingest",))
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("years")
+    (tmp_path / "out" / "bins.parquet").rename(tmp_path / "away")
+    (tmp_path / "out" / "bins.parquet").symlink_to(mine)
+    with pytest.raises(OutError, match=r"'bins.parquet' is a link to a folder\. Delete the link"):
+        run(*given, steps=("ingest",), force=True)
+    assert [path.name for path in mine.iterdir()] == ["thesis.tex"]
+
+
+def test_answers_are_not_written_through_a_link(tmp_path):
+    (tmp_path / "mine").write_text("years")
+    (tmp_path / "points.csv").write_text("oil\n1\n")
+    answers = pd.DataFrame({name: [None] for name in ANSWERS}, dtype=object)
+    (tmp_path / ".q.csv.part").symlink_to(tmp_path / "mine")
+    (tmp_path / "q.csv").symlink_to(tmp_path / "mine")
+    write_answers(read_points(tmp_path / "points.csv"), answers, tmp_path / "q.csv")
+    assert (tmp_path / "mine").read_text() == "years"
+    assert (tmp_path / "q.csv").read_text().startswith("oil,")
+
+
 @pytest.mark.parametrize(
     "line", ["x\n[loop]\neffects_folder='mine'\n", "'''\"\"\"", "\\u0041\\", '"]\t[loop', "#"]
 )
@@ -283,11 +311,11 @@ def test_answers_hold_no_formulas(hostile):
     home = hostile[0]
     points = pd.read_csv(home / "campaign" / "runs.csv").iloc[:4].assign(displacement_mm=20.0)
     points = points.drop(columns="started_at").assign(run_order=1, elapsed_h=1.0)
-    words = ["+1+cmd", "\t=2", "-2+3", "1"]
+    words = ["+1+cmd", "\t=2", "-2+3", "＝1+1"]
     points = points.assign(**{"=x": words, "@y": words})
     points.to_csv(home / "points.csv", index=False)
     commands.predict(home / "out", home / "points.csv", home / "q.csv")
     for row in csv.reader(io.StringIO((home / "q.csv").read_text("utf-8"))):
         for cell in row:
-            begins = cell.lstrip()[:1] in tuple("=+-@") and cell.strip()
+            begins = cell.lstrip()[:1] in tuple("=+-@＝＋－＠") and cell.strip()
             assert not begins or re.fullmatch(r"-[\d.e-]+", cell), cell
