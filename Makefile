@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks docs/generate.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test golden lint check docs bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean
+.PHONY: help demo test golden lint audit check docs bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -28,6 +28,10 @@ docs: .venv/.installed-test ## build the documentation into out/docs
 	$(BIN)/python docs/generate.py
 	$(BIN)/zensical build --strict
 	@echo out/docs/index.html
+
+audit: .venv/.installed-audit ## compare the installed packages with the known vulnerabilities (pip-audit; needs a network)
+	@.venv/audit/bin/pip-audit --strict --skip-editable --progress-spinner off --path .venv/lib/python*/site-packages || \
+		{ echo "make: packages with known vulnerabilities, or the list of them could not be read; pip-audit says which." >&2; exit 1; }
 
 check: test ## what the continuous integration runs: the same as test
 
@@ -84,4 +88,9 @@ clean: ## remove everything that make made, .venv too
 .venv/.installed-bench: .venv/.installed
 	@test -x .venv/bench/bin/python || $(BIN)/python -m venv .venv/bench
 	@.venv/bench/bin/python -m pip install -q --disable-pip-version-check -e '.[bench]' || { $(NO_NETWORK); exit 1; }
+	@touch $@
+
+.venv/.installed-audit: .venv/.installed
+	@test -x .venv/audit/bin/python || $(BIN)/python -m venv .venv/audit
+	@.venv/audit/bin/python -m pip install -q --disable-pip-version-check pip-audit || { $(NO_NETWORK); exit 1; }
 	@touch $@
