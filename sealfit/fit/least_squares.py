@@ -20,6 +20,8 @@ STEPS = 2000
 SAME = 1e-13
 # Steps that shrink at least by this factor still converge, though the sum of squares no longer changes.
 SHRINKS = 0.9
+# Relative change of all parameters that is rounding. Such steps could repeat one another without end.
+ROUNDING = 4 * np.finfo(float).eps
 # Damping of the first step. Below it a step is close to a Gauss-Newton step.
 DAMPING = 1e-3
 # Damping at which the search ends without a further decrease.
@@ -89,6 +91,7 @@ def levenberg_marquardt(
             same, shrinks = np.abs(gain) <= SAME * rss[todo], step < SHRINKS * length[todo]
             better = (gain > 0) | (same & shrinks)
             done = same & ~(shrinks & (step > 0)) & ((damping[todo] < DAMPING) | ~better)
+            done |= (np.abs(trial - at) <= ROUNDING * np.abs(at)).all(axis=1)
             moved = todo[better]
             x[moved], rest[moved], slope[moved], length[moved] = (
                 trial[better],

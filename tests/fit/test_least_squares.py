@@ -59,3 +59,21 @@ def test_a_problem_without_a_finite_residual_is_infinite_and_alone_in_it():
     values[1, 3] = np.inf
     _, rss = levenberg_marquardt(problems(values), np.ones((4, 2)), LOW, HIGH)
     npt.assert_array_equal(np.isfinite(rss), [True, False, True, True])
+
+
+def test_steps_of_rounding_do_not_repeat_without_end():
+    """Of 3,000 small problems some went round in steps of one unit in the last place."""
+    rng = np.random.default_rng(1)
+    days = np.array([2.0, 8.0, 32.0])
+    value = 0.04 * np.log1p(days / 0.1) + 0.003 * rng.standard_normal((3000, 3))
+    calls = []
+
+    def evaluate(x, of):
+        calls.append(of.size)
+        a, ratio = x[:, :1], days * np.exp(-x[:, 1:])
+        slope = np.stack([np.log1p(ratio), -a * ratio / (1 + ratio)], axis=1)
+        return 1e3 * (a * np.log1p(ratio) - value[of]), 1e3 * slope
+
+    start = np.tile([0.04, np.log(0.1)], (3000, 1))
+    levenberg_marquardt(evaluate, start, np.array([-np.inf, -20.0]), np.array([np.inf, 10.0]))
+    assert len(calls) < 100  # were 2,001
