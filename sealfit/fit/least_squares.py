@@ -37,6 +37,7 @@ def levenberg_marquardt(
     high: np.ndarray,
     *,
     damping: float = DAMPING,
+    linear: Linear | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the local least-squares optima from starting points, and their sums of squares.
 
@@ -51,6 +52,8 @@ def levenberg_marquardt(
         Closed bounds; infinite for none, equal for a fixed parameter.
     damping : float
         Damping of the first step; small for starts close to the optimum.
+    linear : Linear, optional
+        Products of the derivatives, if they are not arrays.
 
     Returns
     -------
@@ -64,6 +67,7 @@ def levenberg_marquardt(
     Mathematics 630, 105-116). The damped step is computed by singular values, more accurately than by normal
     equations.
     """
+    linear = linear or Linear()
     low, high = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
     x, todo = np.clip(start, low, high), np.arange(len(start))
     damping = np.full(len(x), damping)
@@ -76,15 +80,12 @@ def levenberg_marquardt(
         for _ in range(STEPS):
             if not todo.size:
                 break
-            at, size = x[todo], np.linalg.norm(slope[todo], axis=2)
+            at, size = x[todo], linear.norms(slope[todo])
             scale[todo] = np.maximum(scale[todo], size)
-            pull = -(slope[todo] @ rest[todo, :, None])[..., 0]
+            pull = -linear.gradient(slope[todo], rest[todo])
             free = ~((at <= low[todo]) & (pull <= 0)) & ~((at >= high[todo]) & (pull >= 0))
             own_scale = np.where(scale[todo] > 0, scale[todo], 1.0)
-            move = (
-                _damped(slope[todo] / own_scale[..., None] * free[..., None], rest[todo], damping[todo])
-                / own_scale
-            )
+            move = linear.step(slope[todo], free / own_scale, rest[todo], damping[todo]) / own_scale
             trial = np.clip(at + move, low[todo], high[todo])
             trial_rest, trial_slope = evaluate(trial, todo)
             gain, step = rss[todo] - _squares(trial_rest), np.linalg.norm((trial - at) * size, axis=1)
@@ -105,11 +106,27 @@ def levenberg_marquardt(
     return x, rss
 
 
-def _damped(slope: np.ndarray, rest: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return x of least |x slope + rest|^2 + damping |x|^2, shape (r, p); slope (r, p, n), rest (r, n)."""
-    axes, singular, rows = np.linalg.svd(slope, full_matrices=False)
-    share = np.where(singular > 0, singular / (singular**2 + damping[:, None]), 0.0)
-    return -(axes @ (share * (rows @ rest[..., None])[..., 0])[..., None])[..., 0]
+class Linear:
+    """Products of the derivatives of residuals, here arrays of shape (r, p, n); residuals are (r, n)."""
+
+    def norms(self, slope: np.ndarray) -> np.ndarray:
+        """Return the norm of each parameter's derivative, shape (r, p)."""
+        return np.linalg.norm(slope, axis=2)
+
+    def gradient(self, slope: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        """Return half the derivative of the sum of squares, shape (r, p)."""
+        return (slope @ rest[..., None])[..., 0]
+
+    def step(self, slope: np.ndarray, scale: np.ndarray, rest: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        """Return x of least |x scale slope + rest|^2 + damping |x|^2, shape (r, p); scale is (r, p)."""
+        axes, singular, rows = np.linalg.svd(slope * scale[..., None], full_matrices=False)
+        share = damped_inverse(singular, damping[:, None])
+        return -(axes @ (share * (rows @ rest[..., None])[..., 0])[..., None])[..., 0]
+
+
+def damped_inverse(singular: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Return s / (s^2 + damping) of singular values s, 0 for s = 0."""
+    return np.where(singular > 0, singular / (singular**2 + damping), 0.0)
 
 
 def _squares(rest: np.ndarray) -> np.ndarray:
@@ -137,34 +154,34 @@ def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray
     return ((below2 - 8 * below + 8 * above - above2) / (12 * h[:, None])).T
 
 
-def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple[np.ndarray, int]:
-    """Return (J'J)^-1, shape (p, p), and its rank; parameters not determined by J have infinite variance.
+def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return (J'J)^-1, shape (..., p, p), and its rank; undetermined parameters have infinite variance.
 
     Parameters
     ----------
-    jacobian : ndarray, shape (n, p)
-        Derivative J of the weighted residual.
-    free : ndarray of bool, shape (p,), optional
+    jacobian : ndarray, shape (..., n, p)
+        Derivative J of the weighted residual, of one or many problems.
+    free : ndarray of bool, shape (..., p), optional
         Parameters that are fitted; the others have variance 0.
     """
-    p = jacobian.shape[1]
+    n, p = jacobian.shape[-2:]
     free = np.ones(p, bool) if free is None else free
-    covariance = np.zeros((p, p))
     if not free.any():
-        return covariance, 0
-    scale = np.linalg.norm(jacobian[:, free], axis=0)
+        return np.zeros((*jacobian.shape[:-2], p, p)), np.zeros(jacobian.shape[:-2], int)
+    jacobian = jacobian * free[..., None, :]
+    scale = np.linalg.norm(jacobian, axis=-2)
     scale = np.where(scale > 0, scale, 1.0)
-    wide = jacobian.shape[0] < scale.size  # only then the null space needs the full decomposition
-    _, singular, rows = np.linalg.svd(jacobian[:, free] / scale, full_matrices=wide)
-    known = np.zeros(rows.shape[0], bool)
-    known[: singular.size] = singular > RANK * max(singular.max(initial=0.0), 1e-300)
-    inverse = (rows[known].T / singular[known[: singular.size]] ** 2) @ rows[known]
-    part = inverse / np.outer(scale, scale)
-    unknown = np.any(np.abs(rows[~known]) > 1e-6, axis=0)  # parameters that change along the null space
-    part[unknown, :], part[:, unknown] = 0.0, 0.0
-    part[unknown, unknown] = np.inf
-    covariance[np.ix_(free, free)] = part
-    return covariance, int(known.sum())
+    # Only if it is wide the null space needs the full decomposition.
+    _, singular, rows = np.linalg.svd(jacobian / scale[..., None, :], full_matrices=n < p)
+    singular = np.concatenate([singular, np.zeros((*singular.shape[:-1], p - singular.shape[-1]))], axis=-1)
+    known = singular > RANK * np.maximum(singular.max(axis=-1, keepdims=True), 1e-300)
+    half = rows * np.divide(1.0, singular, out=np.zeros(singular.shape), where=known)[..., None]
+    covariance = np.swapaxes(half, -1, -2) @ half / (scale[..., :, None] * scale[..., None, :])
+    # Parameters that change along the null space.
+    unknown = free & np.any(~known[..., None] & (np.abs(rows) > 1e-6), axis=-2)
+    covariance[unknown[..., :, None] | unknown[..., None, :]] = 0.0
+    covariance[unknown[..., :, None] & np.eye(p, dtype=bool)] = np.inf
+    return covariance, known.sum(axis=-1)
 
 
 # ---------------------------------------------------------------- variable projection

@@ -130,7 +130,7 @@ def test_the_effects_uncertainty_is_common_to_all_conditions(warmed):
     known = free.drop(columns=shifts_of(free))
     alone = shared_levels(known, fit_conditions(known, Config()))
     levels = shared_levels(free, conditions)
-    added = levels.covariance - alone.covariance
+    added = (levels.covariance - alone.covariance).toarray()
     place = after.model.term_slice(0)
     share = 0.035 / 0.05  # of the warming, in the mean of a stroke at mu_s: some 3.5 of 5 percent
     error = share * np.sqrt(after.covariance[place, place][0, 0]) * levels.table["value"].to_numpy()

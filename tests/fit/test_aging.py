@@ -1,13 +1,16 @@
+import tracemalloc
+
 import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
+from scipy import sparse
 from scipy.optimize import least_squares
 
 from sealfit.config import Config
-from sealfit.fit.aging.law import Values, between_scatter, fit_law, solve_law
-from sealfit.fit.aging.law_profiles import curve_intervals
-from sealfit.fit.aging.series import aging_curves, fit_series
+from sealfit.fit.aging.law import Values, fit_law, solve_law
+from sealfit.fit.aging.law_profiles import curve_errors, curve_intervals
+from sealfit.fit.aging.series import aging_curves, between_scatter, fit_series
 from sealfit.fit.steady.fit import fit_conditions
 from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT
@@ -92,11 +95,64 @@ def test_the_shared_unaged_value_is_counted_once():
     npt.assert_allclose([mu_0, a_0, u_0, a_1, u_1], other.x, rtol=1e-5)
     npt.assert_allclose(fit.chi2, 2 * other.cost, rtol=1e-9)
     expected = np.linalg.inv(other.jac.T @ other.jac)
-    order = [0, 1, 3, 2, 4]
-    npt.assert_allclose(fit.covariance[np.ix_(order, order)], expected, rtol=1e-3, atol=1e-3 * expected.max())
+    for place, found in zip(([0, 1, 2], [0, 3, 4]), curve_errors(fit, np.zeros(13))[0], strict=True):
+        npt.assert_allclose(found, expected[np.ix_(place, place)], rtol=1e-3, atol=1e-3 * expected.max())
     assert (
         abs(expected[2, 4]) > 0.02 * expected[2, 2]
     )  # through mu_0 the b of one series hangs on the other's days
+
+
+def correlated(series=3, seed=2):
+    """Two quantities of some series with 5, 6, 7, ... days; those of a condition are correlated."""
+    rng, sd = np.random.default_rng(seed), 0.004
+    rows = [(0.0, quantity, -1) for quantity in (0, 1)]
+    for k in range(series):
+        rows += [
+            (2.0**power, quantity, 2 * k + quantity) for power in range(5 + k % 3) for quantity in (0, 1)
+        ]
+    days, origin, curve = np.array(rows).T
+    origin, curve = origin.astype(int), curve.astype(int)
+    a = np.where(curve < 0, 0.0, 0.03 + 0.002 * (curve % 7))
+    value = np.where(origin, 0.6, 0.9) - a * np.log1p(days / 0.3)
+    block = sd**2 * np.array([[1.0, 0.6], [0.6, 1.0]])
+    value = value + rng.multivariate_normal([0.0, 0.0], block, days.size // 2).ravel()
+    covariance = sparse.kron(sparse.eye_array(days.size // 2), block)
+    return Values(days, value, origin, curve, covariance)
+
+
+def test_correlated_quantities_of_several_series_are_one_fit():
+    """A second way: all 14 parameters by scipy with the whole covariance; estimates, covariance and shift."""
+    values = correlated()
+    white = np.linalg.inv(np.linalg.cholesky(values.covariance.toarray()))
+
+    def residual(x):
+        a, u = np.append(x[2:8], 0.0)[values.curve], np.append(x[8:], 0.0)[values.curve]
+        return white @ (x[values.origin] - a * np.log1p(values.days * np.exp(-u)) - values.value)
+
+    fit = fit_law(values)
+    other = least_squares(residual, fit.x + 0.01, "3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    expected = np.linalg.inv(other.jac.T @ other.jac)
+    assert fit.chi2 == pytest.approx(2 * other.cost, rel=1e-9)
+    npt.assert_allclose((fit.x - other.x) / np.sqrt(np.diag(expected)), 0.0, atol=1e-4)
+    moved = 0.01 * values.value
+    change = expected @ other.jac.T @ white @ moved
+    for place, found, shift in zip(values.places_of_curve, *curve_errors(fit, moved), strict=True):
+        size = np.sqrt(np.diag(expected))[place]
+        npt.assert_allclose((found - expected[np.ix_(place, place)]) / np.outer(size, size), 0.0, atol=1e-5)
+        npt.assert_allclose((shift - change[place]) / size, 0.0, atol=1e-4)
+
+
+def test_memory_grows_as_the_series():
+    """400 series have 4,800 values and 1,602 parameters: an array of n by n numbers has 184 MB."""
+    values = correlated(400)
+    tracemalloc.start()
+    fit = fit_law(values)
+    covariance, _ = curve_errors(fit, values.value)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert fit.chi2 == pytest.approx(fit.df, rel=0.2)
+    assert covariance.shape == (800, 3, 3)
+    assert peak < 60e6
 
 
 def test_profile_of_b_is_that_of_the_whole_problem():

@@ -1,6 +1,7 @@
 """One law of aging for all series: truth comes back, evidence chooses the shape, and intervals hold."""
 
 import os
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.optimize import least_squares
+from scipy.sparse import csr_array
 
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.aging.joint_law import Aged, fit_joint_law, fit_laws, left_out, rivals_of
+from sealfit.fit.aging.joint_law import MOST_LEFT_OUT, Aged, fit_joint_law, fit_laws, left_out, rivals_of
 from sealfit.fit.aging.joint_least_squares import solved_many, solved_without
 from sealfit.fit.aging.lifetime import (
     DAYS_PER_YEAR,
@@ -22,6 +24,7 @@ from sealfit.fit.aging.lifetime import (
     resampled,
     temperature_for,
 )
+from sealfit.fit.joint.whitening import whitening_of
 from sealfit.fit.least_squares import central_jacobian
 from sealfit.physics.aging_laws import LOSSES
 
@@ -159,7 +162,7 @@ def test_an_end_that_a_likely_law_leaves_open_stays_open():
 
 
 def whitened(covariance):
-    return np.linalg.inv(np.linalg.cholesky(covariance))
+    return whitening_of(csr_array(covariance))
 
 
 def alone(law, covariance, values, keep=slice(None)):
@@ -177,7 +180,7 @@ def alone(law, covariance, values, keep=slice(None)):
 
 def test_many_draws_at_once_are_fitted_as_each_alone():
     law = fit_joint_law(campaign(scatter=0.01), "log", "rate")
-    covariance = law.aged.covariance(law.scatter)
+    covariance = law.aged.covariance(law.scatter).toarray()
     drawn = np.random.default_rng(2).multivariate_normal(law.at(law.aged), covariance, 6)
     for values, x in zip(drawn, solved_many(law, whitened(covariance), drawn), strict=True):
         assert x == pytest.approx(alone(law, covariance, values), rel=1e-5, abs=1e-6)
@@ -188,10 +191,37 @@ def test_values_left_out_at_once_are_left_out_of_each_fit():
     aged = campaign(scatter=0.01)
     common = 1e-5 * (aged.series()[:, None] == aged.series()) + np.diag(aged.variance)
     law = fit_joint_law(replace(aged, variance=common), "log", "rate")
-    covariance = law.aged.covariance(law.scatter)
+    covariance = law.aged.covariance(law.scatter).toarray()
     masks = np.array([*aged.whole_series(), *aged.last_days()])
     for out, x in zip(masks, solved_without(law, whitened(covariance), masks), strict=True):
         assert x == pytest.approx(alone(law, covariance, aged.value, ~out), rel=1e-5, abs=1e-6)
+
+
+def test_of_many_series_some_are_left_out_in_turn():
+    rng = np.random.default_rng(1)
+    days = np.tile([1.0, 4.0, 16.0], 200)
+    celsius = np.repeat(np.linspace(40.0, 80.0, 200), 3)
+    value = 0.9 - 0.05 * np.log1p(days / 0.1) + 0.01 * rng.standard_normal(600)
+    masks = Aged(days, value, celsius).whole_series()
+    assert len(masks) == MOST_LEFT_OUT
+    assert masks[0][:3].all()
+    assert masks[-1][-3:].all()
+    assert {int(own.sum()) for own in masks} == {3}
+    assert len(Aged(days[:60], value[:60], celsius[:60]).last_days()) == 20
+
+
+def test_memory_grows_as_the_conditions():
+    """3,999 values of 1,333 series: an array of n by n numbers has 128 MB."""
+    rng = np.random.default_rng(1)
+    celsius = np.repeat(np.linspace(40.0, 80.0, 1333), 3)
+    days = np.tile([1.0, 4.0, 16.0], 1333)
+    value = (0.9 - 0.05 * np.log1p(days / 0.1)) * (1 + 0.01 * rng.standard_normal(days.size))
+    tracemalloc.start()
+    law = fit_joint_law(Aged(days, value, celsius, variance=np.full(days.size, 1e-6)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert law.x[0] == pytest.approx(0.9, abs=0.01)
+    assert peak < 60e6
 
 
 @pytest.mark.parametrize("scatter", [0.0, 0.02])
@@ -199,8 +229,8 @@ def test_a_decomposed_covariance_is_the_covariance(scatter):
     aged = campaign(scatter=0.01)
     common = 1e-5 * (aged.series()[:, None] == aged.series()) + np.diag(aged.variance)
     aged = replace(aged, variance=common)
-    covariance, residual = aged.covariance(scatter), np.sin(np.arange(aged.value.size))
-    white = aged.spread.whitening(scatter)
+    covariance, residual = aged.covariance(scatter).toarray(), np.sin(np.arange(aged.value.size))
+    white = aged.spread.whitening(scatter).toarray()
     assert white @ covariance @ white.T == pytest.approx(np.eye(aged.value.size), abs=1e-9)
     assert aged.spread.chi2(residual, scatter) == pytest.approx(
         residual @ np.linalg.solve(covariance, residual)

@@ -48,7 +48,7 @@ def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
         rows["value"].to_numpy(float),
         column(TEMPERATURE),
         column(COMPRESSION),
-        levels.covariance[np.ix_(here, here)],
+        levels.covariance[here][:, here],
     )
 
 
@@ -137,8 +137,7 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
 
     None if the series have too few values for separate laws.
     """
-    aged, series = law.aged, law.aged.series()
-    days = [np.unique(aged.days[own]).size for own in aged.whole_series()]
+    aged, series, days = law.aged, law.aged.series(), law.aged.days_of_series()
     if len(days) < 2 or min(days) < 3:
         return None
     origin = np.zeros(aged.value.size, int)
@@ -146,8 +145,8 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
     bic = fitted.chi2 + aged.spread.log_determinant(law.scatter) + fitted.x.size * np.log(aged.value.size)
     squares = []
     for out in aged.last_days() if min(days) > 3 else []:
-        part = fit_law(fitted.values.part(~out))
-        squares += list((law_model(fitted.values, part.x)[0][out] - aged.value[out]) ** 2)
+        part = fit_law(fitted.values.part(~out), fitted.x)
+        squares += list((law_model(fitted.values, part.x)[out] - aged.value[out]) ** 2)
     return bic, float(np.sqrt(np.mean(squares))) if squares else np.nan
 
 

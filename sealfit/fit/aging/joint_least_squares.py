@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sealfit.fit.least_squares import levenberg_marquardt
 
@@ -31,14 +33,14 @@ POLISHED = 4
 DEPENDENT = 1e-20
 
 
-def solved(law: JointLaw, white: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+def solved(law: JointLaw, white: csr_array, start: np.ndarray | None = None) -> np.ndarray:
     """Return the least-squares parameters, shape (p,), from a start or from the best points of a grid.
 
     Parameters
     ----------
     law : JointLaw
         Gives the shape, its target, the values and the references.
-    white : ndarray, shape (n, n)
+    white : sparse array, shape (n, n)
         W with W C W' = 1 for the covariance C of the values.
     start : ndarray, shape (p,), optional
         Starting point.
@@ -49,7 +51,7 @@ def solved(law: JointLaw, white: np.ndarray, start: np.ndarray | None = None) ->
     return x[np.argmin(rss)]
 
 
-def solved_many(law: JointLaw, white: np.ndarray, values: np.ndarray) -> np.ndarray:
+def solved_many(law: JointLaw, white: csr_array, values: np.ndarray) -> np.ndarray:
     """Return the parameters for many draws of the values, shape (draws, p), computed together.
 
     Parameters
@@ -62,7 +64,7 @@ def solved_many(law: JointLaw, white: np.ndarray, values: np.ndarray) -> np.ndar
     return _Projected(law, white, values).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
 
 
-def solved_without(law: JointLaw, white: np.ndarray, masks: np.ndarray) -> np.ndarray:
+def solved_without(law: JointLaw, white: csr_array, masks: np.ndarray) -> np.ndarray:
     """Return the parameters without the values of each mask, shape (masks, p), computed together.
 
     Parameters
@@ -92,30 +94,30 @@ class _Projected:
     Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995.
     """
 
-    def __init__(self, law: JointLaw, white: np.ndarray, values: np.ndarray, masks: np.ndarray | None = None):
-        self.law, self.values, self.aside = law, values, None
-        level = white.sum(axis=1)  # the column of mu_0
-        if masks is None:
-            self.level = (level @ white / (level @ level))[None]
-            self.white = white - np.outer(level, self.level)
-        else:
-            # Leaving a value out equals giving it a parameter; these columns are projected out together with
-            # mu_0.
-            self.white, self.level = white, np.zeros(values.shape)
-            self.aside = np.zeros((len(masks), masks.sum(axis=1).max() + 1, values.shape[1]))
-            for k, out in enumerate(masks):
-                found, upper = np.linalg.qr(np.column_stack([white[:, out], level]))
-                self.aside[k, : out.sum() + 1] = found.T
-                self.level[k] = found[:, -1] @ white / upper[-1, -1]
+    def __init__(self, law: JointLaw, white: csr_array, values: np.ndarray, masks: np.ndarray | None = None):
+        self.law, self.values, self.white, self.aside = law, values, white, None
+        level = np.tile(white.sum(axis=1), (1 if masks is None else len(masks), 1, 1))
+        if masks is not None:
+            self.aside = [_columns_of(white, out) for out in masks]
+            self._take_aside(level, range(len(masks)))
+        self.column = level / np.linalg.norm(level, axis=2, keepdims=True)  # of mu_0
+        self.level = (level[:, 0] / (level[:, 0] ** 2).sum(axis=1, keepdims=True)) @ white
         self.measured = self._whitened(values[:, None], np.arange(len(values)))
-        self.reach = float((white**2).sum())
+        self.reach = float((white.data**2).sum())
+
+    def _take_aside(self, many: np.ndarray, of: Iterable[int]) -> None:
+        """Project the values left out of the sets `of` out of whitened rows, shape (r, m, n), in place."""
+        for own, k in zip(many, of, strict=True):
+            rows, basis = self.aside[k]
+            own[:, rows] -= (own[:, rows] @ basis) @ basis.T
 
     def _whitened(self, many: np.ndarray, of: np.ndarray) -> np.ndarray:
         """Return rows, shape (r, m, n), of the sets `of`, shape (r,), whitened, with mu_0 projected out."""
-        many = (many.reshape(-1, len(self.white)) @ self.white.T).reshape(many.shape)
-        return (
-            many if self.aside is None else many - (many @ np.swapaxes(self.aside[of], 1, 2)) @ self.aside[of]
-        )
+        many = (self.white @ many.reshape(-1, many.shape[2]).T).T.reshape(many.shape)
+        if self.aside is not None:
+            self._take_aside(many, of)
+        column = self.column[of] if len(self.column) > 1 else self.column
+        return many - (many @ np.swapaxes(column, 1, 2)) * column
 
     def solve(self, nonlinear: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mu_0 and a, shape (r, 2), the whitened residual, (r, n), and its derivative, (r, p - 2, n).
@@ -163,3 +165,14 @@ class _Projected:
         )
         found, rss = levenberg_marquardt(lambda x, rows: self.solve(x, of[rows])[1:], nonlinear, low, high)
         return np.concatenate([self.solve(found, of)[0], found], axis=1), rss
+
+
+def _columns_of(white: csr_array, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows, shape (t,), and an orthonormal basis there, (t, k), of the columns of some values.
+
+    Leaving a value out equals giving it a parameter, whose column is projected out. It is 0 in the rows of
+    independent values.
+    """
+    columns = white[:, np.flatnonzero(out)]
+    rows = np.flatnonzero(np.diff(columns.indptr))
+    return rows, np.linalg.qr(columns[rows].toarray())[0]

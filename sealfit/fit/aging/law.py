@@ -1,24 +1,29 @@
 """Eq. 15 fitted to the coefficients of many conditions: one law per curve, one unaged value for all curves.
 
 A curve is one quantity (mu_s or mu_c) of one series. Curves of a quantity share mu_0, so their values are
-fitted together by generalised least squares. mu_0 and a are linear; ln b is searched globally, curve by
-curve.
+fitted together by generalised least squares. ln b is first searched globally, curve by curve.
+
+Given mu_0, the series are independent: they are fitted one by one, many at once as arrays, and only mu_0 is
+fitted to all values (variable projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
+doi:10.1137/0710036). The cost is proportional to the number of series.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.sparse import csr_array
+from scipy.sparse import block_array, csr_array
 
+from sealfit.fit.joint.whitening import members, whitening_of
 from sealfit.fit.least_squares import (
     BatchFit,
+    Linear,
     Separable,
-    covariance_of,
+    damped_inverse,
     even_grid,
     global_optimum,
     levenberg_marquardt,
@@ -30,8 +35,10 @@ SOONEST, LATEST = 1e-9, 1e3
 PER_DECADE = 8
 # Largest relative scatter. If a law is zero, no relative scatter explains its residuals.
 MOST_SCATTER = 1e6
-# Number of points along ln b at which the intervals of a and c are computed.
-PROFILED = 17
+# Number of points along ln b at which the intervals of a and c are computed, and at which b is searched anew.
+PROFILED, SCANNED = 17, 120
+# Directions of a and ln b with singular values below this share are not determined.
+DEPENDENT = 1e-10
 
 
 def search_limits(days) -> tuple[np.ndarray, np.ndarray]:
@@ -70,6 +77,7 @@ def solve_law(days, value, weight) -> BatchFit:
     return global_optimum(Separable(basis, value, weight, (False, False)), even_grid(low, high, PER_DECADE))
 
 
+# ---------------------------------------------------------------- values
 @dataclass(frozen=True)
 class Values:
     """Measured values of one rubber; values of one condition are adjacent."""
@@ -78,13 +86,18 @@ class Values:
     value: np.ndarray  # (n,)
     origin: np.ndarray  # (n,) int: number of the value's mu_0
     curve: np.ndarray  # (n,) int: number of its curve, -1 for unaged rubber
-    covariance: np.ndarray  # (n, n)
+    covariance: csr_array  # (n, n), or an array
     # (n,), values to which the scatter between specimens is relative; None: the law's own
     size: np.ndarray | None = None
     # degrees of freedom of a covariance estimated from replicates, of differences between values and of their
     # common level; 0 if it is known otherwise
     replicates_df: float = 0.0
     level_df: float = 0.0
+
+    def __post_init__(self) -> None:
+        covariance = csr_array(self.covariance, copy=True)
+        covariance.eliminate_zeros()
+        object.__setattr__(self, "covariance", covariance)
 
     @property
     def origins(self) -> int:
@@ -97,18 +110,39 @@ class Values:
         return int(self.curve.max()) + 1
 
     @cached_property
-    def whitening(self) -> np.ndarray:
-        """W with W C W' = 1, shape (n, n); block diagonal where only adjacent values are correlated."""
-        n = self.value.size
-        linked = np.abs(self.covariance) > 0
-        reach = np.array([np.flatnonzero(row)[-1] for row in linked])
-        ends = np.flatnonzero(np.maximum.accumulate(reach) == np.arange(n)) + 1
-        inverse, start = np.zeros((n, n)), 0
-        for end in ends:
-            block = slice(start, end)
-            inverse[block, block] = np.linalg.inv(np.linalg.cholesky(self.covariance[block, block]))
-            start = end
-        return inverse
+    def whitening(self) -> csr_array:
+        """W with W C W' = 1, shape (n, n)."""
+        return whitening_of(self.covariance)
+
+    @cached_property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Limits of ln b per curve, as `search_limits`, shape (curves,) each."""
+        first, last = np.full(self.curves, np.inf), np.zeros(self.curves)
+        aged = self.curve >= 0
+        np.minimum.at(first, self.curve[aged], self.days[aged])
+        np.maximum.at(last, self.curve[aged], self.days[aged])
+        return np.log(first * SOONEST), np.log(last * LATEST)
+
+    @cached_property
+    def places_of_curve(self) -> np.ndarray:
+        """Places of mu_0, a and ln b of each curve among the parameters, shape (curves, 3)."""
+        m, curve = self.origins, np.arange(self.curves)
+        origin, aged = np.zeros(self.curves, int), self.curve >= 0
+        origin[self.curve[aged]] = self.origin[aged]
+        return np.column_stack([origin, m + curve, m + self.curves + curve])
+
+    @cached_property
+    def groups(self) -> list[Groups]:
+        """The values in groups that are independent given mu_0, those of one size together."""
+        n, aged = self.value.size, np.flatnonzero(self.curve >= 0)
+        member = csr_array((np.ones(aged.size), (aged, self.curve[aged])), shape=(n, self.curves))
+        found = {}
+        for own in members(block_array([[self.covariance, member], [member.T, None]], format="csr")):
+            of_values = (own < n).sum(axis=1)  # values come first
+            for count in np.unique(of_values):
+                rows, curves = np.split(own[of_values == count], [count], axis=1)
+                found[rows.shape[1], curves.shape[1]] = Groups(self, rows, curves - n)
+        return list(found.values())
 
     def part(self, keep) -> Values:
         """Return some of the values, with origins and curves renumbered."""
@@ -119,7 +153,7 @@ class Values:
             self.value[keep],
             np.unique(self.origin[keep], return_inverse=True)[1],
             np.where(curve >= 0, numbered, -1),
-            self.covariance[np.ix_(keep, keep)],
+            self.covariance[keep][:, keep],
             None if self.size is None else self.size[keep],
             self.replicates_df,
             self.level_df,
@@ -130,6 +164,96 @@ class Values:
         return np.abs(model) if self.size is None else self.size
 
 
+class Groups:
+    """Groups of values and of their curves, of one size each and independent given mu_0.
+
+    A group is a series with its correlated quantities, an unaged condition, or, if batches correlate
+    conditions, several of them. The parameters of a group are all mu_0, then a, then ln b of its curves.
+
+    Parameters
+    ----------
+    values : Values
+        All values.
+    rows, curves : ndarray of int, shape (g, n) and (g, w)
+        The values and the curves of each group, ascending.
+
+    Attributes
+    ----------
+    places : ndarray of int, shape (g, p)
+        Places of the parameters of each group among all parameters.
+    bounds : ndarray, shape (2, g, p)
+        Limits of the parameters.
+    """
+
+    def __init__(self, values: Values, rows: np.ndarray, curves: np.ndarray) -> None:
+        self.rows, self.curves, self.m, self.width = rows, curves, values.origins, curves.shape[1]
+        self.days, self.value = values.days[rows], values.value[rows]
+        self.of_origin = values.origin[rows][:, None] == np.arange(self.m)[:, None]
+        self.of_curve = values.curve[rows][:, None] == curves[..., None]
+        shared = np.tile(np.arange(self.m), (len(rows), 1))
+        self.places = np.hstack([shared, self.m + curves, self.m + values.curves + curves])
+        self.size = self.m + 2 * values.curves
+        b = slice(self.m + self.width, None)
+        self.bounds = np.full((2, *self.places.shape), np.inf)  # of the parameters
+        self.bounds[0] *= -1
+        self.bounds[:, :, b] = np.array(values.limits)[:, curves]
+        white, count = values.whitening.tocoo(), np.arange(rows.shape[1])
+        number, place = np.full(values.value.size, -1), np.zeros(values.value.size, int)
+        number[rows], place[rows] = np.arange(len(rows))[:, None], count
+        own = number[white.row] >= 0
+        number, column, data = number[white.row[own]], place[white.col[own]], white.data[own]
+        down = place[white.row[own]] - column
+        # Of the whitening, from the main one downwards: as many as there are values of a condition.
+        self.diagonals = [np.zeros((len(rows), count.size - d)) for d in range(down.max() + 1)]
+        for d, diagonal in enumerate(self.diagonals):
+            diagonal[number[down == d], column[down == d]] = data[down == d]
+
+    def white(self, columns: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """Return whitened columns, shape (r, c, n), of the groups `of`, shape (r,)."""
+        found = self.diagonals[0][of, None] * columns
+        for down, own in enumerate(self.diagonals[1:], start=1):
+            found[..., down:] += own[of, None] * columns[..., :-down]
+        return found
+
+    def evaluate(self, x: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return whitened residuals, shape (r, n), and derivatives, (r, p, n), of groups at x, (r, p)."""
+        a, u = x[:, self.m : self.m + self.width, None], x[:, self.m + self.width :, None]
+        ratio = self.of_curve[of] * self.days[of, None] * np.exp(-u)
+        loss = np.log1p(ratio)
+        model = (x[:, : self.m, None] * self.of_origin[of]).sum(axis=1) - (a * loss).sum(axis=1)
+        slope = np.concatenate([self.of_origin[of], -loss, a * ratio / (1 + ratio)], axis=1)
+        white = self.white(np.concatenate([slope, (model - self.value[of])[:, None]], axis=1), of)
+        return white[:, -1], white[:, :-1]
+
+    def total(self, each: np.ndarray) -> np.ndarray:
+        """Return what is given for the parameters of each group, shape (g, p), added up for all, (all,)."""
+        return np.bincount(self.places.ravel(), each.ravel(), minlength=self.size)
+
+    def free(self, x: np.ndarray) -> np.ndarray:
+        """Return which parameters of the groups, shape (g, p), are not at a limit of ln b."""
+        return (x[self.places] > self.bounds[0]) & (x[self.places] < self.bounds[1])
+
+    def eliminated(self, x: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Return whitened derivatives with respect to mu_0 and a column, a and b eliminated, (g, m + 1, n).
+
+        Parameters
+        ----------
+        x : ndarray, shape (all,)
+            All parameters.
+        column : ndarray, shape (g, n)
+            Any whitened column.
+        """
+        _, slope = self.evaluate(x[self.places], np.arange(len(self.rows)))
+        columns = np.concatenate([slope[:, : self.m], column[:, None]], axis=1)
+        if not self.width:
+            return columns
+        aside = slope[:, self.m :] * self.free(x)[:, self.m :, None]
+        scale = np.linalg.norm(aside, axis=2, keepdims=True)
+        _, singular, basis = np.linalg.svd(aside / np.where(scale > 0, scale, 1.0), full_matrices=False)
+        basis = basis * (singular > DEPENDENT)[..., None]
+        return columns - (columns @ np.swapaxes(basis, 1, 2)) @ basis
+
+
 @dataclass(frozen=True)
 class LawFit:
     """Optimum of the joint fit; parameters in the order mu_0 (origins), a (curves), ln b (curves)."""
@@ -137,49 +261,28 @@ class LawFit:
     values: Values
     x: np.ndarray
     chi2: float
-    limits: tuple[np.ndarray, np.ndarray]  # of ln b per curve
-
-    @cached_property
-    def jacobian(self) -> np.ndarray:
-        """Derivative of the model, not whitened, shape (n, p)."""
-        return law_model(self.values, self.x)[1]
-
-    @cached_property
-    def covariance(self) -> np.ndarray:
-        """Covariance of the parameters, shape (p, p), by `covariance_of`; 0 for a ln b at a limit."""
-        free = np.ones(self.x.size, bool)
-        free[-self.values.curves :] = (self.x[-self.values.curves :] > self.limits[0]) & (
-            self.x[-self.values.curves :] < self.limits[1]
-        )
-        return covariance_of(self.values.whitening @ self.jacobian, free)[0]
 
     @property
     def df(self) -> int:
         """Values less parameters."""
         return self.values.value.size - self.x.size
 
-    @property
+    @cached_property
     def model(self) -> np.ndarray:
         """The law at every value, shape (n,)."""
-        return law_model(self.values, self.x)[0]
+        return law_model(self.values, self.x)
+
+    @cached_property
+    def residuals(self) -> list[np.ndarray]:
+        """Whitened residuals of `values.groups`, shape (g, n) each."""
+        return [own.evaluate(self.x[own.places], np.arange(len(own.rows)))[0] for own in self.values.groups]
 
 
-def law_model(values: Values, x) -> tuple[np.ndarray, np.ndarray]:
-    """Return the law at every value, shape (n,), and its derivative, shape (n, p)."""
-    m, k, n = values.origins, values.curves, values.value.size
-    a, u = x[m : m + k], x[m + k :]
-    jacobian = np.zeros((n, x.size))
-    every = np.arange(n)
-    jacobian[every, values.origin] = 1.0
-    aged = every[values.curve >= 0]
-    curve = values.curve[aged]
-    ratio = values.days[aged] * np.exp(-u[curve])
-    loss = np.log1p(ratio)
-    jacobian[aged, m + curve] = -loss
-    jacobian[aged, m + k + curve] = a[curve] * ratio / (1 + ratio)
-    model = x[values.origin].copy()
-    model[aged] -= a[curve] * loss
-    return model, jacobian
+def law_model(values: Values, x: np.ndarray) -> np.ndarray:
+    """Return the law with parameters x at every value, shape (n,)."""
+    m, k = values.origins, values.curves
+    a, b = np.append(x[m : m + k], 0.0), np.exp(np.append(x[m + k :], 0.0))  # unaged rubber is curve -1
+    return x[values.origin] - a[values.curve] * np.log1p(values.days / b[values.curve])
 
 
 def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
@@ -196,94 +299,121 @@ def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
     start : ndarray, shape (p,), optional
         Parameters of a fit to nearly the same values, for a local fit only.
     """
-    m, k = values.origins, values.curves
-    whiten = csr_array(values.whitening)
-    limits = np.array([search_limits(values.days[values.curve == c]) for c in range(k)]).reshape(k, 2).T
-    low, high = (
-        np.concatenate([np.full(m + k, end), own]) for end, own in zip((-np.inf, np.inf), limits, strict=True)
-    )
-
-    def evaluate(x, _rows):
-        model, slope = law_model(values, x[0])
-        return (whiten @ (model - values.value))[None], (whiten @ slope).T[None]
-
-    def polished(x):
-        found, rss = levenberg_marquardt(evaluate, x[None], low, high)
-        return LawFit(values, found[0], float(rss[0]), (limits[0], limits[1]))
-
     if start is not None:
-        return polished(start)
-    found = polished(_each_alone(values))
+        return _polished(values, start)
+    found = _polished(values, _each_alone(values))
     for _ in range(3):
         moved = _rescan(found)
         if moved is None:
             break
-        again = polished(moved)
+        again = _polished(values, moved)
         if not again.chi2 < found.chi2 * (1 - 1e-9):
             break
         found = again
     return found
 
 
+def _polished(values: Values, start: np.ndarray) -> LawFit:
+    """Return the local optimum from a start."""
+    groups, endless = values.groups, np.full(values.origins + values.curves, np.inf)
+
+    def evaluate(x, _):
+        found = [own.evaluate(x[0, own.places], np.arange(len(own.rows))) for own in groups]
+        slope = np.empty(1, object)
+        slope[0] = [one for _, one in found]
+        return np.concatenate([rest.ravel() for rest, _ in found])[None], slope
+
+    low, high = np.r_[-endless, values.limits[0]], np.r_[endless, values.limits[1]]
+    x, rss = levenberg_marquardt(evaluate, start[None], low, high, linear=_Eliminating(groups))
+    return LawFit(values, x[0], float(rss[0]))
+
+
+class _Eliminating(Linear):
+    """Products for one problem, whose derivatives are a list by groups.
+
+    A step eliminates a and b group by group, solves the remaining equations of mu_0 (Schur complement), and
+    substitutes back.
+    """
+
+    def __init__(self, groups: list[Groups]) -> None:
+        self.groups = groups
+        self.ends = np.cumsum([own.rows.size for own in groups])[:-1]
+
+    def _each(self, slope, rest):
+        parts = np.split(rest[0], self.ends)
+        for own, one, part in zip(self.groups, slope[0], parts, strict=True):
+            yield own, one, part.reshape(own.rows.shape)
+
+    def norms(self, slope):
+        squares = (own.total((one**2).sum(axis=2)) for own, one in zip(self.groups, slope[0], strict=True))
+        return np.sqrt(sum(squares))[None]
+
+    def gradient(self, slope, rest):
+        parts = (own.total((one @ part[..., None])[..., 0]) for own, one, part in self._each(slope, rest))
+        return sum(parts)[None]
+
+    def step(self, slope, scale, rest, damping):
+        m, found = self.groups[0].m, np.zeros(scale.shape)
+        normal, kept = np.zeros((m + 1, m + 1)), []
+        for own, one, part in self._each(slope, rest):
+            one = one * scale[0, own.places, None]
+            columns = np.concatenate([one[:, :m], part[:, None]], axis=1)
+            normal += np.einsum("gin,gjn->ij", columns, columns)
+            if own.width:
+                axes, singular, rows = np.linalg.svd(one[:, m:], full_matrices=False)
+                along, share = columns @ np.swapaxes(rows, 1, 2), damped_inverse(singular, damping)
+                normal -= np.einsum("gik,gk,gjk->ij", along, singular * share, along)
+                kept.append((own, axes * share[:, None], along))
+        found[0, :m] = np.linalg.solve(normal[:m, :m] + damping * np.eye(m), -normal[:m, m])
+        for own, inverse, along in kept:
+            left = along[:, m] + found[0, :m] @ along[:, :m]
+            found[0, own.places[:, m:]] = -(inverse @ left[..., None])[..., 0]
+        return found
+
+
 def _each_alone(values: Values) -> np.ndarray:
+    """Return the parameters if every curve is fitted alone; unaged values enter as their weighted mean."""
     m, k = values.origins, values.curves
-    members = []
-    for c in range(k):
-        own = values.curve == c
-        shared = (values.curve < 0) & (values.origin == values.origin[own][0])
-        members.append(np.flatnonzero(own | shared))
-    longest = max(len(rows) for rows in members)
-    days, value, weight = np.ones((k, longest)), np.zeros((k, longest)), np.zeros((k, longest))
-    variance = np.diag(values.covariance)
-    for c, rows in enumerate(members):
-        days[c, : len(rows)], value[c, : len(rows)] = values.days[rows], values.value[rows]
-        weight[c, : len(rows)] = 1 / variance[rows]
-    alone = solve_law(days, value, weight)
-    start_0 = [
-        np.mean([alone.coefficients[c, 0] for c in range(k) if values.origin[values.curve == c][0] == q])
-        for q in range(m)
-    ]
-    return np.concatenate([start_0, alone.coefficients[:, 1], alone.u])
+    weight = 1 / values.covariance.diagonal()
+    aged = np.flatnonzero(values.curve >= 0)
+    aged = aged[np.argsort(values.curve[aged], kind="stable")]
+    curve = values.curve[aged]
+    number = 1 + np.arange(aged.size) - np.searchsorted(curve, curve)
+    table = np.zeros((3, k, 1 + int(number.max())))
+    table[0] = 1.0
+    table[:, curve, number] = values.days[aged], values.value[aged], weight[aged]
+    unaged = values.curve < 0
+    total = np.bincount(values.origin[unaged], weight[unaged], minlength=m)
+    moment = np.bincount(values.origin[unaged], (weight * values.value)[unaged], minlength=m)
+    mean = np.divide(moment, total, out=np.zeros(m), where=total > 0)
+    origin = values.places_of_curve[:, 0]
+    table[:, :, 0] = np.zeros(k), mean[origin], total[origin]
+    alone = solve_law(*table)
+    start = np.bincount(origin, alone.coefficients[:, 0], minlength=m) / np.bincount(origin, minlength=m)
+    return np.concatenate([start, alone.coefficients[:, 1], alone.u])
 
 
 def _rescan(found: LawFit) -> np.ndarray | None:
     """Return parameters with each b searched over its whole range, others fixed; None if none is better."""
-    values, limits, whiten = found.values, found.limits, found.values.whitening
-    m, k = values.origins, values.curves
     x, gained = found.x.copy(), False
-    rest = values.value - found.model
-    for c in range(k):
-        rows = np.flatnonzero(values.curve == c)
-        u = np.linspace(limits[0][c], limits[1][c], 120)
-        columns = -np.log1p(values.days[rows] * np.exp(-u)[:, None])
-        without = rest.copy()
-        without[rows] += x[m + c] * -np.log1p(values.days[rows] * np.exp(-x[m + k + c]))
-        target = whiten @ without
-        white = columns @ whiten[:, rows].T
-        gain = (white @ target) ** 2 / np.maximum(np.einsum("gn,gn->g", white, white), 1e-300)
-        best = int(np.argmax(gain))
-        if target @ target - gain[best] < found.chi2 * (1 - 1e-6):
-            x[m + k + c], x[m + c] = u[best], white[best] @ target / (white[best] @ white[best])
-            gained = True
+    for own, rest in zip(found.values.groups, found.residuals, strict=True):
+        every, chi2 = np.arange(len(own.rows)), (rest**2).sum(axis=1)
+        for place in range(own.width):
+            at_a, at_b = own.m + place, own.m + own.width + place
+            tried = found.x[own.places]
+            target = tried[:, at_a, None] * own.evaluate(tried, every)[1][:, at_a] - rest
+            most, best = np.zeros(len(every)), tried[:, [at_a, at_b]]
+            for u in np.linspace(own.bounds[0][:, at_b], own.bounds[1][:, at_b], SCANNED):
+                tried[:, at_b] = u
+                column = own.evaluate(tried, every)[1][:, at_a]
+                along, size = (column * target).sum(axis=1), np.maximum((column**2).sum(axis=1), 1e-300)
+                more = along**2 / size > most
+                most[more] = (along**2 / size)[more]
+                best[more] = np.column_stack([along / size, u])[more]
+            better = (target**2).sum(axis=1) - most < chi2 - 1e-6 * found.chi2
+            x[own.places[better, at_a]], x[own.places[better, at_b]] = best[better].T
+            gained |= bool(better.any())
     return x if gained else None
-
-
-def between_scatter(values: Values) -> tuple[float, LawFit]:
-    """Return the relative scatter of a quantity's values beyond their covariance, and the fit without it.
-
-    The variance of every value is increased by (scatter times the law or `size`)^2; the estimate is Paule and
-    Mandel's.
-    """
-    plain = fit_law(values)
-    if plain.df <= 0 or plain.chi2 <= plain.df:
-        return 0.0, plain
-    scale = values.scale(plain.model)
-
-    def chi2(tau: float) -> float:
-        covariance = values.covariance + np.diag((tau * scale) ** 2)
-        return fit_law(replace(values, covariance=covariance), plain.x).chi2
-
-    return paule_mandel(chi2, plain.df, (plain.model - values.value) / scale), plain
 
 
 def paule_mandel(chi2: Callable[[float], float], df: float, residual: np.ndarray) -> float:

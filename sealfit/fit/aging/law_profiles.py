@@ -1,15 +1,20 @@
-"""Profile-likelihood intervals of the aging law's a, b and c, curve by curve of a joint fit."""
+"""Errors of the aging law's mu_0, a, b and c, curve by curve of a joint fit: covariances and intervals.
+
+For one series all others are a Gaussian likelihood of mu_0: their laws are linearised, and their a and b are
+eliminated (Schur complement). mu_0 hardly changes along the profile of a curve, so that the linearisation is
+harmless. The cost is proportional to the number of series.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize.elementwise import find_root
 
-from sealfit.fit.aging.law import PROFILED, LawFit, Values, law_model
-from sealfit.fit.least_squares import covariance_of, levenberg_marquardt
+from sealfit.fit.aging.law import PROFILED, Groups, LawFit
+from sealfit.fit.least_squares import CHUNK, covariance_of, levenberg_marquardt
 
 # Tolerance of the ends of intervals in ln b: 0.1 % of b.
 CLOSE = 1e-3
@@ -17,6 +22,83 @@ CLOSE = 1e-3
 FIRST_STEP = 0.25
 
 
+# ---------------------------------------------------------------- other series
+def elsewhere(fit: LawFit, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return what all other groups contribute to the normal matrix of mu_0 and a whitened column.
+
+    Parameters
+    ----------
+    fit : LawFit
+        Joint fit.
+    columns : sequence of ndarray, shape (g, n) each
+        The column, by `values.groups`.
+
+    Returns
+    -------
+    list of ndarray, shape (g, m + 1, m + 1) each
+        By `values.groups`; a and b of the other groups are eliminated. Groups are independent, and their
+        contributions add.
+    """
+    pairs = zip(fit.values.groups, columns, strict=True)
+    rows = [own.eliminated(fit.x, column) for own, column in pairs]
+    each = np.concatenate([one @ np.swapaxes(one, 1, 2) for one in rows])
+    none = np.zeros_like(each[:1])
+    before = np.concatenate([none, np.cumsum(each[:-1], axis=0)])
+    after = np.concatenate([np.cumsum(each[:0:-1], axis=0)[::-1], none])
+    return np.split(before + after, np.cumsum([len(one) for one in rows])[:-1])
+
+
+def likelihoods(fit: LawFit) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the likelihood of mu_0 from the other groups, by `values.groups`.
+
+    It is R, shape (g, m + 1, m), and r, (g, m + 1): their chi-square is |R (mu_0 - fitted) + r|^2.
+    """
+    found = []
+    for square in elsewhere(fit, fit.residuals):
+        share, axes = np.linalg.eigh(square)
+        half = np.sqrt(np.maximum(share, 0.0))[..., None] * np.swapaxes(axes, 1, 2)
+        found.append((half[..., :-1], half[..., -1]))
+    return found
+
+
+def curve_errors(fit: LawFit, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariance of mu_0, a and ln b of curves, (curves, 3, 3), and their shift, (curves, 3).
+
+    Parameters
+    ----------
+    fit : LawFit
+        Joint fit.
+    moved : ndarray, shape (n,)
+        Change of the values that causes the shift.
+    """
+    values, m = fit.values, fit.values.origins
+    covariance, shift = np.zeros((values.curves, 3, 3)), np.zeros((values.curves, 3))
+    white = values.whitening @ moved
+    pulls = elsewhere(fit, [white[own.rows] for own in values.groups])
+    for own, (root, _), pull in zip(values.groups, likelihoods(fit), pulls, strict=True):
+        every = np.arange(len(own.rows))[:, None]
+        _, slope = own.evaluate(fit.x[own.places], every[:, 0])
+        tangent = np.concatenate([slope, _of_mu_0(root, slope.shape[1])], axis=2)
+        found, _ = covariance_of(np.swapaxes(tangent, 1, 2), own.free(fit.x))
+        gradient = (slope @ white[own.rows][..., None])[..., 0]
+        gradient[:, :m] += pull[:, :m, -1]
+        step = (np.where(np.isfinite(found), found, 0.0) @ gradient[..., None])[..., 0]
+        for place, curve in enumerate(own.curves.T):
+            at = np.full((len(curve), 3), (0, m + place, m + own.width + place))
+            at[:, 0] = values.places_of_curve[curve, 0]
+            covariance[curve] = found[every[..., None], at[:, :, None], at[:, None, :]]
+            shift[curve] = step[every, at]
+    return covariance, shift
+
+
+def _of_mu_0(root: np.ndarray, p: int) -> np.ndarray:
+    """Return the derivatives of R (mu_0 - fitted), shape (g, p, m + 1), with respect to p parameters."""
+    found = np.zeros((len(root), p, root.shape[1]))
+    found[:, : root.shape[2]] = np.swapaxes(root, 1, 2)
+    return found
+
+
+# ---------------------------------------------------------------- intervals
 @dataclass(frozen=True)
 class CurveInterval:
     """95 % intervals of one curve; an open end is 0 or inf for b, -inf or inf for a and c."""
@@ -43,87 +125,98 @@ def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterv
     rise_of_origin : ndarray, shape (origins,)
         t^2 of each quantity.
     """
-    values = fit.values
-    linked = _linked(values)
-    rows = [np.flatnonzero(np.isin(values.curve, curves)) for curves in linked]
     intervals: dict[int, CurveInterval] = {}
-    for curves, own, others in zip(linked, rows, _other_series(fit, linked, rows), strict=True):
-        series = _Series(fit, curves, own, *others)
-        for place, curve in enumerate(curves):
-            rise = float(rise_of_origin[values.origin[values.curve == curve][0]])
-            intervals[curve] = _curve_interval(series, place, rise)
-    return [intervals[curve] for curve in range(values.curves)]
+    for own, others in zip(fit.values.groups, likelihoods(fit), strict=True):
+        for place, curves in enumerate(own.curves.T):
+            profile = _Profile(fit, own, others, place)
+            rise = rise_of_origin[fit.values.places_of_curve[curves, 0]]
+            intervals |= zip(curves.tolist(), _intervals(profile, rise), strict=True)
+    return [intervals[curve] for curve in range(fit.values.curves)]
 
 
-def _curve_interval(series: _Series, place: int, rise: float) -> CurveInterval:
-    """Return the interval of one curve of a series; `rise` is that of chi-square above its minimum."""
-    limit, log_b = series.chi2 + rise, float(series.x[series.b_at(place)])
-    low, high = (_end(series, place, sign, limit) for sign in (-1, 1))
-    points = np.unique([*np.linspace(low[0], high[0], PROFILED), log_b])
-    chi2, a, variance = np.array([series.profile(place, u) for u in points]).T
-    room = limit - chi2
+def _intervals(profile: _Profile, rise: np.ndarray) -> list[CurveInterval]:
+    """Return the intervals of a curve of each group; `rise`, shape (g,), is that of chi-square."""
+    limit = profile.chi2 + rise
+    low, high = (profile.ends(sign, limit) for sign in (-1, 1))
+    points = np.concatenate([np.linspace(low[0], high[0], PROFILED), profile.log_b[None]]).T
+    of = np.repeat(np.arange(len(points)), points.shape[1])
+    chi2, a, variance = (found.reshape(points.shape) for found in profile.at(points.ravel(), of))
+    room = limit[:, None] - chi2
     half = np.sqrt(np.where(room > 0, room * variance, 0.0))
-    return _interval(points, a, half, low, high)
+    ends = (zip(*end, strict=True) for end in (low, high))
+    return [_interval(*row) for row in zip(points, a, half, *ends, strict=True)]
 
 
-class _Series:
-    """The curves of one series, with its values and a Gaussian likelihood of mu_0 from the other series.
-
-    mu_0 hardly changes along a profile, so that the laws of the other series may be linearised. The
-    parameters of a series are its mu_0, then a, then ln b of its curves.
+class _Profile:
+    """The profile of chi-square along ln b of one curve in each of some groups.
 
     Parameters
     ----------
     fit : LawFit
         Joint fit.
-    curves : list of int
-        The curves of the series.
-    rows : ndarray of int, shape (n,)
-        Its values.
-    root, miss : ndarray, shape (k, m) and (k,)
-        The chi-square of the other series is |root (mu_0 - fitted) + miss|^2.
+    own : Groups
+        The groups.
+    others : tuple of ndarray
+        The likelihood of mu_0 from all others, as in `likelihoods`.
+    place : int
+        Number of the curve within its group.
 
     Attributes
     ----------
-    x : ndarray, shape (p,)
-        Its parameters at the joint optimum.
-    chi2 : float
-        Chi-square there.
+    chi2, log_b : ndarray, shape (g,)
+        Chi-square and ln b at the joint optimum.
     """
 
-    def __init__(
-        self, fit: LawFit, curves: list[int], rows: np.ndarray, root: np.ndarray, miss: np.ndarray
-    ) -> None:
-        self.values, self.root, self.miss = fit.values.part(rows), root, miss
-        m, k = fit.values.origins, fit.values.curves
-        places = np.r_[np.unique(fit.values.origin[rows]), m + np.array(curves), m + k + np.array(curves)]
-        self.x, self.m, self.width = fit.x[places], root.shape[1], len(curves)
-        endless = np.full(self.m + self.width, np.inf)
-        self.low, self.high = np.r_[-endless, fit.limits[0][curves]], np.r_[endless, fit.limits[1][curves]]
-        self.chi2 = float((self._evaluate(self.x[None])[0] ** 2).sum())
+    def __init__(self, fit: LawFit, own: Groups, others: tuple[np.ndarray, np.ndarray], place: int) -> None:
+        self.own, (self.root, self.miss) = own, others
+        self.at_a, self.at_b = own.m + place, own.m + own.width + place
+        self.x = fit.x[own.places]
+        self.log_b = self.x[:, self.at_b]
+        self.chi2 = (self._evaluate(self.x, np.arange(len(self.x)))[0] ** 2).sum(axis=1)
 
-    def b_at(self, place: int) -> int:
-        """Return the index of ln b of a curve among the parameters."""
-        return self.m + self.width + place
+    def at(self, log_b: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """Return the least chi-square, a and the variance of a at fixed ln b of groups, shape (3, r)."""
+        rows = self.own.rows.shape[1] + self.miss.shape[1]
+        parts = 1 + of.size * self.x.shape[1] * rows // CHUNK
+        split = (np.array_split(one, parts) for one in (log_b, of))
+        return np.concatenate([self._at(*part) for part in zip(*split, strict=True)], axis=1)
 
-    def profile(self, place: int, log_b: float) -> tuple[float, float, float]:
-        """Return the least chi-square, a and the variance of a at a fixed ln b of one curve."""
-        x, low, high = self.x.copy(), self.low.copy(), self.high.copy()
-        x[self.b_at(place)] = low[self.b_at(place)] = high[self.b_at(place)] = log_b
-        found, chi2 = levenberg_marquardt(lambda x, _: self._evaluate(x), x[None], low, high)
-        free = (found[0] > low) & (found[0] < high)
-        covariance, _ = covariance_of(self._evaluate(found)[1][0].T, free)
-        at = self.m + place
-        return float(chi2[0]), float(found[0, at]), float(covariance[at, at])
+    def _at(self, log_b: np.ndarray, of: np.ndarray) -> np.ndarray:
+        x, (low, high) = self.x[of], self.own.bounds[:, of]
+        x[:, self.at_b] = low[:, self.at_b] = high[:, self.at_b] = log_b
+        found, chi2 = levenberg_marquardt(lambda x, rows: self._evaluate(x, of[rows]), x, low, high)
+        slope = self._evaluate(found, of)[1]
+        covariance, _ = covariance_of(np.swapaxes(slope, 1, 2), (found > low) & (found < high))
+        return np.array([chi2, found[:, self.at_a], covariance[:, self.at_a, self.at_a]])
 
-    def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return whitened residuals, shape (1, n + k), and the derivative; mu_0 from other series is last."""
-        model, slope = law_model(self.values, x[0])
-        white = self.values.whitening
-        others = np.zeros((self.miss.size, x.size))
-        others[:, : self.m] = self.root
-        rest = np.r_[white @ (model - self.values.value), self.root @ (x[0] - self.x)[: self.m] + self.miss]
-        return rest[None], np.concatenate([white @ slope, others]).T[None]
+    def _evaluate(self, x: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return whitened residuals, shape (r, n + m + 1), and derivatives; those of others are last."""
+        rest, slope = self.own.evaluate(x, of)
+        away = (x - self.x[of])[:, : self.own.m, None]
+        others = (self.root[of] @ away)[..., 0] + self.miss[of]
+        beside = _of_mu_0(self.root[of], x.shape[1])
+        return np.hstack([rest, others]), np.concatenate([slope, beside], axis=2)
+
+    def ends(self, sign: int, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return ln b where the profiles reach the limit, from the optimum outwards, and which are open."""
+        edge = self.own.bounds[int(sign > 0), :, self.at_b]
+        near, far, is_open = self.log_b.copy(), self.log_b.copy(), np.ones(len(edge), bool)
+
+        def above(log_b: np.ndarray, of: np.ndarray) -> np.ndarray:
+            return self.at(log_b, of.astype(int))[0] - limit[of.astype(int)]
+
+        todo, step = np.flatnonzero(sign * (edge - near) > 0), FIRST_STEP
+        while todo.size:
+            far[todo] = sign * np.minimum(sign * near[todo] + step, sign * edge[todo])
+            is_open[todo] = ~(above(far[todo], todo) > 0)
+            todo = todo[is_open[todo]]
+            near[todo], step = far[todo], 2 * step
+            todo = todo[sign * (edge[todo] - near[todo]) > 0]
+        reached = np.flatnonzero(~is_open)
+        if reached.size:
+            bracket, stops = (near[reached], far[reached]), {"xatol": CLOSE, "xrtol": 0.0, "fatol": 0.0}
+            near[reached] = find_root(above, bracket, args=(reached,), tolerances=stops).x
+        return near, is_open
 
 
 def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high: End) -> CurveInterval:
@@ -144,66 +237,3 @@ def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high
             around["c"][outer] = endless
     b = (0.0 if low[1] else float(np.exp(low[0])), np.inf if high[1] else float(np.exp(high[0])))
     return CurveInterval(tuple(around["a"]), b, tuple(around["c"]))
-
-
-def _end(series: _Series, place: int, sign: int, limit: float) -> End:
-    """Return ln b where the profile reaches the limit, from the optimum outwards, and whether it is open."""
-    at = series.b_at(place)
-    near, edge = float(series.x[at]), float((series.low, series.high)[sign > 0][at])
-
-    def above(log_b: float) -> float:
-        return series.profile(place, log_b)[0] - limit
-
-    step = FIRST_STEP
-    while sign * (edge - near) > 0:
-        far = sign * min(sign * (near + sign * step), sign * edge)
-        if above(far) > 0:
-            return float(brentq(above, near, far, xtol=CLOSE)), False
-        near, step = far, 2 * step
-    return near, True
-
-
-def _linked(values: Values) -> list[list[int]]:
-    """Return groups of curves with correlated values: the quantities of one series."""
-    group = list(range(values.curves))
-    rows, columns = np.nonzero(values.covariance)
-    for one, other in set(zip(values.curve[rows].tolist(), values.curve[columns].tolist(), strict=True)):
-        if one >= 0 and other >= 0 and group[one] != group[other]:
-            old, new = group[other], group[one]
-            group = [new if g == old else g for g in group]
-    return [[c for c in range(values.curves) if group[c] == g] for g in sorted(set(group))]
-
-
-def _other_series(
-    fit: LawFit, series: list[list[int]], rows: list[np.ndarray]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield per series the likelihood of its mu_0 from the other series: R, shape (k, m), and r, shape (k,).
-
-    Their chi-square is |R (mu_0 - fitted) + r|^2, linearised, with their a and b eliminated. Series are not
-    correlated, so that their contributions add.
-    """
-    values, m, k = fit.values, fit.values.origins, fit.values.curves
-    tangent = values.whitening @ fit.jacobian
-    # Of mu_0, and the residual.
-    columns = np.column_stack([tangent[:, :m], values.whitening @ (fit.model - values.value)])
-    unaged = np.setdiff1d(np.arange(values.value.size), np.concatenate(rows))
-    squares = []
-    for curves, own in zip(series, rows, strict=True):
-        aside = tangent[np.ix_(own, [*(m + np.array(curves)), *(m + k + np.array(curves))])]
-        scale = np.linalg.norm(aside, axis=0)
-        left, singular, _ = np.linalg.svd(aside / np.where(scale > 0, scale, 1.0), full_matrices=False)
-        left = left[:, singular > 1e-10]
-        rest = columns[own] - left @ (left.T @ columns[own])
-        squares.append(rest.T @ rest)
-    total = columns[unaged].T @ columns[unaged]
-    for s, own in enumerate(rows):
-        square = total + sum(squares[:s] + squares[s + 1 :], np.zeros_like(total))
-        used = np.append(np.isin(np.arange(m), values.origin[own]), True)
-        if not used.all():  # mu_0 of quantities that the series lacks are eliminated too
-            cross = square[np.ix_(~used, used)]
-            square = (
-                square[np.ix_(used, used)] - cross.T @ np.linalg.pinv(square[np.ix_(~used, ~used)]) @ cross
-            )
-        share, axes = np.linalg.eigh(square)
-        half = np.sqrt(np.maximum(share, 0.0))[:, None] * axes.T
-        yield half[:, :-1], half[:, -1]

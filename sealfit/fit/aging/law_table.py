@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtri, stdtrit
@@ -46,6 +47,11 @@ class OneQuantity:
     tau: float  # relative standard deviation between specimens in excess of the steady fits' errors
     series: int  # number of series with a law
 
+    @cached_property
+    def squares(self) -> np.ndarray:
+        """Squares of the whitened residuals, shape (n,)."""
+        return (self.alone.values.whitening @ (self.alone.values.value - self.alone.model)) ** 2
+
     @property
     def df(self) -> float:
         """Degrees of freedom of the intervals of a, b and c: those of the scatter that they contain."""
@@ -82,13 +88,6 @@ class Estimate:
     x: np.ndarray
     covariance: np.ndarray
     shift: np.ndarray
-
-    @classmethod
-    def of(cls, joint: LawFit, curve: Curve, q: int, shift: np.ndarray) -> Estimate:
-        """Return the estimates of a curve of a joint fit; `shift`, shape (p,), is that of all parameters."""
-        m, k = joint.values.origins, joint.values.curves
-        at = [q, m + curve.place, m + k + curve.place]
-        return cls(joint.x[at], joint.covariance[np.ix_(at, at)], shift[at])
 
     def error_of_c(self) -> float:
         """Return the standard error of c = -a ln b."""
@@ -184,12 +183,11 @@ def without_law(curve: Curve) -> Iterator[dict]:
 
 def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Iterator[dict]:
     """Return the rows with the statistics of the fit of this curve."""
-    part, alone, share, tau = quantity.part, quantity.alone, quantity.series, quantity.tau
+    part, squares, share, tau = quantity.part, quantity.squares, quantity.series, quantity.tau
     values = joint.values
     own = values.curve == curve.place
     q = values.origin[own][0]
     unaged = (values.curve < 0) & (values.origin == q)
-    squares = (alone.values.whitening @ (alone.values.value - alone.model)) ** 2
     chi2 = float(squares[own[part]].sum() + squares[unaged[part]].sum() / share)
     own_df = float(own.sum() - 2 + (unaged.sum() - 1) / share)
     shown = own | unaged

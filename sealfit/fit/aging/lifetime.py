@@ -12,6 +12,7 @@ from scipy.special import ndtri, stdtr
 from sealfit.errors import RequestError
 from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw
 from sealfit.fit.aging.joint_least_squares import solved_many
+from sealfit.fit.joint.whitening import blockwise, whitening_of
 from sealfit.fit.least_squares import central_jacobian
 
 # ---------------------------------------------------------------- lifetime
@@ -229,9 +230,9 @@ def resampled(
     """
     rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_pct)
     mean = law.at(law.aged)
-    root = np.linalg.cholesky(law.aged.covariance(law.scatter, mean))
-    drawn = mean + rng.standard_normal((draws, mean.size)) @ root.T
-    found = [_days(law, x, goal, place) for x in solved_many(law, np.linalg.inv(root), drawn)]
+    covariance = law.aged.covariance(law.scatter, mean)
+    drawn = mean + rng.standard_normal((draws, mean.size)) @ blockwise(np.linalg.cholesky, covariance).T
+    found = [_days(law, x, goal, place) for x in solved_many(law, whitening_of(covariance), drawn)]
     days, wider = _days(law, law.x, goal, place), law.t / ndtri(0.975)
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.log(np.quantile(found, [0.025, 0.975], method="inverted_cdf") / days)

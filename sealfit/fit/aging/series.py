@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pandas as pd
+from scipy.sparse import csr_array, diags_array
 
 from sealfit.config import Config
-from sealfit.fit.aging.law import LawFit, Values, between_scatter, fit_law
-from sealfit.fit.aging.law_profiles import curve_intervals
+from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
+from sealfit.fit.aging.law_profiles import curve_errors, curve_intervals
 from sealfit.fit.aging.law_table import (
     DAYS_FOR_LAW,
     Curve,
@@ -161,7 +163,7 @@ def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], 
     )
 
 
-def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> np.ndarray:
+def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> csr_array:
     """Return the covariance of steady values, shape (n, n); it is 0 between conditions.
 
     Parameters
@@ -171,30 +173,52 @@ def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -
     known : dict
         The covariances: `values_of(steady_fit, "covariance")`.
     """
-    quantity = used["quantity"].to_numpy(object)
-    covariance = np.diag((SMALLEST * used["value"].to_numpy(float)) ** 2 + 1e-300)
+    quantity, n = used["quantity"].to_numpy(object), len(used)
+    pairs, found = [], []
     for condition, places in used.groupby("condition", sort=False).indices.items():
-        for i in places:
-            for j in places:
-                names = sorted((quantity[i], quantity[j]), reverse=True)  # mu_s before mu_c
-                value = known.get((condition, f"{names[0]},{names[1]}"), np.nan)
-                covariance[i, j] += value if np.isfinite(value) else 0.0
-    return covariance
+        for i, j in product(places.tolist(), repeat=2):
+            names = sorted((quantity[i], quantity[j]), reverse=True)  # mu_s before mu_c
+            value = known.get((condition, f"{names[0]},{names[1]}"), np.nan)
+            pairs.append((i, j))
+            found.append(value if np.isfinite(value) else 0.0)
+    covariance = csr_array((found, np.reshape(pairs, (-1, 2)).T), shape=(n, n))
+    return covariance + diags_array((SMALLEST * used["value"].to_numpy(float)) ** 2 + 1e-300)
 
 
 def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Values:
     """Return values with specimen scatter in the covariance, correlated in a condition as the residuals."""
     scale = values.scale(model)
     relative = (values.value - model) / scale
-    tau = np.array(taus)[values.origin]
-    near = values.covariance != 0
-    link = near & (values.origin[:, None] != values.origin[None, :])
+    added = np.array(taus)[values.origin] * scale
+    near = values.covariance.tocoo()
+    link = values.origin[near.row] != values.origin[near.col]
+    row, column, covariance = near.row[link], near.col[link], near.data[link]
     correlation = 0.0
-    if link.any() and min(taus) > 0:
-        cross = (np.outer(relative, relative) - values.covariance / np.outer(scale, scale))[link].mean()
+    if row.size and min(taus) > 0:
+        cross = (relative[row] * relative[column] - covariance / (scale[row] * scale[column])).mean()
         correlation = float(np.clip(cross / np.prod(taus), -0.9, 0.9))  # below 1, so that it is invertible
-    added = np.outer(tau * scale, tau * scale) * (np.eye(len(tau)) + correlation * link)
-    return replace(values, covariance=values.covariance + added)
+    both = csr_array((correlation * added[row] * added[column], (row, column)), shape=near.shape)
+    return replace(values, covariance=values.covariance + diags_array(added**2) + both)
+
+
+def between_scatter(values: Values) -> tuple[float, LawFit]:
+    """Return the relative scatter of a quantity's values beyond their covariance, and the fit without it.
+
+    The variance of every value is increased by (scatter times the law or `size`)^2; the estimate is Paule and
+    Mandel's.
+    """
+    plain = fit_law(values)
+    if plain.df <= 0 or plain.chi2 <= plain.df:
+        return 0.0, plain
+    scale, last = values.scale(plain.model), plain
+
+    def chi2(tau: float) -> float:
+        nonlocal last
+        covariance = values.covariance + diags_array((tau * scale) ** 2)
+        last = fit_law(replace(values, covariance=covariance), last.x)
+        return last.chi2
+
+    return paule_mandel(chi2, plain.df, (plain.model - values.value) / scale), plain
 
 
 # ---------------------------------------------------------------- table
@@ -222,23 +246,17 @@ def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: n
         model[part] = alone.model
     joint = fit_law(_with_specimens(values, [one.tau for one in quantities.values()], model))
     intervals = curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))
-    shift = _shift(joint, moved)
+    covariance, shift = curve_errors(joint, moved)
+    x = joint.x[values.places_of_curve]
     for curve in curves:
         if curve.place < 0:
             yield from without_law(curve)
             continue
         one = quantities[curve.quantity]
-        found = Estimate.of(joint, curve, fitted.index(curve.quantity), shift)
+        found = Estimate(x[curve.place], covariance[curve.place], shift[curve.place])
         yield from law_rows(curve, found, intervals[curve.place], one.level_df)
         yield from statistics_rows(curve, joint, one)
         yield from covariance_rows(curve, found.covariance)
-
-
-def _shift(joint: LawFit, moved: np.ndarray) -> np.ndarray:
-    """Return the change of parameters, shape (p,), for a change of the values, shape (n,)."""
-    white = joint.values.whitening
-    weighted = (white @ joint.jacobian).T @ (white @ moved)
-    return np.where(np.isfinite(joint.covariance), joint.covariance, 0.0) @ weighted
 
 
 # ---------------------------------------------------------------- curves

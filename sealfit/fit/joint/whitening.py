@@ -17,11 +17,12 @@ number of rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from sealfit.fit.joint.rows import Groups
 from sealfit.fit.joint.tangent import Tangent
@@ -204,3 +205,32 @@ class Whitening:
         white, numbers = columns * self.unit[:, None], self.take @ columns
         white += self.back @ (self.between(numbers) - numbers / self.root)
         return white
+
+
+# ---------------------------------------------------------------- covariances of independent blocks
+def members(links: csr_array) -> list[np.ndarray]:
+    """Return the connected groups of a symmetric matrix, those of one size together, (groups, size) each."""
+    _, label = connected_components(links, directed=False)
+    size, order = np.bincount(label), np.argsort(label, kind="stable")
+    start = np.cumsum(size) - size
+    return [order[start[size == s][:, None] + np.arange(s)] for s in np.unique(size)]
+
+
+def blockwise(function: Callable[[np.ndarray], np.ndarray], matrix: csr_array) -> csr_array:
+    """Return `function`, (k, s, s) -> (k, s, s), of the independent blocks of a symmetric matrix."""
+    rows, columns, found = [], [], []
+    for own in members(matrix):
+        count, size = own.shape
+        row, column = (axis.ravel() for axis in np.broadcast_arrays(own[:, :, None], own[:, None, :]))
+        found.append(function(matrix[row, column].reshape(count, size, size)).ravel())
+        rows.append(row)
+        columns.append(column)
+    parts = np.concatenate(found), (np.concatenate(rows), np.concatenate(columns))
+    found = csr_array(parts, shape=matrix.shape)
+    found.eliminate_zeros()
+    return found
+
+
+def whitening_of(covariance: csr_array) -> csr_array:
+    """Return W with W C W' = 1, lower triangular within the independent blocks of C, shape (n, n)."""
+    return blockwise(lambda blocks: np.linalg.inv(np.linalg.cholesky(blocks)), covariance)

@@ -61,7 +61,8 @@ class Condition:
     @property
     def shifts(self) -> np.ndarray:
         """Change of F sgn v per run along principal directions of the effects' uncertainty, shape (n, k)."""
-        return self.runs[shifts_of(self.runs)].to_numpy(float)
+        names = shifts_of(self.runs)
+        return self.runs[names].to_numpy(float) if names else np.zeros((len(self.runs), 0))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -72,6 +73,12 @@ class Condition:
     def df(self) -> int:
         """Runs minus parameters; a parameter at its bound counts too, which makes intervals wider."""
         return max(len(self.runs) - len(self.names), 0)
+
+    def take(self, values: np.ndarray) -> None:
+        """Take estimates, shape (p,), which determine the model by their number."""
+        _, _, force, weight = self.arrays
+        self.model, self.values = len(values), values
+        self.chi2 = float(weight @ (force - self.model_force()) ** 2)
 
     def jacobian(self) -> np.ndarray:
         """Derivative of F sgn v with respect to the parameters, shape (n, p)."""

@@ -84,7 +84,9 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
 
 
-def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, UnitVariance]:
+def solve_conditions(
+    steady: pd.DataFrame, fitted: pd.DataFrame | None = None
+) -> tuple[list[Condition], Scatter, UnitVariance]:
     """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
 
     A Stribeck curve that does not differ significantly from a straight line is dropped.
@@ -93,6 +95,9 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, Un
     ----------
     steady : DataFrame
         Table `steady`; rows with `used` false are left out.
+    fitted : DataFrame, optional
+        Table `steady_fit` of these rows. With repeats, which determine the weights, its estimates are used
+        and nothing is fitted again.
 
     Raises
     ------
@@ -101,7 +106,15 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, Un
     """
     runs = run_means(steady)
     scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
-    conditions = _solved(runs.assign(weight=run_weights(runs, scatter)))
+    runs = runs.assign(weight=run_weights(runs, scatter))
+    if fitted is not None and scatter.df > 0:
+        rows = fitted[(fitted["quantity"] == "steady") & fitted["value"].notna()]
+        known = rows.groupby("condition")["value"].agg(np.array)  # in the order of NAMES
+        conditions = [make_condition(name, own) for name, own in runs.groupby("condition", sort=True)]
+        for condition in conditions:
+            condition.take(known[condition.name])
+        return conditions, scatter, _unit_variance(conditions, scatter)
+    conditions = _solved(runs)
     if not scatter.df > 0:
         conditions = _more_likely_weights(conditions)
     first = _unit_variance(conditions, scatter)

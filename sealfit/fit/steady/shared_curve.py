@@ -19,8 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.linalg import block_diag
+from scipy import linalg
 from scipy.optimize import minimize_scalar
+from scipy.sparse import block_diag, csr_array
 from scipy.special import fdtrc
 
 from sealfit.fit.aging.series import PAIRS, steady_covariance, values_of
@@ -48,7 +49,7 @@ class Levels:
     """Values of mu_s and mu_c (F_s and F_c) and the covariance of their measurement."""
 
     table: pd.DataFrame  # `condition`, `quantity`, `value`, and the condition's columns of `steady_fit`
-    covariance: np.ndarray  # (n, n)
+    covariance: csr_array  # (n, n) of the values; before the loop it is 0 between series
 
 
 def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
@@ -73,7 +74,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     curved = set(known.loc[known["parameter"] == "v_s", "condition"])
     free = known[known["parameter"].isin([name for pair in PAIRS for name in pair])]
     free = free.assign(quantity=free["parameter"])[["condition", "quantity", "value"]]
-    conditions, _, variance = solve_conditions(steady)
+    conditions, _, variance = solve_conditions(steady, steady_fit)
     place = {c.name: k for k, c in enumerate(conditions)}
     series = series_of_curve(about.reset_index(drop=True), aging=True)
     known_covariances, known_shifts = (
@@ -81,31 +82,31 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
         values_of(steady_fit, "effect_shift"),
     )
     count = len(shifts_of(steady))
-    tables, covariances, shifts = [], [], []
-    for names in (about["condition"].to_numpy(object)[series == s] for s in dict.fromkeys(series)):
-        places = [place[name] for name in names]
-        found = _shared([conditions[k] for k in places], variance, variance.value[places], curved)
-        covered = set()
+    tables, covariances, shifts, covered = [], [], [], set()
+    for places in about.groupby(series, sort=False).indices.values():
+        of = [place[name] for name in about["condition"].to_numpy(object)[places]]
+        found = _shared([conditions[k] for k in of], variance, variance.value[of], curved)
         if found is not None:
             tables.append(found[0])
             covariances.append(found[1])
             shifts.append(found[2])
-            covered = found[3]
-        own = free[free["condition"].isin(set(names) - covered)]
-        tables.append(own)
-        keys = list(zip(own["condition"], own["quantity"], strict=True))
-        shift = np.array(
-            [[known_shifts.get((c, f"{q}:{k + 1}"), 0.0) for k in range(count)] for c, q in keys]
-        )
-        shift = shift.reshape(len(own), count)
-        shifts.append(shift)
-        same = own["condition"].to_numpy()[:, None] == own["condition"].to_numpy()[None, :]
-        # What is subtracted is added again below.
-        covariances.append(steady_covariance(own, known_covariances) - same * (shift @ shift.T))
-    table = pd.concat(tables, ignore_index=True) if tables else free
-    together = np.concatenate(shifts) if shifts else np.zeros((0, count))
-    covariance = block_diag(*covariances) + together @ together.T  # effects are common to all conditions
-    return Levels(table.merge(about, on="condition", how="left", validate="many_to_one"), covariance)
+            covered |= found[3]
+    alone = free[free["condition"].isin(set(about["condition"]) - covered)]
+    keys = zip(alone["condition"], alone["quantity"], strict=True)
+    shift = [[known_shifts.get((c, f"{q}:{k + 1}"), 0.0) for k in range(count)] for c, q in keys]
+    shift = np.reshape(shift, (len(alone), count))
+    # Effects are common to all conditions: their part in the separate fits' covariances is subtracted here.
+    within = steady_covariance(alone, known_covariances)
+    row, column = within.nonzero()
+    common = csr_array(((shift[row] * shift[column]).sum(axis=1), (row, column)), shape=within.shape)
+    table = pd.concat([*tables, alone], ignore_index=True)
+    covariance = block_diag([*covariances, within - common], format="csr")
+    if count:
+        together = np.concatenate([*shifts, shift])
+        covariance = csr_array(covariance + together @ together.T)
+    order = np.argsort(pd.Index(about["condition"]).get_indexer(table["condition"]), kind="stable")
+    table = table.iloc[order].merge(about, on="condition", how="left", validate="many_to_one")
+    return Levels(table, covariance[order][:, order])
 
 
 def _shared(
@@ -204,7 +205,7 @@ class _Curve:
         bend = np.diff(self.levels[:, ::-1], axis=1) * self.load * np.exp(-square) * 2 * square * self.root
         shared = [bend.ravel()] + ([(self.speed * self.root).ravel()] if self.sigma_2 > 0 else [])
         there = (self.root > 0).ravel()
-        return np.column_stack([block_diag(*columns), *shared])[there]
+        return np.column_stack([linalg.block_diag(*columns), *shared])[there]
 
     def shifts(self) -> np.ndarray:
         """Return weighted changes of forces along the directions of the effects' uncertainty, (runs, k)."""
