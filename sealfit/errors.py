@@ -33,7 +33,7 @@ class Fault:
     fix: str = ""
 
     def __str__(self) -> str:
-        place = self.file or ""
+        place = shortened(self.file or "", LONGEST_PATH)
         if self.line is not None:
             place += f":{self.line}"
         if self.stroke is not None:
@@ -53,6 +53,7 @@ class Fault:
 
 
 LONGEST_VALUE = 80  # characters of a cell that a message shows
+LONGEST_PATH = 400  # and of the path of a file
 
 
 def shortened(text: str, most: int = LONGEST_VALUE) -> str:
@@ -80,15 +81,16 @@ RUNS_TABLES = ("runs.csv", "runs.xlsx", "runs.parquet")  # their lines are trace
 
 
 def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
-    """Return the faults, grouped if more than `EXAMPLES` files share them, in the order of the first of each.
+    """Return the faults, grouped if more than `EXAMPLES` places share them, in the order of their first.
 
-    Faults are shared that differ in the file, the line, the value and in numbers of their reason only.
+    A place is a line, or a file. Faults are shared that differ in the file, the line, the value and in
+    numbers of their reason only.
     """
     faults = list(faults)
     alike: dict[tuple, list[Fault]] = {}
     for fault in faults:
         alike.setdefault(_shared(fault), []).append(fault)
-    together = {key for key, group in alike.items() if len({_place(fault) for fault in group}) > EXAMPLES}
+    together = {key for key, group in alike.items() if len({(f.file, f.line) for f in group}) > EXAMPLES}
     found: list[list[Fault]] = []
     for fault in faults:
         group = alike.get(key := _shared(fault), [])
@@ -116,16 +118,19 @@ def told(group: Sequence[Fault]) -> str:
 
 
 def how_many(group: Sequence[Fault]) -> str:
-    """Return how many files a group concerns, and how often where that is more."""
-    files = len({_place(fault) for fault in group})
+    """Return how many files a group concerns, or lines of one file, and how often where that is more."""
+    files = len({_file(fault) for fault in group})
+    if files == 1 and group[0].line is not None:
+        return f"{len({fault.line for fault in group})} lines of {group[0].file}"
     return f"{files} files" if files == len(group) else f"{files} files, {len(group)} times"
 
 
 def examples(group: Sequence[Fault]) -> list[str]:
     """Return the places of a group, three at most, with value, and reason if it differs between files."""
     whole, places = one_reason(group), {}
+    several = len({fault.file for fault in group}) > 1
     for fault in group:
-        places.setdefault(_place(fault), fault)
+        places.setdefault(_file(fault) if several else (fault.file, fault.line), fault)
     return [
         ": ".join(
             part
@@ -145,7 +150,7 @@ def one_reason(group: Sequence[Fault]) -> bool:
     return len({fault.reason for fault in group}) == 1
 
 
-def _place(fault: Fault) -> tuple:
+def _file(fault: Fault) -> tuple:
     return (fault.file, fault.line) if fault.file in RUNS_TABLES else (fault.file,)
 
 

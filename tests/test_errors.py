@@ -31,10 +31,14 @@ def test_what_84_files_share_is_one_message_with_a_count_and_three_examples():
     assert len(CampaignError(faults).as_dicts()) == 85
 
 
-def test_three_files_and_the_lines_of_one_file_are_named_one_by_one():
+def test_three_files_are_named_one_by_one_and_the_lines_of_one_file_together():
     faults = [comma(i) for i in range(3)] + [comma(9, line) for line in range(2, 30)]
     assert [len(group) for group in grouped(faults[:3])] == [1, 1, 1]
-    assert [len(group) for group in grouped(faults[3:])] == [1] * 28
+    assert [len(group) for group in grouped(faults[3:6])] == [1, 1, 1]
+    (group,) = grouped(faults[3:])
+    assert told(group).startswith(
+        "28 lines of raw/9.csv: column 'Kraft': is not a number. For example raw/9.csv:2"
+    )
     (group,) = grouped(faults)
     assert told(group).startswith("4 files, 31 times: column 'Kraft': ")
 
