@@ -128,7 +128,11 @@ def predict(
         (progress or Silent()).warn(warning)
     store.require("close-loop")
     asked = read_points(points)
-    answers = answers_to(asked.values, store)
+    try:
+        answers = answers_to(asked.values, store)
+    except RequestError as error:
+        place = {"file": points, "line": 1} if error.column else {}
+        raise RequestError(error.message, column=error.column, fix=error.fix, **place) from error
     return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
 
 
@@ -247,10 +251,12 @@ def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict
     closed = not store.why_stale("close-loop")
     added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
     listed = {"effects": summary.of_effects(known.values(), store.config.units), "added": added}
-    return {**listed, "note": _note_on_own(store)}
+    return {**listed, "note": _note_on_effects(store)}
 
 
-def _note_on_own(store: Store) -> str | None:
+def _note_on_effects(store: Store) -> str | None:
+    if "close-loop" in store.state.steps and (why := store.why_stale("close-loop")):
+        return f"{why}: which effects the loop added is not known."
     if store.effects is None and store.state.effects:
         files = ", ".join(store.state.effects)
         return f"your own effects ({files}) are listed only from a folder that you name: add {OPTION} FOLDER."

@@ -26,6 +26,7 @@ from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.joint.whitening import Component, Scatter
 from sealfit.ingest.categorical import add_keys
+from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # Relative tolerance of the tested range.
@@ -182,7 +183,7 @@ def _conditions(
         if name not in known:
             like = conditions.index[(conditions["series"] == series) & (conditions["rubber"] == rubber)]
             lawful = [c for c in like if declared.index["a_c"][c] >= 0]
-            if not lawful or not 0 <= days.iloc[k] < np.inf:
+            if not lawful or not 0 <= days.iloc[k] < OVERLOAD:
                 notes[k].append(
                     f"condition {name} was not tested and has no fitted aging law: give a tested condition, "
                     "or other days of a tested series with three or more days"
@@ -211,16 +212,17 @@ def _conditions(
 def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -> None:
     """Add a note to every point with an invalid cell."""
     speed = table["speed_mm_s"].to_numpy(dtype=float)
-    for k in np.flatnonzero(~np.isfinite(speed) | (speed == 0)):
+    for k in np.flatnonzero(~(np.abs(speed) < OVERLOAD) | (speed == 0)):
         notes[k].append("speed_mm_s must be a signed number other than 0 (the model holds in sliding)")
     if model["has_load"]:
-        for k in np.flatnonzero(~(table["load_N"].to_numpy(dtype=float) > 0)):
+        load = table["load_N"].to_numpy(dtype=float)
+        for k in np.flatnonzero(~(load > 0) | (load >= OVERLOAD)):
             notes[k].append("load_N must be a positive number")
     for name in dict.fromkeys(n for term in after.terms for n in term.channels):
         tested = model["ranges"].get(name)
         if _is_range(tested):
             table[name] = pd.to_numeric(table[name], errors="coerce").astype(float)
-            for k in np.flatnonzero(~np.isfinite(table[name].to_numpy())):
+            for k in np.flatnonzero(~(np.abs(table[name].to_numpy()) < OVERLOAD)):
                 notes[k].append(f"{name} must be a number")
         elif isinstance(tested, list):
             table[name] = table[name].astype(object).where(table[name].notna(), NO_VALUE).astype(str)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,11 +54,10 @@ def read_points(path: Path) -> Points:
     except OSError as error:
         raise RequestError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
     lines = csv.reader(io.StringIO(raw, newline=""))
-    names = _names_of_points([name.strip() for name in next(lines, [])], path)
+    filled = _filled(lines, path)
+    names = _names_of_points([name.strip() for name in next(filled, [])], path)
     rows = []
-    for row in lines:
-        if not any(cell.strip() for cell in row):
-            continue
+    for row in filled:
         if len(row) != len(names):
             raise RequestError(
                 f"has {len(row)} cells, and there are {len(names)} columns.",
@@ -72,11 +72,23 @@ def read_points(path: Path) -> Points:
     return Points(path, text, text.apply(_numbers))
 
 
+def _filled(lines, path: Path) -> Iterator[list[str]]:
+    """Yield the rows that are not blank; raises RequestError for a cell that holds the end of its line."""
+    begins = 1
+    for row in lines:
+        if any("\n" in cell or "\r" in cell for cell in row):
+            fix = "Close or delete it."
+            raise RequestError("a quotation mark is left open.", file=path, line=begins, fix=fix)
+        begins = lines.line_num + 1
+        if any(cell.strip() for cell in row):
+            yield row
+
+
 def _names_of_points(names: list[str], path: Path) -> list[str]:
     """Return the names of the columns of points, checked."""
     if not any(names):
         raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
-    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+    if len(names) == 1 and any(mark in names[0] for mark in ";\t| "):
         raise RequestError(
             "is not separated by commas.", file=path, line=1, fix="Save it with commas and points."
         )

@@ -18,3 +18,14 @@ def test_between_three_speeds_the_force_is_not_known():
         between["note"].str.contains("too few speeds for the friction between them; tested: 1, 8, 64").all()
     )
     assert np.isfinite(between["force_after_N"]).all()
+
+
+def test_a_point_with_an_infinite_number_has_no_answer():
+    bins = make_bins(speeds=(1.0, 8.0, 64.0), bins=6)
+    model = close_loop(bins, make_traces(bins), Config()).model
+    points = bins.groupby("condition").head(1)
+    for name in ("load_N", "speed_mm_s"):
+        for value in (np.inf, 9.9e37):
+            answer = predict(model, points.assign(**{name: value}))
+            assert answer["force_after_N"].isna().all()
+            assert answer["note"].str.contains(f"{name} must be a").all()
