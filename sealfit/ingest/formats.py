@@ -395,7 +395,7 @@ def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    opened = pq.ParquetFile(pa.BufferReader(raw))
+    opened = pq.ParquetFile(pa.BufferReader(raw), page_checksum_verification=True)
     about = {
         k.decode(): v.decode("utf-8", "replace") for k, v in (opened.schema_arrow.metadata or {}).items()
     }

@@ -258,7 +258,8 @@ def _parquet_text(raw: bytes) -> bytes:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = pq.ParquetFile(pa.BufferReader(raw)).read(use_threads=False)
+    file = pq.ParquetFile(pa.BufferReader(raw), page_checksum_verification=True)
+    table = file.read(use_threads=False)
     table = table.select([name for name in table.column_names if not name.startswith("__index_level_")])
     rows = zip(*(column.to_pylist() for column in table.columns), strict=True)
     lines = ["\t".join(_cell(value, ".") for value in row) for row in (table.column_names, *rows)]

@@ -401,3 +401,13 @@ def test_a_missing_library_is_one_line_that_names_it(simulated, tmp_path, monkey
     assert not (tmp_path / "out").exists()
     _, found = check(campaign)
     assert [fault.check for fault in found] == ["missing_library"]
+
+
+def test_a_page_of_parquet_that_is_not_what_its_checksum_says_is_damage(tmp_path):
+    table().to_parquet(
+        tmp_path / "t.parquet", compression="none", use_dictionary=False, write_page_checksum=True
+    )
+    raw = bytearray((tmp_path / "t.parquet").read_bytes())
+    raw[raw.index(table()["force_N"].to_numpy().tobytes()[:64])] ^= 1
+    (tmp_path / "t.parquet").write_bytes(raw)
+    assert "cannot be read as a Parquet file" in refused(tmp_path, "t.parquet").reason
