@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.errors import CampaignError, Fault
+from sealfit.errors import CampaignError, Fault, nearest
 from sealfit.ingest.categorical import Columns, keys_of, known, where
+from sealfit.ingest.cells import LISTED
 from sealfit.ingest.columns import suggestion
 from sealfit.ingest.derived_columns import (
     NUMBERS,
@@ -75,6 +76,10 @@ def read_properties(
     if batch != BATCH and batch not in words:
         fix = suggestion(batch, [*columns, *words])
         raise _stop(table, "missing_column", "there is no such column.", fix, line=1, column=batch)
+    if batch not in words and (close := nearest(batch, list(columns))):
+        reason, fix = f"is not used; it looks like '{batch}'.", f"Write '{batch}' if that is meant."
+        place = {"file": table, "line": 1, "column": close, "severity": "warning", "action": "kept"}
+        faults.append(Fault("column_name", reason, fix=fix, **place))
     faults += out_of_range(entries, columns) + _lacking(entries, columns, config)
     if stopping := [f for f in faults if f.severity == "error" and f.action == "stopped"]:
         raise CampaignError(stopping)
@@ -151,13 +156,21 @@ def _rows(
 
 
 def _left_out(entries: Entries, rows: pd.DataFrame) -> list[Fault]:
-    """Return a finding for every row without a value."""
-    at = {line: i for i, line in enumerate(entries.lines or [])}
-    place = {"severity": "info", "action": "row left out", "fix": ""}
-    return [
-        entries[at[row.line]].fault("empty_cell", "the cell is empty.", row.quantity, value="", **place)
-        for row in rows.itertuples()
-    ]
+    """Return a finding for every property that some rows have no value of: how many, and in which lines."""
+    faults = []
+    for name, lines in rows.groupby("quantity", sort=False)["line"]:
+        listed = ", ".join(str(line) for line in lines.head(LISTED)) + (
+            ", ..." if len(lines) > LISTED else ""
+        )
+        reason = f"{len(lines)} rows have no value and are left out: {listed}."
+        place = {
+            "file": entries.table,
+            "line": int(lines.iloc[0]),
+            "column": name,
+            "value": float(len(lines)),
+        }
+        faults.append(Fault("empty_cell", reason, severity="warning", action="row left out", **place))
+    return faults
 
 
 def _stop(table: str, check: str, reason: str, fix: str, **place) -> CampaignError:

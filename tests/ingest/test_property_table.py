@@ -53,7 +53,16 @@ def test_names_units_and_computed_columns_are_those_of_the_config(tmp_path):
 def test_a_row_without_a_value_is_left_out_and_said(tmp_path):
     table, faults = read(tmp_path, PLAIN + "8,70,\n16,70,n/a\n")
     assert len(table) == 3
-    assert [(fault.line, fault.action) for fault in faults] == [(5, "row left out"), (6, "row left out")]
+    (fault,) = faults
+    assert (fault.line, fault.action, fault.severity) == (5, "row left out", "warning")
+    assert fault.reason == "2 rows have no value and are left out: 5, 6."
+
+
+def test_a_column_that_looks_like_that_of_the_batch_is_named(tmp_path):
+    _, faults = read(tmp_path, "aging_days,batchs,hardness\n0,A,60\n2,B,58\n")
+    assert [(fault.column, fault.reason) for fault in faults] == [
+        ("batchs", "is not used; it looks like 'batch'.")
+    ]
 
 
 def test_several_properties_are_named(tmp_path):
