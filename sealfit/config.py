@@ -20,6 +20,7 @@ from pydantic import (
     ConfigDict,
     Field,
     PrivateAttr,
+    StrictInt,
     ValidationError,
     field_validator,
     model_validator,
@@ -46,7 +47,7 @@ class FileColumn(Strict):
     it is another than ours. The numbers are converted to our unit when they are read.
     """
 
-    name: str | int
+    name: str | Annotated[StrictInt, Field(ge=1)]
     unit: str | None = None
 
 

@@ -319,9 +319,8 @@ def _is_number(kind: pa.DataType) -> bool:
 def _column(column: pa.ChunkedArray) -> np.ndarray:
     if _is_number(column.type):
         return column.cast(pa.float64(), safe=False).to_numpy()  # a whole number beyond 2**53 is rounded
-    text = np.array(column.cast(pa.string()).to_pylist(), dtype=object)
-    text[text == ""] = None
-    return text
+    cells = column.cast(pa.string()).to_pylist()
+    return np.array([(cell or "").strip() or None for cell in cells], dtype=object)
 
 
 def _single_tabs(body: bytes) -> bytes:

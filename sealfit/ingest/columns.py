@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from sealfit.config import Config, TraceFormat
-from sealfit.errors import BadFile, Fault, nearest
+from sealfit.errors import BadFile, Fault, nearest, shortened
 from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, listed
 from sealfit.ingest.expression import parse
 from sealfit.ingest.files import Layout, as_number, split_line
@@ -16,6 +16,7 @@ from sealfit.tables import BINS, RUNS
 # ---------------------------------------------------------------- columns
 # From a file's columns to ours: which position holds what, and what the other columns are called.
 
+LONGEST_LIST = 400  # characters of the names of columns that a message lists
 SLOTS = ("time_s", "displacement_mm", "force_N", "load_N")  # always numbers
 # Columns that our tables make themselves: a channel of that name in a trace file gets another, `stroke_file`.
 RESERVED = ({column.name for schema in (BINS, RUNS) for column in schema.columns} | {"line", "steady"}) - set(
@@ -96,8 +97,9 @@ def suggestion(name: str, known: Sequence[str]) -> str:
     """Return a fix for a missing column: the nearest name, or the names that there are."""
     if close := nearest(name, known):
         case = " (the case of letters matters)" if close.lower() == name.lower() else ""
-        return f"Did you mean {close!r}?{case}"
-    return f"The columns are {', '.join(repr(n) for n in known if n)}." if any(known) else ""
+        return f"Did you mean {shortened(repr(close))}?{case}"
+    names = ", ".join(shortened(repr(n)) for n in known if n)
+    return f"The columns are {shortened(names, LONGEST_LIST)}." if names else ""
 
 
 def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
@@ -126,7 +128,7 @@ def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceForma
     )
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
-        for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), (" ", '"whitespace"')):
+        for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), ("|", '"|"'), (" ", '"whitespace"')):
             if len(split_line(line, "tab" if mark == "\t" else mark)) >= 2 and mark != settings.delimiter:
                 fix = f"The header looks separated otherwise: set delimiter = {word} in the rig config."
                 break

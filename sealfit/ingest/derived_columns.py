@@ -22,6 +22,7 @@ from sealfit.ingest.categorical import (
     put,
     where,
 )
+from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
@@ -34,7 +35,7 @@ from sealfit.units import Conversion
 
 NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
 COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
-_MOSTLY = 0.8  # a column with this share of numbers is one of numbers, and the rest of its cells are slips
+_MOSTLY = 0.5  # a column with more numbers than this is one of numbers, and the rest of its cells are slips
 
 
 UNAGED_WORDS = ("unaged", "fresh", "new", "rt")  # RT: kept at room temperature
@@ -139,7 +140,7 @@ def to_values(entries: Entries, columns: Columns, config: Config) -> tuple[Colum
     """Return the columns as numbers or as labels, and faults of cells that are neither.
 
     A column of numbers is one whose name says so, one of the config's condition columns or a channel where
-    more than four fifths of the cells are numbers, and any where all are.
+    more than half of the cells are numbers, and any where all are.
     """
     faults: list[Fault] = []
     made: Columns = {}
@@ -154,7 +155,7 @@ def _column(name: str, cells: Column, entries: Entries, config: Config) -> tuple
     if name in TEXT_COLUMNS:
         return labels, []
     values = mapped(cells, _number)  # nan: not missing, but wrong
-    wrong = np.flatnonzero(where(values, lambda value: not math.isfinite(value))).tolist()
+    wrong = np.flatnonzero(where(values, lambda value: not abs(value) < OVERLOAD)).tolist()
     count = int(known(cells).sum())
     meant = name in NUMBERS or name in COUNTS  # as numbers
     if wrong and not meant and len(wrong) >= (1 - _MOSTLY) * count:

@@ -204,6 +204,7 @@ def _rows(
 ) -> tuple[list[int], Columns]:
     """Return the line of every row, and the columns that have a name; adds to `faults`."""
     lines, rows = [], []
+    named = max((i for i, name in enumerate(names, start=1) if name), default=0)
     for number, line in islice(_lines(text), 1, None):
         if _left_open(line, delimiter):
             reason = "a quotation mark is left open."
@@ -215,6 +216,11 @@ def _rows(
             faults.append(
                 Fault("too_many_cells", reason, file=RUNS_CSV, line=number, fix="Quote cells with commas.")
             )
+            continue
+        if len(cells) < named:
+            reason = f"the line has {len(cells)} cells where {named} are named."
+            fix = "Complete the line: a cell that is empty needs its separator."
+            faults.append(Fault("too_few_cells", reason, file=RUNS_CSV, line=number, fix=fix))
             continue
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         if needed and needed not in row:
@@ -268,7 +274,7 @@ def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault
 
 def _posix(campaign: Path, file: str) -> str:
     """Return a listed path with forward slashes and without detours; Windows' backslashes are understood."""
-    if "\\" in file and not (campaign / file).exists():
+    if "\\" in file and not os.path.exists(campaign / file):
         file = file.replace("\\", "/")
     return os.path.normpath(file) if file else file
 
@@ -322,7 +328,7 @@ def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
                 entry.fault("duplicate_file", reason, "file", value=entry.file, fix="Delete one line.")
             )
         lines.setdefault(entry.file, entry.line)
-    if entries and not faults and not any((campaign / file).is_file() for file in entries.files):
+    if entries and not faults and not any(os.path.isfile(campaign / file) for file in entries.files):
         reason = f"none of the {len(entries)} trace files listed exists."
         fix = "Paths are relative to the folder of runs.csv."
         faults.append(entries[0].fault("missing_file", reason, "file", value=entries[0].file, fix=fix))

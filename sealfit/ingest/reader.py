@@ -30,6 +30,7 @@ from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays
 from sealfit.ingest.trace_checks import speed_fault
 from sealfit.ingest.workbooks import read_sheet
 
+UNFILLED = ("", "Comment")  # last names without cells: a stray separator, and LabVIEW's column of comments
 MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
 
 
@@ -144,6 +145,7 @@ class _Opened:
             text, layout, settings = _text(raw, file, settings)
             body = body_of(text, layout, settings, file)
             width = width_of(body, settings.delimiter)
+            _refuse_narrow(layout, width, settings, file)
             arrays, faults = (), ()
         try:
             ours = locate(layout, len(layout.names) or width, settings, file)
@@ -157,6 +159,19 @@ class _Opened:
     def alike(self) -> tuple:
         """Files for which this is equal are parsed in one go."""
         return self.layout, self.width, self.settings.delimiter, bool(self.arrays)
+
+
+def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat, file: str) -> None:
+    """Raise `BadFile` if columns go by name and the first line has fewer cells than there are names."""
+    named = len(layout.names)
+    while named and layout.names[named - 1] in UNFILLED:
+        named -= 1
+    by_name = any(isinstance(theirs, str) for theirs in settings.their_columns.values())
+    if by_name and len(layout.names) > 1 and 1 < width < named:
+        reason = f"the header names {named} columns, and the first line of data has {width} cells."
+        fix = "Complete the header or the data: no cell can be told to be that of a name."
+        fault = _bad_file("too_few_cells", reason, file, fix)
+        raise BadFile(replace(fault, line=layout.first_line))
 
 
 def _names_below(error: BadFile, layout: Layout, body: bytes, settings: TraceFormat) -> BadFile:

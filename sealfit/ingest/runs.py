@@ -340,6 +340,7 @@ def _missing(entries: Entries, columns: Columns, needed: _Needed) -> list[Fault]
             fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
             place = {
                 "file": entries.table if entries.lines is not None else None,
+                "line": 1 if entries.lines is not None else None,
                 "column": name,
                 "fix": fix.strip(),
             }

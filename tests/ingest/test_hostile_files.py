@@ -7,7 +7,7 @@ import pytest
 from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, read, refused, trace
 
 from sealfit.config import load_config
-from sealfit.errors import CampaignError, ConfigError, Fault
+from sealfit.errors import CampaignError, ConfigError, Fault, grouped, told
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.runs import list_traces
 
@@ -83,6 +83,70 @@ def test_a_link_to_nowhere_says_so(tmp_path):
     assert fault.reason == "is a link to 'gone.csv', which does not exist."
 
 
+@pytest.mark.parametrize(
+    "header", ["time_s,displacement_mm,,force_N", "time_s,displacement_mm,force_N,oil,gas"]
+)
+def test_a_header_with_more_names_than_cells_is_refused(tmp_path, header):
+    rows = [f"{row},45.1" for row in ROWS] if "oil" in header else ROWS
+    fault = refused(tmp_path, csv_of(rows, header))
+    names, cells = header.count(",") + 1, rows[0].count(",") + 1
+    assert fault.line == 2
+    assert fault.reason == f"the header names {names} columns, and the first line of data has {cells} cells."
+
+
+@pytest.mark.parametrize("last", ["", "Comment"])
+def test_a_last_name_that_never_has_cells_is_no_column(tmp_path, last):
+    assert read(tmp_path, csv_of(ROWS, f"{HEADER},{last}")).rows_read == 100
+
+
+def test_labels_have_no_blanks_around_them_whichever_reader_saw_them(tmp_path):
+    header, rows = f"{HEADER}, oil", [f"{row}, mineral " for row in ROWS]
+    fast = read(tmp_path, csv_of(rows, header))
+    patient = read(tmp_path, csv_of([*rows, "10.0,slipped,2, mineral "], header))
+    assert set(fast.columns["oil"]) == set(patient.columns["oil"]) == {"mineral"}
+
+
+def test_a_short_line_in_runs_csv_is_refused(tmp_path):
+    campaign(tmp_path, RUNS.replace("b.csv,1,5", "b.csv,15"))
+    with pytest.raises(CampaignError, match=r"runs.csv:3: the line has 2 cells where 3 are named"):
+        channels(tmp_path, 'condition = ["aging_days"]\n')
+
+
+@pytest.mark.parametrize("value", ["9.9e37", "inf", "1e400"])
+def test_a_mark_of_overload_is_no_number_in_runs_csv(tmp_path, value):
+    campaign(tmp_path, RUNS.replace("b.csv,1,5", f"b.csv,1,{value}"))
+    with pytest.raises(CampaignError, match=r"runs.csv:3: column 'speed_mm_s'.*is not a number"):
+        channels(tmp_path, 'condition = ["aging_days"]\n')
+
+
+def test_a_name_longer_than_names_can_be_is_a_missing_file(tmp_path):
+    long = "x" * 5000
+    campaign(tmp_path, RUNS.replace("b.csv", long))
+    found = ingest_campaign(tmp_path, config('condition = ["aging_days"]')).faults
+    assert [fault.check for fault in found if fault.file == long] == ["unreadable_file"]
+
+
+def test_names_of_columns_are_not_listed_without_end(tmp_path):
+    campaign(tmp_path, RUNS.replace("file", "\xff" * 5000))
+    with pytest.raises(CampaignError) as caught:
+        channels(tmp_path)
+    assert len(str(caught.value)) < 1000
+
+
+def test_equal_faults_of_many_lines_of_a_file_are_one_message():
+    faults = [
+        Fault(
+            "not_a_number", "is not a number.", "a.csv", line=i, column="force_N", value="-", fix="Mend it."
+        )
+        for i in range(2, 9)
+    ]
+    (group,) = grouped(faults)
+    assert told(group) == (
+        "7 lines of a.csv: column 'force_N': is not a number. "
+        "For example a.csv:2: '-'; a.csv:3: '-'; a.csv:4: '-'. Mend it."
+    )
+
+
 @pytest.mark.skipif(os.name == "nt", reason="names are text there")
 @pytest.mark.parametrize("listed", [True, False])
 def test_a_name_that_is_not_utf_8_is_one_finding(tmp_path, listed):
@@ -128,6 +192,8 @@ def test_no_temperature_is_below_absolute_zero(tmp_path, value):
         "[strokes]\nmin_travel_mm = -1\n",
         "[strokes]\nsmooth_samples = 1000000\n",
         "[loop]\nseed = -1\n",
+        "[trace.columns]\ntime_s = 0\n",
+        "[trace.columns]\ntime_s = true\n",
         '[files]\nglob = "a**b"\n',
         '[files]\nglob = "."\n',
     ],
