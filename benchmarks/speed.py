@@ -6,6 +6,7 @@
     python benchmarks/speed.py startup [--repeats 20]                  beside `import typer`; imports
     python benchmarks/speed.py cluster [--campaign DIR] [--repeats 3]  local: a Dask cluster beside processes
     python benchmarks/speed.py growth  [--files 1000 10000 100000] [--steps all] [--effect conditioning]
+    python benchmarks/speed.py conditions  [--files 200 1000 3000 10000]   fits of so many conditions
 
 Several parts may be named at once. Without --campaign the paper's own, 1,752 files of 1,000 rows, is
 simulated first. What is written goes to a temporary folder, or to --work DIR, where campaigns are kept for
@@ -36,10 +37,14 @@ from many_files import EFFECTS
 
 from sealfit.simulation import simulate
 
-PARTS = ("ingest", "memory", "run", "startup", "growth", "cluster")
+PARTS = ("ingest", "memory", "run", "startup", "growth", "conditions", "cluster")
 NEEDS_CAMPAIGN = ("ingest", "run", "cluster")
 REPEATS = {"ingest": 5, "run": 3, "startup": 20, "cluster": 3}
-FILES = {"memory": (1752, 17520), "growth": (1000, 10_000, 100_000)}
+FILES = {
+    "memory": (1752, 17520),
+    "growth": (1000, 10_000, 100_000),
+    "conditions": (200, 1000, 3000, 10_000),
+}
 
 
 def main() -> None:
@@ -67,6 +72,8 @@ def main() -> None:
                     speed_cluster.cluster(campaign, cores, repeats, work)
                 case "growth":
                     growth(given, sizes, cores, work)
+                case "conditions":
+                    speed_growth.conditions(sizes, seed=given.seed, cores=cores, work=work)
 
 
 def growth(given: argparse.Namespace, sizes: Sequence[int], cores: Sequence[int], work: Path) -> None:
@@ -90,7 +97,9 @@ def arguments() -> argparse.Namespace:
         "--work", type=Path, help="folder for campaigns and results, kept; default: a temporary one"
     )
     parser.add_argument("--repeats", type=int, help=f"turns; default: {REPEATS}")
-    parser.add_argument("--files", type=int, nargs="+", help=f"sizes of memory and growth; default: {FILES}")
+    parser.add_argument(
+        "--files", type=int, nargs="+", help=f"sizes of memory, growth and conditions; default: {FILES}"
+    )
     parser.add_argument("--rows", type=int, help="of a file of memory and growth; default: 1000 and 80")
     parser.add_argument("--workers", type=int, default=2, help="of growth")
     parser.add_argument(

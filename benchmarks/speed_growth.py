@@ -6,6 +6,8 @@ new run of a condition that was there), and reading one condition of table `bins
 seconds and bytes, in a process of its own. With all steps also what each later step takes, on the tables
 without the three files; with an effect in the files close-loop has something to find, and to find again in
 every fold.
+
+`conditions` measures fit-steady and fit-aging of tables with thousands of conditions, without files.
 """
 
 from __future__ import annotations
@@ -17,11 +19,34 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from many_files import add_files, write_campaign
 from process_tree import Watched, watched
+from steady_tables import MU_C, MU_S, steady_rows
 
 LATER_STEPS = ("fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report")
 TAKES_WORKERS = ("ingest", "close-loop")
+# Designs of thousands of conditions: temperatures and compressions that are distinct, and their days.
+DESIGNS = {
+    "temperatures, one day each": ("temperature", (8,)),
+    "temperatures, three days each": ("temperature", (2, 8, 32)),
+    "compressions, six days each": ("compression", (1, 2, 4, 8, 16, 32)),
+}
+FIT = """
+import sys
+import pandas as pd
+from sealfit.config import Config
+steady, fit, step = pd.read_parquet(sys.argv[1]), sys.argv[2], sys.argv[3]
+if step == "fit-steady":
+    from sealfit.fit.steady.fit import fit_conditions
+    fit_conditions(steady, Config()).to_parquet(fit)
+else:
+    from sealfit.fit.aging.all_series import joint_laws
+    from sealfit.fit.aging.series import aging_curves, fit_series
+    steady_fit = pd.read_parquet(fit)
+    aging_curves(fit_series(steady_fit, Config()))
+    joint_laws(steady, steady_fit, Config())
+"""
 READ = """
 import io, json, sys, time
 import pandas as pd
@@ -88,6 +113,33 @@ def measure(
     print(f"  {'OUT':28s}{size / 1e6:9.1f} MB, {size / files / 1e3:.2f} kB a file")
     shutil.rmtree(out)
     return first.seconds
+
+
+def conditions(sizes: Sequence[int], *, seed: int, cores: Sequence[int], work: Path) -> None:
+    """Measure fit-steady and fit-aging of tables with about so many conditions, of every design."""
+    table, fit = work / "steady.parquet", work / "steady_fit.parquet"
+    for (name, (varied, days)), size in itertools.product(DESIGNS.items(), sizes):
+        rows = many_conditions(varied, days, size, seed=seed)
+        rows.to_parquet(table)
+        print(f"\n{rows['condition'].nunique():,} conditions: {name}")
+        for step in ("fit-steady", "fit-aging"):
+            line(step, watched([sys.executable, "-c", FIT, table, fit, step], cores=cores))
+
+
+def many_conditions(varied: str, days: Sequence[float], size: int, *, seed: int = 1):
+    """Return table `steady` of unaged rubber and about `size` conditions: eight speeds, two repeats each.
+
+    Aging is faster the hotter and the more compressed the rubber is. Specimens scatter by 0.5 %.
+    """
+    count = max(size // len(days), 1)
+    if varied == "temperature":
+        series = [(float(t), 80.0) for t in np.linspace(20.0, 90.0, count)]
+    else:
+        series = [(60.0, float(c)) for c in np.linspace(70.0, 95.0, count)]
+    faster = {(t, c): 2.0 ** ((t - 60.0) / 40.0) * (1.0 + 0.005 * (80.0 - c)) for t, c in series}
+    laws = {at: tuple({**law, "b": law["b"] / k} for law in (MU_S, MU_C)) for at, k in faster.items()}
+    how = {"repeats": 2, "ways": (1,), "specimen": 0.005, "seed": seed}
+    return steady_rows(days=(0, *days), series=series, laws=laws, **how)
 
 
 def each_further_file(seconds: Sequence[tuple[int, float]]) -> None:

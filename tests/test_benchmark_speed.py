@@ -13,6 +13,7 @@ import pytest
 from in_turns import in_turns, ratios
 from many_files import MU_C, MU_S, SIGMA_2, V_S, add_files, design_for, write_campaign
 from process_tree import watched
+from speed_growth import DESIGNS, many_conditions
 
 from sealfit.config import load_config
 from sealfit.fit.steady.fit import fit_conditions
@@ -50,6 +51,16 @@ def test_many_files_fill_folders_and_designs_grow(tmp_path, monkeypatch):
     for files in (1, 24, 1_000, 10_000, 100_000):
         design = design_for(files)
         assert len(design.conditions) * design.files_per_condition >= files
+
+
+def test_designs_of_many_conditions_have_distinct_ones():
+    for varied, days in DESIGNS.values():
+        rows = many_conditions(varied, days, 30)
+        assert rows["condition"].nunique() == 31
+        assert rows.groupby("condition").size().eq(16).all()
+        aged = rows[rows["aging_days"] > 0]
+        column = "temperature_C" if varied == "temperature" else "compression_ratio_pct"
+        assert aged[column].nunique() == 30 // len(days)
 
 
 def forces_of(folder):
