@@ -1,0 +1,53 @@
+"""The suite of fuzzing in a short form; benchmarks/torture/fuzzing.py is the long one."""
+
+import fuzzing
+import pytest
+from fuzzing import BAD, INPUTS, crafted, drawn, fuzzed_input, fuzzed_results, limited
+
+
+@pytest.fixture(autouse=True)
+def computations_as_they_were(monkeypatch):
+    """The suite lets modules remember what they computed; other tests get them as they were."""
+    import importlib
+
+    for module, name in fuzzing.COMPUTED:
+        owner = importlib.import_module(module)
+        monkeypatch.setattr(owner, name, getattr(owner, name))
+
+
+def test_mutations_are_many_and_differ_from_the_file():
+    found = list(drawn(b"time_s,force_N\n0,1\n1,2\n", [b"other"], 30, 1))
+    assert len({raw for _, raw in found}) == len(found) == 30
+    assert len({name.split()[0] for name, _ in found}) > 4
+    assert found == list(drawn(b"time_s,force_N\n0,1\n1,2\n", [b"other"], 30, 1))
+
+
+def test_what_takes_too_long_is_ended():
+    def spin():
+        with limited(0.05):
+            while True:
+                pass
+
+    with pytest.raises(fuzzing.TooSlow):
+        spin()
+
+
+@pytest.mark.parametrize("name", [name for name in INPUTS if name != "points"])
+def test_mutated_inputs_are_read_or_refused_in_a_line(tmp_path, monkeypatch, name):
+    monkeypatch.setattr(fuzzing, "closed", lambda work, seed: work)  # of points only
+    found = fuzzed_input(name, tmp_path, 5, 1)
+    assert len(found) == 5
+    assert [one for one in found if one.verdict in BAD] == []
+
+
+def test_damaged_results_give_no_answer_and_are_made_again(tmp_path):
+    found = fuzzed_results(tmp_path, 1, 1, share=(0, 3), heal=9)
+    assert len(found) > 40
+    assert {"same", "refused", "healed"} <= {one.verdict for one in found}
+    assert [one for one in found if one.verdict in BAD] == []
+
+
+def test_no_python_is_run_from_crafted_results(tmp_path):
+    found = crafted(tmp_path, 1)
+    assert len(found) > 50
+    assert [one for one in found if one.verdict in BAD] == []
