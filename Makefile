@@ -6,7 +6,7 @@ NO_NETWORK = echo "make: the packages that sealfit needs could not be installed;
 CODE := $(wildcard sealfit tests benchmarks docs/generate.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test golden lint audit check docs bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean torture torture-rivals
+.PHONY: help demo test golden torture torture-rivals lint audit check docs bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -20,9 +20,11 @@ test: lint ## lint and run every test
 golden: .venv/.installed-test ## compare ten campaigns with what is on record; after every step that is to move no number (three minutes)
 	$(BIN)/python -m pytest -rs -n auto -m golden tests/golden
 
-torture: .venv/.installed-test ## polluted input and fuzzing, the long forms (see benchmarks/RELIABILITY.md)
+torture: .venv/.installed-test ## polluted input, fuzzing, faults of the system, concurrency (see benchmarks/RELIABILITY.md)
 	$(BIN)/python benchmarks/torture/pollution.py
 	$(BIN)/python benchmarks/torture/fuzzing.py
+	$(BIN)/python benchmarks/torture/faults.py
+	$(BIN)/python benchmarks/torture/concurrency.py
 
 torture-rivals: .venv/.installed-bench
 	.venv/bench/bin/python benchmarks/torture/pollution.py --rivals
