@@ -6,9 +6,10 @@ from scipy.optimize import curve_fit
 
 from sealfit.config import Config, Quantity, Sensor
 from sealfit.errors import FitError
-from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady.fit import fit_conditions, parameter_units
 from sealfit.fit.steady.uncertainty import more_likely, run_means, speed_levels, unit_variance
 from sealfit.tables import STEADY_FIT
+from sealfit.units import Units
 
 TRUTH = {"mu_s": 0.7, "mu_c": 0.45, "v_s": 6.0, "sigma_2": 0.03}
 UNAGED = {"days": (0,), "model": TRUTH}
@@ -376,3 +377,12 @@ def test_likelier_weights_by_hand():
     assert more_likely([np.sum(w * error**2) for w in weights], weights, 4) == 1
     even = np.array([0.1, -0.1, 0.1, -0.1])
     assert more_likely([np.sum(w * even**2) for w in weights], weights, 4) == 0
+
+
+@pytest.mark.parametrize(
+    ("speed", "load", "mu", "sigma_2"),
+    [("mm/s", "N", "", "N s/mm"), ("m/ms", "N", "", "N/(m/ms)"), ("mm/s", "N/mm", "N/(N/mm)", "N s/mm")],
+)
+def test_units_of_parameters_are_those_of_their_numbers(speed, load, mu, sigma_2):
+    units = parameter_units(Units({"speed": ("speed", speed), "load": ("load", load)}), has_load=True)
+    assert (units["mu_s"], units["sigma_2"]) == (mu, sigma_2)

@@ -10,6 +10,7 @@ import pandas as pd
 from scipy.special import stdtrit
 
 from sealfit.config import Config
+from sealfit.effects.contract import fill_unit
 from sealfit.fit.joint.rows import merge_directions
 from sealfit.fit.steady.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
 from sealfit.fit.steady.stribeck import NAMES, linearised
@@ -296,8 +297,9 @@ def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterat
 def parameter_units(units: Units, has_load: bool) -> dict[str, str]:
     """Return the units of mu_s, mu_c (or F_s, F_c), v_s and sigma_2 that follow from the config's units."""
     force, speed, load = units.unit("force"), units.unit("speed"), units.unit("load")
-    mu = force if not has_load else "" if force == load else f"{force}/{load}"
-    sigma_2 = f"{force} s/{speed.removesuffix('/s')}" if speed.endswith("/s") else f"{force}/{speed}"
+    mu = force if not has_load else "" if force == load else fill_unit("{y}/{x}", load, force)
+    per_speed = fill_unit("{y}/{x}", speed, force)
+    sigma_2 = f"{force} s/{speed.removesuffix('/s')}" if speed.endswith("/s") else per_speed
     return {"mu_s": mu, "mu_c": mu, "v_s": speed, "sigma_2": sigma_2}
 
 
