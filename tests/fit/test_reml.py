@@ -44,6 +44,24 @@ def test_the_likelihood_is_that_of_the_dense_covariance_and_its_gradient_is_exac
     npt.assert_allclose(gradient, slopes, rtol=1e-5)
 
 
+@pytest.mark.parametrize("unit", [1e-7, 1e7])
+def test_the_likelihood_does_not_depend_on_the_unit_of_force(unit):
+    rng = np.random.default_rng(8)
+    groups = Groups.of({"file": np.arange(24), "run": np.arange(24) // 3})
+    force, residual = rng.normal(40, 10, 24), rng.normal(size=24)
+    tangent, kinds = (
+        Tangent.dense(orthonormal(rng.normal(size=(24, 5)))),
+        [("file", "gain"), ("run", "offset")],
+    )
+    found = []
+    for scale in (1.0, unit):
+        means = GroupMeans(scale * residual, np.full(24, (0.4 * scale) ** 2), scale * force, groups)
+        sizes = np.array([1e-4, 0.1 * scale**2])
+        value, gradient = RestrictedLikelihood(means, tangent, kinds)(sizes)
+        found.append([value - (24 - 5) * np.log(scale), *(gradient * sizes)])
+    npt.assert_allclose(found[1], found[0], rtol=1e-8)
+
+
 def test_reml_recovers_scatter_of_files_runs_and_specimens():
     codes = nested(3, 8, 25)
     rng = np.random.default_rng(3)

@@ -193,15 +193,15 @@ class RestrictedLikelihood:
 
 def _root_of(gram: np.ndarray) -> np.ndarray:
     """Return a Gram matrix's lower Cholesky root, with the smallest ridge that makes it positive definite."""
-    ridge = 1e-12
+    largest = float(np.diag(gram).max(initial=0.0)) or 1.0  # it depends on the unit of force
+    ridge = 1e-12 * largest
     while True:
         try:
             return np.linalg.cholesky(gram + ridge * np.eye(gram.shape[0]))
         except np.linalg.LinAlgError:
-            largest = float(np.diag(gram).max())
-            if not np.isfinite(gram).all() or ridge > max(largest, 1.0):
+            if not np.isfinite(gram).all() or ridge > largest:
                 raise
-            ridge = max(100 * ridge, 1e-12 * largest)
+            ridge *= 100
 
 
 def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
