@@ -272,6 +272,13 @@ class Strokes(Strict):
     """Every file is one steady stroke, without ramps."""
 
 
+class Rig(Strict):
+    """What the rig adds to the measured force."""
+
+    moving_mass_kg: float = Field(0.0, ge=0)
+    """Mass that the measured force accelerates; mass times acceleration is subtracted from the force."""
+
+
 class Bins(Strict):
     """How the steady window is cut along displacement."""
 
@@ -361,6 +368,7 @@ class Config(Strict):
     """
     column_units: dict[str, str] = Field(default_factory=dict)
     """Units of your own channels: `humidity = "%"`."""
+    rig: Rig = Rig()
     strokes: Strokes = Strokes()
     bins: Bins = Bins()
     quality: Quality = Quality()
@@ -415,7 +423,19 @@ class Config(Strict):
                 self._conversions.setdefault(table, {})[name] = conversion(unit, to)
             except ConfigError as error:
                 raise ValueError(f"{place}.{name}: {error}") from None
+        try:
+            _ = self.mass
+        except ConfigError as error:
+            raise ValueError(f"rig.moving_mass_kg: {error}") from None
         return self
+
+    @property
+    def mass(self) -> float:
+        """Moving mass in units of force per unit of acceleration: 1 kg is 0.001 N s2/mm."""
+        if not self.rig.moving_mass_kg:
+            return 0.0
+        force, length, time = (self.units.unit(slot) for slot in ("force", "displacement", "time"))
+        return conversion(f"kg*{length}/{time}**2", force)(self.rig.moving_mass_kg)
 
     def _units_of_files(self) -> list[tuple[str, str, str, str]]:
         """Return every column whose unit is given: its table, place in the config, name and unit."""

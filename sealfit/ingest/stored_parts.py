@@ -132,7 +132,7 @@ def noise_from_bends(bends: np.ndarray) -> float:
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
-FORMAT = 4  # of a part's files; those of another one are made again
+FORMAT = 5  # of a part's files; those of another one are made again
 _ABOUT = b"part"
 
 Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it

@@ -21,8 +21,9 @@ from sealfit.ingest.quality import (
     stroke_faults,
 )
 from sealfit.ingest.reader import Trace, read_traces
-from sealfit.ingest.strokes import Stroke, find_strokes
+from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, speed_factor
+from sealfit.ingest.window import acceleration
 from sealfit.store.manifest import Fingerprint
 
 OWN_SPEED = "speed_file_mm_s"  # what the reader calls a speed column of the trace itself
@@ -87,13 +88,26 @@ def _with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
     keep, faults = displacement_spikes(
         trace.ref.file, trace.columns["displacement_mm"], trace.line, config.quality
     )
-    trace = trace.where(keep, faults)
+    trace = _without_inertia(trace.where(keep, faults), config.mass)
     strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
     keep, faults = force_spikes(trace.ref.file, trace.columns["force_N"], strokes, trace.line, config.quality)
     if keep.all():
         return replace(trace, faults=(*trace.faults, *faults)), strokes
     trace = trace.where(keep, faults)
     return trace, find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
+
+
+def _without_inertia(trace: Trace, mass: float) -> Trace:
+    """Return the trace with the force less mass times acceleration of the measured displacement.
+
+    Both count in the direction of rising displacement, as the force of friction does.
+    """
+    if not mass or len(trace.line) < 3:
+        return trace
+    time_s, displacement, force = (trace.columns[name] for name in SLOTS)
+    noise, wanted = (displacement_noise_mm(values, order=4) for values in (displacement, force))
+    inertia = mass * acceleration(time_s, displacement, noise, wanted / mass)
+    return replace(trace, columns={**trace.columns, "force_N": force - inertia})
 
 
 def _unmoved(trace: Trace, config: Config) -> Fault:

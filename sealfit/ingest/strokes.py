@@ -9,6 +9,7 @@ it later shows counts as one.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -133,20 +134,21 @@ def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strok
     return Stroke(1, 0, n, 0, way, speed, every, every, np.zeros(n), np.full(n, speed), short)
 
 
-def displacement_noise_mm(displacement_mm: np.ndarray) -> float:
+def displacement_noise_mm(displacement_mm: np.ndarray, order: int = 2) -> float:
     """Return the standard deviation of one displacement sample of a trace, noise and resolution together.
 
-    Second differences of a steady motion hold noise only: their variance is six times that of a sample. The
-    90th percentile is blind to gaps, stops and spikes. Where most of the way is covered by single steps
-    between rows that hardly differ, these are the resolution, whose rounding error is uniform: step /
-    sqrt(12). A rest before or after the motion is no such step, be its rows equal or not. 0 of less than
-    three samples.
+    Second differences of a steady motion hold noise only: their variance is six times that of a sample.
+    Fourth differences are free of the acceleration along ramps, too, with 70 times the variance. The 90th
+    percentile is blind to gaps, stops and spikes. Where most of the way is covered by single steps between
+    rows that hardly differ, these are the resolution, whose rounding error is uniform: step / sqrt(12). A
+    rest before or after the motion is no such step, be its rows equal or not. 0 of no more than `order`
+    samples.
     """
-    if len(displacement_mm) < 3:
+    if len(displacement_mm) <= order:
         return 0.0
-    steps = np.diff(displacement_mm)
-    noise = quantile(np.abs(np.diff(steps)), 0.9) / (1.645 * np.sqrt(6.0))
-    steps = np.abs(steps)
+    bends, times = np.diff(displacement_mm, order), math.comb(2 * order, order)
+    noise = quantile(np.abs(bends), 0.9) / (1.645 * np.sqrt(times))
+    steps = np.abs(np.diff(displacement_mm))
     beside = np.zeros(len(steps))
     beside[1:] += steps[:-1]
     beside[:-1] += steps[1:]

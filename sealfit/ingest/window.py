@@ -185,6 +185,36 @@ def _speed_of_means(time_s: np.ndarray, along_mm: np.ndarray, half: int) -> np.n
     return moved / lasted
 
 
+def acceleration(
+    time_s: np.ndarray, displacement_mm: np.ndarray, noise_mm: float, wanted: float
+) -> np.ndarray:
+    """Return the acceleration at every row of a trace, shape (n,), per time unit squared.
+
+    It is the change from the mean speed over `half` rows before the row to that over `half` rows after it.
+    As for the speed of the window (`local_speed`), `half` is as wide as the noise asks for: here, that of the
+    acceleration is `wanted`, or `half` a sixteenth of the trace. Near the ends it is that of the nearest row
+    which has so many.
+
+    Parameters
+    ----------
+    time_s, displacement_mm : ndarray, shape (n,)
+        A trace of three rows or more.
+    noise_mm : float
+        Standard deviation of a displacement sample.
+    wanted : float
+        Standard deviation of the acceleration.
+    """
+    n = len(time_s)
+    # The SD of a second difference over `half` steps is sqrt(6) noise / (half step)^2.
+    step = median(np.diff(time_s))
+    half = np.ceil(np.sqrt(np.sqrt(6.0) * noise_mm / max(wanted, 1e-300)) / step)
+    half = int(np.clip(half, 1, max(n // 16, 1)))
+    at = np.clip(np.arange(n), half, n - 1 - half)
+    t, x = ([values[at + shift] for shift in (-half, 0, half)] for values in (time_s, displacement_mm))
+    before, after = ((x[i + 1] - x[i]) / (t[i + 1] - t[i]) for i in (0, 1))
+    return 2.0 * (after - before) / (t[2] - t[0])
+
+
 def first_motion(force_N: np.ndarray, since: int) -> int:
     """Return the row from which the force comes up to its level: the last one at rest, from `since` on.
 
