@@ -270,6 +270,10 @@ class Strokes(Strict):
     """A steady window that is a smaller share of its stroke is too short."""
     whole_file: bool = False
     """Every file is one steady stroke, without ramps."""
+    turn: float | None = Field(None, gt=0)
+    """One turn of a rotation, in the unit of the displacement: `360`. Each turn is a stroke of its own, and
+    its displacement counts from the turn's start.
+    """
 
 
 class Rig(Strict):

@@ -39,21 +39,28 @@ class Schema:
 FILE = Column("file", "", TEXT, "trace file, relative to the campaign folder")
 RUN = Column("run_id", "", TEXT, "run: one condition at one speed and direction")
 REPEAT = Column("repeat", "", INT, "number of the repeat within its run")
-STROKE = Column("stroke", "", INT, "stroke within the file, from 1")
+STROKE = Column(
+    "stroke", "", INT, "stroke within the file, from 1; each steady speed of a motion and each turn is one"
+)
 DIRECTION = Column("direction", "", INT, "+1 where displacement rises, -1 where it falls")
 SPECIMEN = Column("specimen_id", "", TEXT, "piece of rubber; one per condition where not given")
 CONDITION = Column("condition", "", TEXT, "condition: the condition columns in words; 'unaged' for day 0")
 SERIES = Column("series", "", TEXT, "aging series: the condition without days; 'unaged' for day 0")
 RUBBER = Column("rubber", "", TEXT, "rubber, from the config's rubber columns; 'rubber' if there is one")
 SPEED = Column("speed_mm_s", "mm/s", FLOAT, "measured sliding speed, signed")
-SPEED_SET = Column("speed_set_mm_s", "mm/s", FLOAT, "commanded speed, magnitude; null if not given")
+SPEED_SET = Column(
+    "speed_set_mm_s",
+    "mm/s",
+    FLOAT,
+    "commanded speed, magnitude; that of the run where a stroke has several; null if not given",
+)
 LOAD = Column("load_N", "N", FLOAT, "normal load; null if not given")
 FORCE = Column("force_N", "N", FLOAT, "friction force, with the sign of the motion where it opposes it")
 PRESLIDING = Column("presliding_N", "N", FLOAT, "what is left of the pre-sliding rise, taken out of force_N")
 DISPLACEMENT = Column("displacement_mm", "mm", FLOAT, "displacement in the rig's own coordinate")
-DISTANCE = Column("distance_mm", "mm", FLOAT, "distance slid since the stroke's start")
+DISTANCE = Column("distance_mm", "mm", FLOAT, "distance slid since the start of the motion")
 TIME = Column(
-    "time_s", "s", FLOAT, "time in the file; from the stroke's first row in a file of several strokes"
+    "time_s", "s", FLOAT, "time in the file; from the start of the motion in a file of several strokes"
 )
 RUN_ORDER = Column("run_order", "", FLOAT, "place of the file in the order of started_at; null if not given")
 ELAPSED = Column("elapsed_h", "h", FLOAT, "time since the campaign's first file; null if not given")

@@ -19,6 +19,7 @@ from sealfit.ingest.averages import bin_table, mean_traces
 from sealfit.ingest.categorical import condition_columns, keys_of
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.files import Folder, as_number
+from sealfit.ingest.segments import median
 from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_strokes
 from sealfit.store.manifest import Fingerprint
 from sealfit.store.parquet import as_dictionary, to_arrow
@@ -27,7 +28,17 @@ from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_
 # ---------------------------------------------------------------- shaped
 # A frame brought into the columns and types of its schema.
 
-INNER = ("several", "left", "equal", "extreme", "run", "sliding", "row", "by_itself")  # serve the ingest only
+INNER = (
+    "several",
+    "several_speeds",
+    "left",
+    "equal",
+    "extreme",
+    "run",
+    "sliding",
+    "row",
+    "by_itself",
+)  # serve the ingest only
 STEADY_ONLY = tuple(
     {column.name for column in STEADY.columns}
     - {column.name for column in RUNS.columns}
@@ -205,20 +216,45 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
 def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, list]:
     """Return everything that is known of every stroke, the keys included; run_id with its direction.
 
-    A run with strokes both ways is two: `<run_id>+` and `<run_id>-`.
+    A run with strokes both ways is two: `<run_id>+` and `<run_id>-`. One with several steady speeds in a
+    stroke is one for each of them: `<run_id> at 42.1`.
     """
     rows = [row for made in files for row in made.strokes]
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: [row.get(name) for row in rows] for name in names}
     for name in condition_columns(config):
         columns.setdefault(name, [math.nan] * len(rows))  # every file is unaged, and none says the rest
-    columns |= keys_of(columns, len(rows), config)
-    return columns | _two_runs(columns) if rows else {"used": []}
+    if not rows:
+        return {"used": []}
+    columns |= keys_of(columns, len(rows), config) | {"run": [str(name) for name in columns["run_id"]]}
+    columns |= _at_speeds(columns, config.strokes.speed_tolerance)
+    return columns | {"run_id": _two_runs(columns)}
 
 
-def _two_runs(strokes: Mapping[str, list]) -> dict[str, list[str]]:
-    """Return `run_id` with its direction where needed, and `run`, as it was."""
-    names = [str(name) for name in strokes["run_id"]]
+def _at_speeds(strokes: Mapping[str, list], tolerance: float) -> dict[str, list]:
+    """Return `run_id` with the speed where strokes of the run have several, and that as the speed set.
+
+    Speeds of a run are different ones where those next to each other differ by more than the tolerance.
+    """
+    names = np.array(strokes["run"], object)
+    if not any(strokes["several_speeds"]):
+        return {"run_id": names.tolist()}
+    commanded = strokes.get("speed_set_mm_s", [None] * len(names)).copy()
+    speed = np.abs(np.array(strokes["speed_mm_s"], float))
+    several, known = np.array(strokes["several_speeds"], bool), np.array(strokes["used"], bool)
+    for run in dict.fromkeys(names[several]):
+        own = np.flatnonzero((names == run) & known)
+        own = own[np.argsort(speed[own])]
+        for part in np.split(own, np.flatnonzero(np.diff(np.log(speed[own])) > np.log1p(tolerance)) + 1):
+            for i in part:
+                commanded[i] = float(f"{median(speed[part]):.3g}")
+                names[i] = f"{run} at {commanded[i]:g}"
+    return {"run_id": names.tolist(), "speed_set_mm_s": commanded}
+
+
+def _two_runs(strokes: Mapping[str, list]) -> list[str]:
+    """Return `run_id` with its direction where needed."""
+    names = strokes["run_id"]
     ways = defaultdict(set)
     for run, file, way, used in zip(
         names, strokes["file"], strokes["direction"], strokes["used"], strict=True
@@ -228,10 +264,7 @@ def _two_runs(strokes: Mapping[str, list]) -> dict[str, list[str]]:
             ways[run, None].add(way)
     both = {run for (run, _), found in ways.items() if len(found) > 1}
     signed = (f"{run}{'+' if way > 0 else '-'}" for run, way in zip(names, strokes["direction"], strict=True))
-    return {
-        "run_id": [new if run in both else run for run, new in zip(names, signed, strict=True)],
-        "run": names,
-    }
+    return [new if run in both else run for run, new in zip(names, signed, strict=True)]
 
 
 def _array(values: Sequence[object]) -> pa.Array:

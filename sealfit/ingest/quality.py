@@ -57,8 +57,10 @@ def stroke_faults(
     time_s, force_N, line : ndarray, shape (n,)
         The whole trace, and the line in the file of each of its rows.
     """
+    unsettled = [] if stroke.settles else [_unsettled(stroke)]
     if stroke.short is not None:
         return [
+            *unsettled,
             Fault(
                 "too_short",
                 f"{stroke.short}.",
@@ -66,14 +68,28 @@ def stroke_faults(
                 action="stroke left out",
                 fix="Slide further or sample faster; "
                 "or set strokes.min_samples and min_steady_share in the config.",
-            )
+            ),
         ]
     whole, steady = slice(stroke.start, stroke.stop), stroke.rows
     force_N, steady_line = force_N[steady], line[steady]
     return [
+        *unsettled,
         *_gaps(time_s[whole], line[whole], settings),
         *(_saturated(force_N, steady_line, settings) or _stuck(force_N, steady_line, settings)),
     ]
+
+
+def _unsettled(stroke: Stroke) -> Fault:
+    return Fault(
+        "no_plateau",
+        "the speed never settles: where it is highest it still changes by more than the tolerance. "
+        "Its steady force is a mean over these speeds; bins have a speed each.",
+        column="displacement_mm",
+        value=float(stroke.speed_mm_s),
+        severity="warning",
+        action="kept",
+        fix="Drive at a constant speed; lower strokes.speed_tolerance where steps of the speed are smaller.",
+    )
 
 
 def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:

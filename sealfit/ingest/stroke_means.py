@@ -131,16 +131,17 @@ def _strokes_before(ref: TraceRef) -> int:
 def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[str, np.ndarray]:
     """Return the samples of a trace with stroke, distance and flags.
 
-    Time is counted from the stroke's start if there are several strokes.
+    Time is counted from the start of the motion if there are several strokes.
     """
     time_s, displacement, force = (trace.columns[name] for name in SLOTS)
     size = [stroke.stop - stroke.start for stroke in strokes]
     origin = np.array([stroke.origin for stroke in strokes])
     since = time_s[origin] if len(strokes) > 1 else np.zeros(1)
+    turns = [_turn_of(displacement[stroke.start : stroke.stop], config.strokes.turn) for stroke in strokes]
     return {
         "stroke": np.repeat([stroke.number for stroke in strokes], size),
         "time_s": time_s - np.repeat(since, size),
-        "displacement_mm": displacement,
+        "displacement_mm": displacement - np.repeat(turns, size),
         "force_N": force,
         "steady": np.concatenate([stroke.steady for stroke in strokes]),
         "sliding": np.concatenate([stroke.sliding for stroke in strokes]),
@@ -149,6 +150,11 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         "distance_mm": np.abs(displacement - np.repeat(displacement[origin], size)),
         **{name: values for name, values in trace.columns.items() if name not in SLOTS},
     }
+
+
+def _turn_of(displacement_mm: np.ndarray, turn: float | None) -> float:
+    """Return the displacement at which the turn of a stroke begins; 0 without turns."""
+    return 0.0 if turn is None else turn * float(np.floor(np.median(displacement_mm) / turn))
 
 
 def _stroke_rows(
@@ -170,6 +176,7 @@ def _stroke_rows(
         if used and OWN_SPEED in row:
             found += speed_column_faults(row["speed_mm_s"], row[OWN_SPEED], config)
         row |= {"several": several, "used": used, "stroke": stroke.number + _strokes_before(ref)}
+        row["several_speeds"] = stroke.several_speeds
         rows.append(row)
         faults += [
             replace(fault, file=ref.file, stroke=stroke.number if several else None) for fault in found

@@ -1,6 +1,7 @@
 """Strokes of a trace, and in each the window in which it slides steadily: found from the data.
 
-A stroke runs from one turning point of the smoothed displacement to the next. Its steady window begins when
+A stroke runs from one turning point of the smoothed displacement to the next. Each steady speed of a motion
+with several, and each turn of a rotation, is a stroke of its own. Its steady window begins when
 the speed has reached its plateau and the force has ended its pre-sliding rise, and ends before the platform
 slows down; rests in between are left out with what follows them until sliding is steady again. Nothing that
 changes slowly (warming, drift, a ripple, a Stribeck curve) is taken for a rise: only a force below everything
@@ -10,7 +11,7 @@ it later shows counts as one.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -18,21 +19,33 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from sealfit.config import Strokes
-from sealfit.ingest.segments import median, quantile, smoothed
-from sealfit.ingest.window import slope, speed_along, steady_window
+from sealfit.ingest.segments import median, quantile, smoothed, stretches
+from sealfit.ingest.window import SAME_SPEED, SPEED_NOISE, STANDSTILL, slope, speed_along, steady_window
+
+# Share of the travel of a motion that a steady speed covers at least. It is ten times what counts as a rest
+# (`_bounds`), so that no creep is one; 1, 3, 10 and 30 mm/s for equal times cover 2 % and more.
+LEAST_TRAVEL = 0.01
+# Share of the rows within twice the tolerance of a steady speed that may be slower by more than half of the
+# tolerance, and share that may be faster. Of those of a ramp 38 % are slower and 38 % faster, of those at the
+# top of a sine wave 33 and 24 %.
+OFF_SPEED = 0.2
+# Share of a turn below which what comes before the first or after the last whole turn is no turn of its own.
+PART_OF_TURN = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stroke:
     """One stroke: rows `start` to `stop` (exclusive) of its trace.
 
-    `origin` is the row where it begins to move, from which its distance counts (and, in a file of several
-    strokes, its time): the first row, unless rows of rest come before the file's first stroke. `speed_mm_s`
+    `origin` is the row where its motion begins, from which its distance counts (and, in a file of several
+    strokes, its time): the first row, unless rows of rest come before the file's first stroke. A steady speed
+    or a turn that is not the first of its motion has the origin of the first. `speed_mm_s`
     is in displacement units per time unit, signed. Arrays are of shape (stop - start,): `steady` marks the
     rows of the window, `sliding` those in which it moves; `presliding_N` is what is left of the pre-sliding
     rise in the window, with the sign of the force, 0 elsewhere; `speed_along_mm_s` is the speed at every row,
     where it is seen to differ from the stroke's. `short` says why the window is too short to be used; None if
-    it is long enough.
+    it is long enough. `settles` is false where the speed has no plateau; `several_speeds` is true for a
+    steady speed of a motion with several.
     """
 
     number: int
@@ -46,6 +59,8 @@ class Stroke:
     presliding_N: np.ndarray
     speed_along_mm_s: np.ndarray
     short: str | None = None
+    settles: bool = True
+    several_speeds: bool = False
 
     @property
     def rows(self) -> np.ndarray:
@@ -82,9 +97,11 @@ def find_strokes(
     """
     if len(time_s) < 3 or not np.ptp(displacement_mm) > 0.0:
         return []
+    smooth = smoothed(displacement_mm, settings.smooth_samples)
     if settings.whole_file:
-        return [_whole_file(time_s, displacement_mm, settings)]
-    noise, smooth = displacement_noise_mm(displacement_mm), smoothed(displacement_mm, settings.smooth_samples)
+        whole = _whole_file(time_s, displacement_mm, settings)
+        return _numbered(_turns(time_s, displacement_mm, smooth, whole, settings))
+    noise = displacement_noise_mm(displacement_mm)
     span = float(np.ptp(smooth))
     if span <= 8.0 * noise:  # the range of some hundred samples of noise alone is about six SDs
         return []
@@ -100,18 +117,31 @@ def find_strokes(
     for number, (start, stop) in enumerate(pairwise(bounds), start=1):
         way = 1 if smooth[turns[number]] > smooth[turns[number - 1]] else -1
         first = origin if number == 1 else start
-        found.append(_stroke(motion, settings, number, slice(start, stop), first, way))
-    return found
+        rows = slice(start, stop)
+        parts = steady_speeds(time_s[rows], way * displacement_mm[rows], noise, settings)
+        for part, begin in parts:
+            own = slice(start + part.start, start + part.stop)
+            stroke = _stroke(motion, settings, own, start + begin, first, way)
+            stroke = replace(stroke, several_speeds=len(parts) > 1)
+            found += _turns(time_s, displacement_mm, smooth, stroke, settings)
+    return _numbered(found)
 
 
-def _stroke(motion: _Motion, settings: Strokes, number: int, rows: slice, origin: int, way: int) -> Stroke:
-    """Return the stroke that takes these rows of a trace."""
-    time_s, displacement_mm, force_N = (values[rows] for values in motion[:3])
-    along, noise = way * displacement_mm, motion.noise_mm
-    window = steady_window(time_s, along, way * force_N, origin - rows.start, noise, settings.speed_tolerance)
+def _numbered(strokes: list[Stroke]) -> list[Stroke]:
+    return [replace(stroke, number=number) for number, stroke in enumerate(strokes, start=1)]
+
+
+def _stroke(motion: _Motion, settings: Strokes, rows: slice, begin: int, origin: int, way: int) -> Stroke:
+    """Return the stroke that takes these rows of a trace; before `begin` it slides at another speed."""
+    time_s, displacement_mm, force_N = (values[begin : rows.stop] for values in motion[:3])
+    along, noise, tolerance = way * displacement_mm, motion.noise_mm, settings.speed_tolerance
+    window = steady_window(time_s, along, way * force_N, max(origin - begin, 0), noise, tolerance)
+    window = window.after(begin - rows.start)
+    time_s, displacement_mm = (values[rows] for values in motion[:2])
+    along = way * displacement_mm
     speed = slope(time_s, displacement_mm, window.steady)
     return Stroke(
-        number,
+        1,
         rows.start,
         rows.stop,
         origin,
@@ -122,7 +152,87 @@ def _stroke(motion: _Motion, settings: Strokes, number: int, rows: slice, origin
         way * window.left_N,
         speed_along(time_s, displacement_mm, window, speed, noise),
         _too_short(along, window.steady, settings),
+        window.settles,
     )
+
+
+def _turns(
+    time_s: np.ndarray, displacement_mm: np.ndarray, smooth_mm: np.ndarray, whole: Stroke, settings: Strokes
+) -> list[Stroke]:
+    """Return a stroke of a trace cut where it passes a multiple of `turn`: a stroke for each turn."""
+    if settings.turn is None:
+        return [whole]
+    number = whole.direction * smooth_mm[whole.start : whole.stop] / settings.turn
+    # Noise at a multiple is not a turn back.
+    cuts = np.flatnonzero(np.diff(np.floor(np.maximum.accumulate(number)))) + 1
+    long = (number[cuts] - number[0] > PART_OF_TURN) & (number[-1] - number[cuts] > PART_OF_TURN)
+    made = []
+    for part in pairwise([0, *cuts[long].tolist(), whole.stop - whole.start]):
+        own, rows = slice(*part), slice(whole.start + part[0], whole.start + part[1])
+        steady, along = whole.steady[own], whole.direction * displacement_mm[rows]
+        turn = replace(
+            whole,
+            start=rows.start,
+            stop=rows.stop,
+            speed_mm_s=slope(time_s[rows], displacement_mm[rows], steady),
+            steady=steady,
+            sliding=whole.sliding[own],
+            presliding_N=whole.presliding_N[own],
+            speed_along_mm_s=whole.speed_along_mm_s[own],
+            short=_too_short(along, steady, settings),
+        )
+        made.append(turn)
+    return made
+
+
+def steady_speeds(
+    time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, settings: Strokes
+) -> list[tuple[slice, int]]:
+    """Return one motion cut into its steady speeds: the rows of each, and the row where it begins.
+
+    The speed at a row is that over a distance, wide enough for the noise at every speed. A steady speed is
+    the longest stretch within twice the tolerance of the speed at which most of the way is slid, if most of
+    it is within half of the tolerance; then the same of what is left before and after it. A cut lies at the
+    slowest row in between. A steady speed begins after the ramp to it, but after a standstill with the ramp,
+    where the force rises. A motion with one steady speed, or none, is not cut.
+
+    Parameters
+    ----------
+    time_s, along_mm : ndarray, shape (n,)
+        One motion in one direction; displacement rising with it.
+    noise_mm : float
+        Standard deviation of a displacement sample.
+    settings : Strokes
+        The config's `strokes`.
+    """
+    n, tolerance = len(time_s), settings.speed_tolerance
+    x = np.maximum.accumulate(smoothed(along_mm, settings.smooth_samples))
+    # The SD of the difference of two samples is SPEED_NOISE * tolerance of the distance.
+    half = np.sqrt(0.5) * noise_mm / (SPEED_NOISE * tolerance)
+    least = LEAST_TRAVEL * (x[-1] - x[0]) if settings.min_travel_mm is None else settings.min_travel_mm
+    least = max(least, 4.0 * half)  # over half of that the speed is taken, of a rest, too
+    whole = [(slice(0, n), 0)]
+    if n < 2 * settings.min_samples or x[-1] - x[0] < 2.0 * least:
+        return whole
+    row = np.arange(n)
+    low = np.clip(x.searchsorted(x - half, "right") - 1, 0, np.maximum(row - 1, 0))
+    high = np.clip(x.searchsorted(x + half), np.minimum(row + 1, n - 1), n - 1)
+    speed = (x[high] - x[low]) / (time_s[high] - time_s[low])
+    found: list[slice] = []
+    for rows in _flat_parts(speed, np.diff(x, prepend=x[0]), slice(0, n), least, settings):
+        ratio = median(speed[rows]) / median(speed[found[-1]]) if found else np.inf
+        if abs(np.log(ratio)) < np.log1p(2.0 * tolerance):  # the same speed after a rest
+            found[-1] = slice(found[-1].start, rows.stop)
+        else:
+            found.append(rows)
+    if len(found) < 2:
+        return whole
+    cuts = [a.stop - 1 + int(speed[a.stop - 1 : b.start + 1].argmin()) for a, b in pairwise(found)]
+    rested = [
+        speed[cut] < STANDSTILL * median(speed[rows]) for cut, rows in zip(cuts, found[1:], strict=True)
+    ]
+    begins = [cut if rest else rows.start for cut, rest, rows in zip(cuts, rested, found[1:], strict=True)]
+    return list(zip(map(slice, [0, *cuts], [*cuts, n]), [0, *begins], strict=True))
 
 
 def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strokes) -> Stroke:
@@ -132,6 +242,39 @@ def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strok
     speed, least = slope(time_s, displacement_mm, every), settings.min_samples
     short = None if n >= least else f"only {n} samples; at least {least} are needed"
     return Stroke(1, 0, n, 0, way, speed, every, every, np.zeros(n), np.full(n, speed), short)
+
+
+def _flat_parts(
+    speed: np.ndarray, step_mm: np.ndarray, within: slice, least_mm: float, settings: Strokes
+) -> list[slice]:
+    """Return the rows of each steady speed found in a part of a motion, in order, without ramps."""
+    own, step, tolerance = speed[within], step_mm[within], settings.speed_tolerance
+    if len(own) < settings.min_samples or step.sum() < least_mm:
+        return []
+    order = np.argsort(own)
+    lowest, covered = own[order], np.cumsum(step[order])
+    last = lowest.searchsorted(lowest * (1.0 + tolerance) ** 2, "right") - 1
+    most = int((covered[last] - covered + step[order]).argmax())
+    level = median(lowest[most : last[most] + 1])
+    # Beyond the part, too: a piece of a ramp is as flat as it is short.
+    near = [slice(*ends) for ends in stretches(np.abs(speed - level) < 2.0 * tolerance * level)]
+    here = [slice(max(rows.start, within.start), min(rows.stop, within.stop)) for rows in near]
+    way = [float(step_mm[rows].sum()) if rows.start < rows.stop else 0.0 for rows in here]
+    longest = int(np.argmax(way))
+    if way[longest] < least_mm:
+        return []
+    rows, here = near[longest], here[longest]
+    off = speed[rows] / median(speed[rows]) - 1.0
+    ends = quantile(off, OFF_SPEED), quantile(off, 1.0 - OFF_SPEED)
+    found = []
+    if len(off) >= settings.min_samples and max(map(abs, ends)) <= 0.5 * tolerance:
+        first, after = (int(np.argmax(np.sign(end[0]) * end <= SAME_SPEED)) for end in (off, off[::-1]))
+        found = [slice(rows.start + first, rows.stop - after)]
+    before, behind = (
+        _flat_parts(speed, step_mm, part, least_mm, settings)
+        for part in (slice(within.start, here.start), slice(here.stop, within.stop))
+    )
+    return [*before, *found, *behind]
 
 
 def displacement_noise_mm(displacement_mm: np.ndarray, order: int = 2) -> float:

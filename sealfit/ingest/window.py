@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -52,13 +52,24 @@ class Window:
 
     `steady` marks its rows, `sliding` those in which the stroke moves at all; `left_N` is what is left in the
     window of the pre-sliding rise, positive against the motion, 0 outside; `rise_mm` is the length of that
-    rise, 0 without one.
+    rise, 0 without one. `settles` is false where the speed on the plateau changes by more than the tolerance.
     """
 
     steady: np.ndarray
     sliding: np.ndarray
     left_N: np.ndarray
     rise_mm: float
+    settles: bool = True
+
+    def after(self, rows: int) -> Window:
+        """Return the window of a stroke that has so many rows more before this one, in which it slides."""
+        before = np.zeros(rows, bool)
+        return replace(
+            self,
+            steady=np.r_[before, self.steady],
+            sliding=np.r_[~before, self.sliding],
+            left_N=np.r_[0.0 * before, self.left_N],
+        )
 
 
 def steady_window(
@@ -97,6 +108,7 @@ def steady_window(
     if plateau <= 0.0:
         return Window(steady, sliding, left, length)
     fast = speed >= (1.0 - tolerance) * plateau
+    settles = True
     stroke, since = _Motion(time_s, along_mm, speed, fast, plateau, half), 0 if blurred else origin
     for first, last in stroke.moving(moves):
         still = stroke.standstill(since, first)
@@ -112,8 +124,11 @@ def steady_window(
             steady[begin:end] = True
             left[begin:end] = rise.at(distance[begin - still :])
             length = rise.length_mm
+            near = first + np.flatnonzero(fast[first:last])
+            rows = slice(near[0], near[-1] + 1)
+            settles &= _settles(time_s[rows], along_mm[rows], noise_mm, tolerance)
         since = last
-    return Window(steady, sliding, left, length)
+    return Window(steady, sliding, left, length, settles)
 
 
 def _rows_of(rise: Rise, distance_mm: np.ndarray) -> int:
@@ -251,6 +266,24 @@ def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -
         product += float(t @ (d - d.mean()))
         square += float(t @ t)
     return product / square if square > 0.0 else np.nan
+
+
+def _settles(time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, tolerance: float) -> bool:
+    """Return whether the speed stays within the tolerance of one value.
+
+    It is a parabola over time, the slope of a cubic of the displacement by least squares: ripples of the
+    speed do not count. Of a sine wave the parabola changes by 24 % where it is above 0.9 of its plateau.
+    """
+    n = len(time_s)
+    if n < 2 * LEAST_SAMPLES:
+        return True
+    share = 2.0 * (time_s - time_s[0]) / (time_s[-1] - time_s[0]) - 1.0  # from -1 to 1
+    powers = np.vstack([np.ones(n), share, share**2, share**3])
+    (_, *slopes), *_ = np.linalg.lstsq(powers @ powers.T, powers @ (along_mm - along_mm[0]), rcond=None)
+    speed = slopes @ (powers[:3] * [[1.0], [2.0], [3.0]])
+    # The SD of the slope at an end is sqrt(sum of (2k + 1) P_k'(1)^2 / n) noise = sqrt(300 / n) noise.
+    error = 2.0 * np.sqrt(2.0 * 300.0 / n) * noise_mm
+    return bool(np.ptp(speed) <= 2.0 * tolerance * abs(speed.mean()) + error)
 
 
 def speed_along(

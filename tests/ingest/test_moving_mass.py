@@ -1,4 +1,4 @@
-"""A moving mass: its force is subtracted, and friction is recovered."""
+"""Campaigns of motions with several steady speeds, of turns, and with a moving mass."""
 
 import numpy as np
 import numpy.testing as npt
@@ -7,6 +7,9 @@ import pytest
 from trace_helpers import config
 
 from sealfit.errors import ConfigError
+from sealfit.fit.dynamic.starts import strokes_along
+from sealfit.fit.joint.rows import merge_directions, nesting_run
+from sealfit.fit.steady.uncertainty import run_means
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.window import acceleration
 
@@ -37,12 +40,68 @@ def moved(legs, hertz=1000, *, jitter=0.0, blur=1e-4, noise=0.2, seed=0, mass_kg
     return time, *(values + rng.normal(0.0, s, time.size) for values, s in zip(columns, sd, strict=True))
 
 
+def steps(speeds, hold=1.0, ramp=0.1):
+    """Legs of a motion through steady speeds, and back through the same."""
+    there = [leg for speed in speeds for leg in ((ramp, speed), (hold, speed))] + [(ramp, 0.0), (0.3, 0.0)]
+    return [(0.3, 0.0), *there, *((seconds, -speed) for seconds, speed in there)]
+
+
 def ingested(folder, traces, text=ONE):
     folder.mkdir(exist_ok=True)
     for number, (time, x, force) in enumerate(traces):
         table = pd.DataFrame({"time_s": time, "displacement_mm": x, "force_N": force, "load_N": LOAD_N})
         table.to_csv(folder / f"{number}.csv", index=False)
     return ingest_campaign(folder, config(text))
+
+
+def test_a_run_with_several_speeds_is_a_run_for_each(tmp_path):
+    traces = [moved(steps([20.0, 40.0, 80.0, 20.0]), seed=seed, mass_kg=0.0) for seed in range(3)]
+    found = ingested(tmp_path / "c", traces)
+    assert found.faults == []
+    tables = found.tables
+    steady = tables["steady"]
+    assert sorted(steady["run_id"].unique()) == [f"A at {v}{d}" for v in (20, 40, 80) for d in "+-"]
+    assert steady.groupby("run_id").size().tolist() == [6, 6, 3, 3, 3, 3]
+    npt.assert_allclose(steady["speed_set_mm_s"], steady["speed_mm_s"].abs(), rtol=0.01)
+    expected = steady["direction"] * (MU * LOAD_N + SIGMA_2 * steady["speed_mm_s"].abs())
+    npt.assert_allclose(steady["force_N"], expected, atol=0.05)
+    assert set(tables["bins"]["run_id"]) == set(tables["traces_mean"]["run_id"]) == set(steady["run_id"])
+    # All speeds and both directions of a file share its set-up: one run, in which the directions are merged.
+    assert set(nesting_run(steady)) == {"A"}
+    means = run_means(merge_directions(steady).assign(direction=1))
+    npt.assert_allclose(means["speed"], [20.0, 40.0, 80.0], rtol=0.01)
+    assert means["files"].tolist() == [3, 3, 3]
+    # Only the first speed of a motion begins at rest.
+    begun = [stroke.row for stroke in strokes_along(tables["traces"], steady)]
+    assert set(steady["stroke"].iloc[begun]) == {1, 5}
+
+
+def test_a_speed_that_never_settles_is_in_quality_and_kept(tmp_path):
+    time = np.arange(0.0, 12.0, 0.005)
+    x = 30.0 * (1.0 - np.cos(2.0 * np.pi * time / 4.0))
+    force = 30.0 * np.tanh(10.0 * np.sin(2.0 * np.pi * time / 4.0))
+    found = ingested(tmp_path / "c", [(time, x, force)])
+    assert {fault.check for fault in found.faults} == {"no_plateau"}
+    assert {(fault.action, fault.severity) for fault in found.faults} == {("kept", "warning")}
+    assert len(found.faults) == len(found.tables["steady"]) == 6
+
+
+def test_turns_of_a_rotation_share_their_positions_and_have_ripples_in_place(tmp_path):
+    rng = np.random.default_rng(3)
+    time = np.arange(0.0, 40.0, 0.01)
+    angle = 1000.0 + 90.0 * time  # ten turns
+    force = 20.0 + np.cos(np.radians(3.0 * angle)) + rng.normal(0.0, 0.1, time.size)
+    units = '[quantities]\ndisplacement = {quantity = "angle", unit = "deg"}\n'
+    units += 'speed = {quantity = "speed", unit = "deg/s"}\n[strokes]\nturn = 360\n'
+    tables = ingested(tmp_path / "c", [(time, angle, force)], ONE + units).tables
+    whole = tables["steady"].iloc[1:-1]
+    assert len(whole) == 9
+    assert set(tables["steady"]["run_id"]) == {"A"}
+    npt.assert_allclose(whole["displacement_from_mm"], 0.0, atol=1.0)
+    npt.assert_allclose(whole["displacement_to_mm"], 360.0, atol=1.0)
+    npt.assert_allclose(np.diff(whole["distance_mm"]), 360.0, atol=2.0)  # it counts on
+    place, residual = tables["bins"]["displacement_mm"], tables["bins"]["force_N"] - 20.0
+    assert np.corrcoef(residual, np.cos(np.radians(3.0 * place)))[0, 1] > 0.98
 
 
 @pytest.mark.parametrize(

@@ -262,7 +262,9 @@ class Along:
 
 
 def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
-    """Return all strokes with a steady window.
+    """Return all strokes with a steady window that begin at rest or at a turn.
+
+    A steady speed or a turn in the midst of a motion does not: its time counts from an earlier row.
 
     Parameters
     ----------
@@ -275,6 +277,9 @@ def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
     time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
     sliding, sign = traces["steady"].to_numpy(bool), steady["direction"].to_numpy().tolist()
     pace = np.abs(steady["speed_mm_s"].to_numpy(float)).tolist()
+    file = traces["file"].iloc[edges[:-1]].to_numpy()
+    later = np.r_[False, file[1:] == file[:-1]] & (time[edges[:-1]] > 0.0)
+    own[later] = -1
     made = []
     for begin, end, row in zip(edges[:-1].tolist(), edges[1:].tolist(), own.tolist(), strict=True):
         part = slice(begin, end)

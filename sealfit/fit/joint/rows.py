@@ -70,6 +70,8 @@ BOTH_DIRECTIONS = 0
 SAME_SPEED = 1.25
 
 KEYS = ["file", "run_id"]
+# How a run of a file with both directions, or with several steady speeds in a stroke, ends.
+SPEED_AND_SIGN = r"( at \d[\d.e+-]*?)?[+-]?$"
 
 
 def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
@@ -91,7 +93,8 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
         merged row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
     """
     rows = steady.assign(half_N=np.nan)
-    run, record = nesting_run(rows), records(rows)
+    record = records(rows)
+    run = rows["run_id"].where(nesting_run(rows) == rows["run_id"], rows["run_id"].str.rstrip("+-"))
     pace = rows["speed_mm_s"].abs()
     if "speed_set_mm_s" in rows.columns:
         pace = rows["speed_set_mm_s"].abs().fillna(pace)
@@ -395,13 +398,13 @@ def records(table: pd.DataFrame) -> pd.Series:
 
 
 def nesting_run(table: pd.DataFrame) -> pd.Series:
-    """Return each row's run, without its sign if the record has strokes in both directions."""
+    """Return each row's run, without speed and sign if the record has several speeds or both directions."""
     both = table.groupby(records(table))["run_id"].transform("nunique") > 1
     return table["run_id"].where(~both, _unsigned(table["run_id"]))
 
 
 def _unsigned(run: pd.Series) -> pd.Series:
-    return run.str.replace(r"[+-]$", "", regex=True)
+    return run.str.replace(SPEED_AND_SIGN, "", n=1, regex=True)
 
 
 def open_columns(table: pd.DataFrame) -> list[str]:
