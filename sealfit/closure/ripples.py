@@ -9,7 +9,13 @@ import numpy as np
 import pandas as pd
 from scipy.special import betaincc, gammaincc
 
-from sealfit.closure.criteria import ABOVE_BACKGROUND, LEAST_FILES_OF_RIPPLE, LOBE, SHARED_PHASE
+from sealfit.closure.criteria import (
+    ABOVE_BACKGROUND,
+    LEAST_FILES_OF_RIPPLE,
+    LEAST_GROUPS_HELD_OUT,
+    LOBE,
+    SHARED_PHASE,
+)
 from sealfit.closure.spectrum import (
     Spectrum,
     Strokes,
@@ -65,6 +71,8 @@ def find_ripple(
         Components in the model. Near them the residual contains their scatter between files.
     """
     peaks, locked = [], []
+    if common_phase and samples["unit"].nunique() < LEAST_GROUPS_HELD_OUT:
+        samples = samples.assign(unit=samples["stroke_id"])  # strokes are held out, too
     for spectrum in spectra_of(samples, AXES, known):
         if common_phase and spectrum.axis == "displacement_mm":
             peaks += _coherent(spectrum)

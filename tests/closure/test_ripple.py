@@ -82,6 +82,26 @@ def test_correlated_noise_is_not_a_ripple():
     assert np.mean(np.array(found) < 0.005) <= 0.04
 
 
+def one_file(seed=0, amplitude=0.0):
+    """Sixteen strokes of one file, forward and back in turn, at three speeds."""
+    samples = make_samples(seed, 16, amplitude, directions=(1,))
+    back = samples["unit"] % 2 == 1
+    samples = samples.assign(direction=np.where(back, -1, 1))
+    return samples.assign(unit=0, time_s=samples["time_s"] * (1.0 + samples["stroke_id"] % 3))
+
+
+def test_a_ripple_of_one_file_is_the_same_in_all_of_its_strokes():
+    peak = find_ripple(one_file(amplitude=0.1), common_phase=True)
+    assert (peak.axis, peak.common_phase) == ("displacement_mm", True)
+    assert peak.wavelength == pytest.approx(3.0, rel=0.01)
+    assert peak.p_value < 1e-4
+
+
+def test_noise_of_one_file_seldom_looks_like_a_ripple():
+    white = [find_ripple(one_file(seed), common_phase=True).p_value for seed in range(60)]
+    assert np.mean(np.array(white) < 0.05) <= 0.1  # nominal 5 %
+
+
 def test_too_few_samples_say_nothing():
     samples = make_samples(files=2)
     assert find_ripple(samples[samples.groupby("stroke_id").cumcount() < 10], common_phase=True) is None
