@@ -17,7 +17,7 @@ from sealfit.draft.files_found import look, read_tables
 from sealfit.draft.runs_table import find_table
 from sealfit.errors import RequestError
 
-SHOWN = ("trace.columns.", "condition", "files.glob", "files.name_pattern", "files.runs_columns")
+SHOWN = ("trace.columns.", "condition", "files.glob", "files.name_pattern", "files.runs_columns", "strokes.")
 """Guesses that the summary repeats: the others are in the draft."""
 
 

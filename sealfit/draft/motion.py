@@ -7,15 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from sealfit.ingest.strokes import turning_rows
+from sealfit.config import Strokes
+from sealfit.ingest.strokes import displacement_noise_mm, steady_speeds, turning_rows
 from sealfit.ingest.trace_checks import measured_speed
 
 SMOOTHED = 7  # samples, as `strokes.smooth_samples`
 MOVING = 0.3  # of the highest smoothed speed: slower samples belong to rests, ramps and turns
 STROKE = 0.2  # of the range: a smaller way back is no turn
-PIECES = 40  # that a stroke is cut into to look for speed steps
-STEP_PIECES = 4  # in a row of one speed are a step
-SAME_STEP = 0.05  # share by which the pieces of a step may differ
 SPEEDS_APART = 1.25  # ratio of two steady speeds in one file; plateaus of one speed differ by far less
 
 
@@ -119,33 +117,21 @@ def _share(difference: float, scatter: float) -> float:
     return abs(difference) / total if total else 0.0
 
 
-def plateau_speeds(time: np.ndarray, displacement: np.ndarray) -> list[float]:
+def plateau_speeds(time: np.ndarray, displacement: np.ndarray) -> list[list[float]]:
     """Return the steady speeds of every stroke, with the sign of the motion; rests and ramps do not count."""
-    speeds = []
+    strokes, noise = [], displacement_noise_mm(displacement)
     for first, last in pairwise(ends_of_strokes(displacement)):
-        if last - first > SMOOTHED:
-            sign = float(np.sign(displacement[last] - displacement[first]))
-            speeds += [
-                sign * speed for speed in _steps(time[first : last + 1], displacement[first : last + 1])
-            ]
-    return [speed for speed in speeds if np.isfinite(speed) and speed != 0]
-
-
-def _steps(time: np.ndarray, displacement: np.ndarray) -> list[float]:
-    """Return the steady speeds of one stroke: the only one, or those of its steps if it has speed steps."""
-    cut = np.unique(np.linspace(0, len(time) - 1, PIECES + 1).astype(int))
-    with np.errstate(all="ignore"):
-        speeds = np.abs(np.diff(displacement[cut]) / np.diff(time[cut]))
-    steps: list[list[float]] = [[]]
-    for speed in speeds.tolist():
-        if steps[-1] and not abs(speed - steps[-1][0]) <= SAME_STEP * steps[-1][0]:
-            steps.append([])
-        steps[-1].append(speed)
-    least = MOVING * float(np.max(speeds)) / 10  # a slow step may be a tenth of a fast one
-    found = [float(np.median(step)) for step in steps if len(step) >= STEP_PIECES and step[0] > least]
-    if len(different_speeds(found)) > 1:
-        return found
-    return [measured_speed(time, displacement)[1]]
+        t, x = time[first : last + 1], displacement[first : last + 1]
+        sign = float(np.sign(x[-1] - x[0]))
+        if len(t) <= SMOOTHED:
+            continue
+        # Where the clock stands there is no speed at a row.
+        parts = (
+            steady_speeds(t, sign * x, noise, Strokes()) if (np.diff(t) > 0).all() else [(slice(len(t)), 0)]
+        )
+        speeds = [sign * measured_speed(t[at : part.stop], x[at : part.stop])[1] for part, at in parts]
+        strokes.append([speed for speed in speeds if np.isfinite(speed) and speed != 0])
+    return strokes
 
 
 def different_speeds(speeds: list[float]) -> list[float]:

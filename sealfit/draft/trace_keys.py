@@ -249,6 +249,12 @@ def _integrated(speed: Column, notes: Notes) -> list[str]:
             "quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, f"from {speed.place}"
         )
         notes.guess("position_origin", "file", "an integral begins anew in every file")
+        notes.doubt(
+            "strokes",
+            "a rotation in one direction may slide over the same track in each turn.",
+            "Then set turn: each turn is a stroke of its own.",
+            ("turn = 1",),
+        )
     return [helper]
 
 
@@ -381,22 +387,22 @@ def motion_keys(
     """Say whether strokes go both ways and how many speeds a file has; return each file's measured speed."""
     if roles.time is None or (roles.displacement is None and roles.speed is None):
         return {}
-    speeds: dict[str, list[float]] = {}
+    strokes: dict[str, list[list[float]]] = {}
     for i, file in enumerate(files):
         if roles.displacement is None:
-            speeds[file] = [motion.mean_speed(roles.speed.values[i])]
+            strokes[file] = [[motion.mean_speed(roles.speed.values[i])]]
             continue
         time = _in_ours(roles.time.values[i], units.get("time"), "s")
         way = _in_ours(roles.displacement.values[i], units.get("displacement"), "mm")
-        speeds[file] = motion.plateau_speeds(time, way)
+        strokes[file] = motion.plateau_speeds(time, way)
+    speeds = {file: [speed for stroke in found for speed in stroke] for file, found in strokes.items()}
     several = {file: found for file, all_ in speeds.items() if (found := motion.several_speeds(all_))}
-    if several:
-        file, found = next(iter(several.items()))
-        shown = ", ".join(f"{speed:.3g}" for speed in found[:6])
-        reason = (
-            f"{len(several)} of {len(files)} files read hold several speeds in one direction: "
-            f"{shown} mm/s in {file}."
-        )
+    steps = {file: found for file, found in several.items() if max(map(len, strokes[file])) > 1}
+    if steps:
+        evidence = f"several steady speeds in a stroke, {_shown_speeds(steps, files)}: each is a stroke"
+        notes.guess("strokes.speed_tolerance", 0.1, evidence)
+    if others := {file: found for file, found in several.items() if file not in steps}:
+        reason = f"strokes in one direction have several speeds, {_shown_speeds(others, files)}."
         fix = "The strokes of a file in one direction are one run: write each speed into a file of its own."
         notes.doubt("strokes", reason, fix)
     return {
@@ -408,6 +414,12 @@ def motion_keys(
 
 def _in_ours(values: np.ndarray, unit: Unit | None, ours: str) -> np.ndarray:
     return values if unit is None else conversion(unit.name, ours)(values)
+
+
+def _shown_speeds(several: Mapping[str, Sequence[float]], files: Sequence[str]) -> str:
+    file, found = next(iter(several.items()))
+    shown = ", ".join(f"{speed:.3g}" for speed in found[:6])
+    return f"in {len(several)} of {len(files)} files read: {shown} mm/s in {file}"
 
 
 def motion_words(roles: Roles, strokes: int) -> str:

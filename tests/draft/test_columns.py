@@ -140,10 +140,23 @@ def test_a_number_in_names_that_is_the_measured_speed_is_the_speed(tmp_path):
     assert "(?P<speed_mm_s>" in config.files.name_pattern
 
 
-def test_a_file_with_steps_of_speed_is_a_doubt(tmp_path):
+def test_a_file_with_steps_of_speed_is_told(tmp_path):
     time = 0.05 * np.arange(400)
     for number, first in enumerate((1.0, 2.0), start=1):
         speed = np.where(time < 10, first, 4 * first)
+        way = np.cumsum(speed) * 0.05
+        body = exports.table([time, way, 40 + 0.1 * speed], ",", 4)
+        exports.write(tmp_path, f"d4_r{number}.csv", "time_s,position_mm,force_N\n" + body)
+    made = draft(tmp_path)
+    (guess,) = [guess for guess in made.guesses if guess.key == "strokes.speed_tolerance"]
+    assert "2 of 2 files read: 1, 4 mm/s" in guess.evidence
+    assert not [doubt for doubt in made.doubts if doubt.key == "strokes"]
+
+
+def test_strokes_of_a_file_at_different_speeds_are_a_doubt(tmp_path):
+    time = 0.05 * np.arange(800)
+    for number, first in enumerate((1.0, 2.0), start=1):
+        speed = np.where(time < 20, first, 4 * first) * np.where(time % 20 < 10, 1, -1)
         way = np.cumsum(speed) * 0.05
         body = exports.table([time, way, 40 + 0.1 * speed], ",", 4)
         exports.write(tmp_path, f"d4_r{number}.csv", "time_s,position_mm,force_N\n" + body)
@@ -157,7 +170,9 @@ def test_strokes_are_counted(strokes, sign):
     (one,) = exports.records(days=(1,), speeds=(5.0,), repeats=(1,), strokes=strokes)
     assert motion.stroke_count(sign * one.displacement_mm) == strokes
     expected = [5.0 * sign * (-1) ** i for i in range(strokes)]
-    assert motion.plateau_speeds(one.time_s, sign * one.displacement_mm) == pytest.approx(expected, rel=0.05)
+    found = motion.plateau_speeds(one.time_s, sign * one.displacement_mm)
+    assert [len(speeds) for speeds in found] == [1] * strokes
+    assert [speed for (speed,) in found] == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize(
