@@ -1,6 +1,8 @@
 """Measured campaigns by others, from files to report; SEALFIT_MEASURED names the folder of measured data."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,6 +64,33 @@ def test_emps_plateaus_go_through(tmp_path):
     strongest = max(ripples, key=lambda values: values["A"])
     assert strongest["lambda"] == pytest.approx(2.50, abs=0.005)
     assert strongest["A"] == pytest.approx(0.97, abs=0.1)
+    assert loop["after"]["heldout_rmse_N"] < 0.25 * loop["before"]["heldout_rmse_N"]
+
+
+def test_emps_as_it_is(tmp_path):
+    page = Path(__file__).parents[1] / "docs" / "how-to" / "own-data.md"
+    (text,) = re.findall(
+        r"^```toml\n(name = \"emps\".*?)^```$", page.read_text("utf-8"), re.DOTALL | re.MULTILINE
+    )
+    (tmp_path / "emps.toml").write_text(text)
+    out = tmp_path / "out"
+    run(measured() / "emps" / "csv", out, tmp_path / "emps.toml")
+    steady = Store.open(out).read("steady")
+    assert len(steady) == 32
+    assert steady["speed_set_mm_s"].tolist() == [42.1, 82.6, 125.0, 42.1] * 8
+    runs = steady.groupby("run_id")["force_N"].agg(["mean", "std"])
+    assert runs.loc["EMPS at 125+", "mean"] == pytest.approx(40.7, abs=0.5)
+    assert runs.loc["EMPS at 125-", "mean"] == pytest.approx(-50.5, abs=0.5)
+    assert (runs["std"] < 0.8).all()  # those at 42 mm/s are at both ends of the axis
+    loop = json.loads((out / "closure.json").read_text())
+    applied = {e["id"]: e for e in loop["effects"] if not e["candidate"]}
+    assert set(applied) == {"asymmetry", "ripple"}
+    assert applied["asymmetry"]["acts_on"] == "sigma_2"
+    # By hand 0.165 N s/mm forward and 0.240 backward, without the mass.
+    assert applied["asymmetry"]["parameters"][0]["value"] == pytest.approx(-0.075, abs=0.01)
+    ripple = {p["name"]: p["value"] for p in applied["ripple"]["parameters"]}
+    assert ripple["lambda"] == pytest.approx(2.50, abs=0.005)
+    assert ripple["A"] == pytest.approx(0.97, abs=0.1)
     assert loop["after"]["heldout_rmse_N"] < 0.25 * loop["before"]["heldout_rmse_N"]
 
 
