@@ -94,6 +94,8 @@ def exit_code(app: typer.Typer) -> int:
     except Exception as error:
         if memory_ran_out(error):
             return _fail(f"sealfit: {MEMORY} {MORE_MEMORY}", [{**_error(MEMORY), "fix": MORE_MEMORY}], 1)
+        if isinstance(error, PermissionError) and error.filename is not None:
+            return _forbidden(error)
         # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they
         # can do.
         if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
@@ -112,6 +114,16 @@ def _fail(message: str, errors: list[dict], code: int) -> int:
         print(json.dumps({"ok": False, "errors": errors}, indent=1, ensure_ascii=False, allow_nan=False))
     print(message, file=sys.stderr)
     return code
+
+
+def _forbidden(error: PermissionError) -> int:
+    """Report a file or folder without access, such as one in a folder that cannot be searched."""
+    file = os.fsdecode(error.filename)
+    reason, fix = (
+        f"there is no access ({error.strerror}).",
+        "Fix its rights, or those of the folders above it.",
+    )
+    return _fail(f"sealfit: {file}: {reason} {fix}", [{**_error(reason), "file": file, "fix": fix}], 1)
 
 
 def _bug(error: Exception) -> int:

@@ -234,6 +234,19 @@ def test_no_memory_is_one_line_and_1(sealfit, monkeypatch, error):
     assert told["reason"].startswith("memory ran out")
 
 
+def test_a_folder_that_may_not_be_searched_is_one_line_and_1(sealfit, monkeypatch):
+    def refused(*_):
+        raise PermissionError(errno.EACCES, "Permission denied", "/locked/out")
+
+    monkeypatch.setattr("sealfit.commands.effects", refused)
+    ended = sealfit("effects", "/locked/out", "--json")
+    assert ended.code == 1
+    (told,) = ended.json["errors"]
+    assert told["file"] == "/locked/out"
+    assert ended.stderr == f"sealfit: /locked/out: {told['reason']} {told['fix']}\n"
+    assert told["reason"] == "there is no access (Permission denied)."
+
+
 def test_a_reader_that_leaves_early_is_no_fault():
     program = "import sys; sys.argv = ['sealfit', '--help']; from sealfit.cli import main; main()"
     read = subprocess.run(

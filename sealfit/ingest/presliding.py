@@ -145,12 +145,12 @@ def rise_of(start: Start) -> Rise:
 def _early_peak(start: Start) -> int | None:
     """Return the row at which the force peaks in the first half of the stroke, or None.
 
-    It is None if the fall from the peak cannot be over soon enough (`_by_damping`), or if the force is
-    highest at the end of that half.
+    It is None if the fall from the peak cannot be over soon enough (`_by_damping`), if the force is highest
+    at the end of that half, or if no row lies where its level is read.
     """
     distance = start.distance_mm
-    half = int(distance.searchsorted(EARLY[1] * distance[-1]))
-    if half < 2:
+    early, half = (int(distance.searchsorted(share * distance[-1])) for share in EARLY)
+    if half < 2 or early == half:
         return None
     peak = int(start.force_N[:half].argmax())
     soon = distance[peak] <= start.plateau_mm + SOON * distance[-1]
@@ -314,6 +314,8 @@ def _settled_mm(start: Start, level_N: float, fitted_mm: float) -> float:
 
 def _below(plateau_N: np.ndarray, begin_N: float) -> bool:
     """Return whether the force begins below everything that the plateau shows, its noise included."""
+    if len(plateau_N) < 2:
+        return False
     steps = np.abs(plateau_N[1:] - plateau_N[:-1])
     to_noise = 1.0 / (0.6745 * math.sqrt(2.0))
     return begin_N < quantile(plateau_N, 0.01) - 4.0 * (median(steps) * to_noise)

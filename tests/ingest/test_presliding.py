@@ -157,3 +157,13 @@ def test_noise_does_not_hide_the_rise_after_a_jump():
 def test_a_rise_far_shorter_than_the_ramp_of_the_speed_leaves_nothing():
     assert _before(-1e-3, 1e4) == 0.0
     assert _before(-1.0, np.log(2.0)) == pytest.approx(-2.0)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_times_with_long_gaps_are_no_fault_of_the_program(seed):
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(rng.lognormal(0.0, rng.uniform(1.0, 5.0), int(rng.integers(30, 300))))
+    displacement = rng.uniform(0.1, 10.0) * time
+    force = 10.0 * (1.0 - np.exp(-(displacement - displacement[0]) / rng.uniform(0.1, 5.0)))
+    for stroke in find_strokes(time, displacement, force + rng.normal(0.0, 0.1, len(time)), Strokes()):
+        assert np.isfinite(stroke.speed_mm_s)

@@ -184,7 +184,9 @@ def test_tables_have_their_units(results):
         "temperature_C": "°C", "compression_ratio_pct": "%", "aging_days": "d",
     }  # fmt: skip
     assert results.sensitivity.attrs["units"] == {"smallest_N": "N", "smallest_pct": "%"}
-    assert results.bins.attrs["meaning"]["speed_set_mm_s"] == "commanded speed, magnitude; null if not given"
+    assert results.bins.attrs["meaning"]["speed_set_mm_s"] == (
+        "commanded speed, magnitude; that of the run where a stroke has several; null if not given"
+    )
     assert results.predict(POINTS).attrs["units"]["meas_lo95_N"] == "N"
 
 
