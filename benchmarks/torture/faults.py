@@ -637,32 +637,54 @@ def subprocess_ended(words: Sequence[str], **more: object) -> Ended:
     return Ended(run.returncode, out, err)
 
 
-def workers_killed(scene: Scene, folder: Path, count: int, random: Random) -> tuple[Counter, list[str]]:
-    """Kill a process that works for the command at so many moments; `scene` is that of close-loop."""
-    ends, wrong, work = Counter(), [], folder / "work"
+def workers_killed(folder: Path, count: int, random: Random) -> tuple[Counter, list[str]]:
+    """Kill a process that works for close-loop at so many moments: one of two workers, or their server.
+
+    The campaign is the sample's series at 60 degC, one repeat: smaller ones need no such processes. The
+    moment is drawn from the time in which an undisturbed command has them.
+    """
+    ends, wrong, campaign, done, out = Counter(), [], *(folder / name for name in ("campaign", "done", "out"))
     folder.mkdir()
-    words = [word if word != "1" else "2" for word in scene.words(work)]
+    spec = load_spec(HERE.parents[1] / "sample_data" / "simulated.spec.toml")
+    small = {"temperatures_C": spec.design.temperatures_C[:1], "repeats": 1}
+    simulate(spec.model_copy(update={"design": spec.design.model_copy(update=small)}), campaign)
+    forked(lambda: sealfit(["run", campaign, "--out", done, "--workers", "1"]), folder)
+    lasts_s = killed_after(done, None, random)[0]
     for _ in range(count):
-        shutil.rmtree(work, ignore_errors=True)
-        shutil.copytree(scene.old, work)
-        wait_s, streams = random.uniform(0, 1.5), {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        with subprocess.Popen([sys.executable, "-m", "sealfit", *words], text=True, **streams) as run:
-            while run.poll() is None and len(helpers(run.pid)) < 2:
-                time.sleep(0.01)
-            time.sleep(wait_s)
-            if there := helpers(run.pid):
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(random.choice(there), signal.SIGKILL)
-            end = Ended(run.returncode or 0, *run.communicate())
-        end = replace(end, code=run.returncode)
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(done, out)
+        _, hit, end = killed_after(out, random.uniform(0, lasts_s), random)
         fault = end.fault()
         if not fault:
-            again = forked(lambda: sealfit(scene.words(work)), folder)
-            fault = again.fault() or ", ".join(differing(work / "out", scene.here / "new" / "out"))
-        kind = "wrong" if fault else "one line" if end.code else "done" if there else "done before"
+            again = forked(lambda: sealfit(["close-loop", out, "--workers", "1"]), folder)
+            fault = again.fault() or ", ".join(differing(out, done))
+        kind = "wrong" if fault else "no process there" if not hit else "one line" if end.code else "done"
         ends[kind] += 1
         wrong += [fault] if fault else []
     return ends, wrong
+
+
+def killed_after(out: Path, wait_s: float | None, random: Random) -> tuple[float, bool, Ended]:
+    """Redo close-loop with two workers, and kill one of its processes so long after it has them.
+
+    Nothing is killed where `wait_s` is None. Return for how long it had such processes, whether one was
+    killed, and how the command ended.
+    """
+    words = [sys.executable, "-m", "sealfit", "close-loop", str(out), "--workers", "2", "--force"]
+    since = until = None
+    hit = False
+    with subprocess.Popen(words, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        while run.poll() is None:
+            there, now = helpers(run.pid), time.monotonic()
+            if len(there) >= 2:
+                since, until = since or now, now
+                if wait_s is not None and not hit and now - since >= wait_s:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(random.choice(there), signal.SIGKILL)
+                        hit = True
+            time.sleep(0.01)
+        end = Ended(0, *run.communicate())
+    return (until or 0) - (since or 0), hit, replace(end, code=run.returncode)
 
 
 def helpers(pid: int) -> list[int]:
@@ -796,7 +818,7 @@ def main() -> int:
     parser.add_argument("--points", type=int, default=1200, help="how many, drawn at random; 0 for all")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=SCENES, metavar="NAME")
     parser.add_argument("--limits", type=int, default=20, help="limits of memory; needs the scene run")
-    parser.add_argument("--kills", type=int, default=50, help="workers killed; needs the scene close-loop")
+    parser.add_argument("--kills", type=int, default=20, help="workers killed, 15 s each")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--work", type=Path, help="folder to work in; else one for temporary files")
     given = parser.parse_args()
@@ -821,7 +843,7 @@ def main() -> int:
             wrong += told_wrong(f"limits of memory {dict(ends)}", given.limits, found)
         if given.kills:
             random = Random(given.seed)
-            ends, found = workers_killed(by_name["close-loop"], folder / "kills", given.kills, random)
+            ends, found = workers_killed(folder / "kills", given.kills, random)
             wrong += told_wrong(f"workers killed {dict(ends)}", given.kills, found)
     return bool(wrong)
 
