@@ -190,8 +190,6 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
 def _replace(output: Path, content: bytes) -> None:
     """Write a file completely or not at all; what a killed process left of an earlier one is replaced."""
     staged = output.with_name(f".{output.name}.part")
-    if staged.is_symlink():  # it would be written through
-        staged.unlink()
     with taken(staged, "--output") as handle:
         try:
             with open(handle, "wb", closefd=False) as file:

@@ -29,7 +29,7 @@ PRINT = 300
 MOST_BINS = 30_000
 """Bins of all runs that a page carries, about 1 MB; of more, every second, third ... is left."""
 
-FEWEST_SHARE = 5
+LARGEST_STEP = 5
 """Traces of which fewer than every fifth bin would be left are not in the page."""
 
 
@@ -100,7 +100,7 @@ def run_traces(tables: Mapping[str, pd.DataFrame], config: Config) -> dict:
     made = {"x": plain(units.label("displacement_mm")), "y": plain(units.label("force_N")), "runs": {}}
     rows = next((t for s in ("after", "before") if len(t := tables[f"residuals_{s}"])), pd.DataFrame())
     made["every"] = every = max(1, math.ceil(len(rows) / MOST_BINS))
-    if rows.empty or every > FEWEST_SHARE:
+    if rows.empty or every > LARGEST_STEP:
         return made
     names = ConditionNames.of(config)
     for run_id, run in rows[rows["bin"] % every == 0].groupby("run_id", sort=False):

@@ -76,6 +76,8 @@ def only_writer(folder: Path) -> Iterator[None]:
 def taken(path: Path, option: str = "--out") -> Iterator[int]:
     """Open and lock the file at `path`, and give its descriptor; it is created if missing.
 
+    A link is replaced by a file of its own.
+
     Raises
     ------
     OutError
@@ -91,7 +93,9 @@ def taken(path: Path, option: str = "--out") -> Iterator[int]:
 def _take(path: Path, option: str) -> int:
     while True:
         try:
-            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            if path.is_symlink():  # what it leads to would be written
+                path.unlink()
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         except OSError as error:
             raise OutError(
                 f"cannot be written ({error.strerror}).",

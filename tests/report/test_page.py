@@ -11,7 +11,7 @@ from report.made_campaigns import NAMES, aging_campaign, not_run, paper_sized, t
 from report.made_tables import empty
 
 from sealfit.config import Config
-from sealfit.report.drawing import FEWEST_SHARE, MOST_BINS, run_traces
+from sealfit.report.drawing import LARGEST_STEP, MOST_BINS, run_traces
 from sealfit.report.page import build_report
 
 VOID = {"meta", "img", "br", "link", "path", "rect", "circle"}
@@ -263,7 +263,7 @@ def test_traces_of_runs_are_in_the_page_thinned_where_they_are_many(small):
     own = rows[rows["file"] == first["file"]]
     assert first["force"] == pytest.approx(own["force_N"].to_numpy(), rel=1e-4)
     assert first["model"] == pytest.approx(own["model_N"].to_numpy(), rel=1e-4)
-    for times, kept in ((2, 2), (FEWEST_SHARE + 1, None)):
+    for times, kept in ((2, 2), (LARGEST_STEP + 1, None)):
         more = pd.concat([rows] * (times * MOST_BINS // len(rows)))
         many = run_traces({**small.tables, "residuals_after": more}, small.config)
         assert many["every"] == times

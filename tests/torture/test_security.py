@@ -30,6 +30,7 @@ from sealfit.errors import CampaignError, ConfigError, OutError, SealfitError
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.pipeline import run
 from sealfit.simulation import load_spec, simulate
+from sealfit.store.lock import LOCK
 
 SOURCE = Path(sealfit.__file__).parent
 DAYS = 'condition = ["aging_days"]\n'
@@ -188,6 +189,18 @@ def test_a_link_in_out_is_not_written_through(tmp_path):
     with pytest.raises(OutError, match=r"'bins.parquet' is a link to a folder\. Delete the link"):
         run(*given, steps=("ingest",), force=True)
     assert [path.name for path in mine.iterdir()] == ["thesis.tex"]
+
+
+def test_the_lock_is_not_written_through_a_link(tmp_path):
+    campaign(tmp_path / "campaign", RUNS, files=("a.csv", "b.csv"))
+    (tmp_path / "rig.toml").write_text(DAYS)
+    given = (tmp_path / "campaign", tmp_path / "out", tmp_path / "rig.toml")
+    run(*given, steps=("ingest",))
+    (tmp_path / "thesis.tex").write_text("years")
+    (tmp_path / "out" / LOCK).symlink_to(tmp_path / "thesis.tex")
+    run(*given, steps=("ingest",), force=True)
+    assert (tmp_path / "thesis.tex").read_text() == "years"
+    assert not os.path.lexists(tmp_path / "out" / LOCK)
 
 
 def test_answers_are_not_written_through_a_link(tmp_path):
