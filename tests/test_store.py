@@ -2,6 +2,7 @@ import errno
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,9 +21,9 @@ from small_tables import small
 
 from sealfit.config import parse_config
 from sealfit.errors import OutError, StaleError
-from sealfit.store import parquet, staged_writes
+from sealfit.store import parquet
 from sealfit.store.lock import LOCK
-from sealfit.store.manifest import STEPS, ConfigCopy, State, fingerprint, seen_config, to_json
+from sealfit.store.manifest import STAGING, STATE, STEPS, ConfigCopy, State, fingerprint, seen_config, to_json
 from sealfit.store.out_folder import Store
 from sealfit.tables import BINS, INPUTS, QUALITY, RUNS
 from sealfit.units import Units
@@ -590,13 +591,13 @@ os.replace = count(real_replace)
 out_folder.sync = staged_writes.sync = count(real_write)
 test_store.do_all(Path({out!r}), Path({campaign!r}), rows=5)
 """
-MOMENTS_PER_STEP = 11  # files written and moved, folders synced
+MOMENTS_PER_STEP = 14  # files written and moved, folders synced
 
 
 def test_a_kill_at_any_moment_leaves_complete_tables(out, campaign):
     do_all(out, campaign, rows=2)
     reached_end = []
-    for at in range(1, MOMENTS_PER_STEP * len(STEPS) + 2, 4):
+    for at in range(1, MOMENTS_PER_STEP * len(STEPS) + 2, 5):
         (campaign / "a.csv").write_text(f"changed before kill {at}")
         program = KILLED.format(tests=str(HERE), out=str(out), campaign=str(campaign), at=at)
         run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -617,26 +618,95 @@ def test_a_kill_at_any_moment_leaves_complete_tables(out, campaign):
     assert not reached_end[len(reached_end) // 2]
 
 
+def at_move(monkeypatch, number, act):
+    """Let `act` come before the move of that number: the first of a step is that of state.json."""
+    real, moved = os.replace, []
+
+    def replace(*paths):
+        moved.append(paths)
+        if len(moved) == number:
+            act()
+        return real(*paths)
+
+    monkeypatch.setattr("sealfit.store.staged_writes.os.replace", replace)
+
+
 def test_a_ctrl_c_while_files_are_moved_waits_until_they_are(out, campaign, monkeypatch):
-    real, moved = staged_writes.Staged.move, []
-
-    def interrupted(self, *names):
-        moved.append(names)
-        if len(moved) == 2:
-            signal.raise_signal(signal.SIGINT)
-        real(self, *names)
-
     def ingest():
         with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
             do(store, "ingest")
 
-    monkeypatch.setattr(staged_writes.Staged, "move", interrupted)
+    at_move(monkeypatch, 2, lambda: signal.raise_signal(signal.SIGINT))
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         ingest()
     assert signal.getsignal(signal.SIGINT) is before
     monkeypatch.undo()
     assert not Store.open(out).why_stale("ingest")
+
+
+def fail_at_move(monkeypatch, out, campaign, number):
+    """Do every step, then fit-steady again, whose moves fail from that number on."""
+    do_all(out, campaign)
+
+    def fail():
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
+        at_move(monkeypatch, number, fail)
+        with pytest.raises(OutError, match=r"Input/output error"):
+            do(store, "fit-steady", rows=5)
+        monkeypatch.undo()
+
+
+def staging(out):
+    return [path for path in out.iterdir() if path.name.startswith(STAGING)]
+
+
+@pytest.mark.parametrize(("number", "rows"), [(1, 2), (2, 5), (3, 5), (4, 5)])
+def test_a_step_is_whole_wherever_its_moves_fail(out, campaign, monkeypatch, number, rows):
+    fail_at_move(monkeypatch, out, campaign, number)
+    assert len(staging(out)) == (number > 1)
+    store = Store.open(out)
+    assert not staging(out)
+    assert len(store.read(OUTPUTS["fit-steady"])) == rows
+    assert not store.why_stale("fit-steady")
+    assert bool(store.why_stale("fit-aging")) == (number > 1)
+
+
+def test_an_interrupted_step_whose_files_were_deleted_is_one_line(out, campaign, monkeypatch):
+    fail_at_move(monkeypatch, out, campaign, 2)
+    (left,) = staging(out)
+    shutil.rmtree(left)
+    with pytest.raises(OutError, match=rf"lacks {left.name}, with files of a step that was interrupted"):
+        Store.open(out)
+
+
+@pytest.mark.parametrize("folder", ["../elsewhere", ".staging-1/..", "/etc", "steady.parquet", 3])
+def test_files_are_moved_from_a_staging_folder_alone(out, campaign, folder):
+    do_all(out, campaign)
+    state = json.loads((out / STATE).read_text())
+    (out / STATE).write_text(json.dumps({**state, "moving": {"folder": folder, "left_over": []}}))
+    with pytest.raises(OutError, match="is not a state that this version"):
+        Store.open(out)
+
+
+def test_no_file_is_moved_or_removed_through_a_link(out, campaign, tmp_path):
+    do_all(out, campaign)
+    (tmp_path / "mine").mkdir()
+    mine = tmp_path / "mine" / "a.svg"
+    mine.write_text("mine")
+    state = json.loads((out / STATE).read_text())
+    state["steps"]["report"]["files"]["plots/a.svg"] = 4
+    for folder, left_over in ((".staging-1", ["../mine/a.svg"]), (".staging-1", [])):
+        crafted = {**state, "moving": {"folder": folder, "left_over": left_over}}
+        (out / STATE).write_text(json.dumps(crafted))
+        (out / folder).mkdir(exist_ok=True)
+        (out / folder / "plots").unlink(missing_ok=True)
+        (out / folder / "plots").symlink_to(mine.parent)
+        with pytest.raises(OutError, match=r"is not a state|is a link to a folder"):
+            Store.open(out)
+        assert mine.read_text() == "mine"
 
 
 def full(*_args, **_kwargs):
@@ -725,7 +795,7 @@ def test_a_file_in_the_way_of_the_staging_is_one_line(out, campaign, monkeypatch
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
     do_all(out, campaign)
-    monkeypatch.setattr(staged_writes.Path, "mkdir", refuse)
+    monkeypatch.setattr(Path, "mkdir", refuse)
     with pytest.raises(OutError, match=r"Permission denied\)\. Fix the rights"), Store.writing(out) as store:
         do(store, "report")
 

@@ -5,9 +5,10 @@
 A point is one command, one call of it and one fault (`faulty_disk`). After each of them
 
 - the command has ended with 0, or with 1 and one line, never a traceback;
-- every file of OUT is that of the old or of the new state, byte by byte, and the steps that count as current
-  are those of one of the two; `predict` and `lifetime` answer as before or as after, or say in one line that
-  a step is not done;
+- every file of OUT is that of the old or of the new state, byte by byte;
+- OUT as the commands that read see it is the old or the new state whole: its files, the steps that count as
+  current, and what `predict` and `lifetime` answer. `run` makes several steps, each of them whole: after some
+  of them the answers are as before or as after, or say in one line that a step is not done;
 - the same command, undisturbed, ends with OUT equal byte by byte to that of an undisturbed run, and no
   temporary file is left.
 
@@ -461,7 +462,7 @@ class Verdict:
 
     point: Point
     call: str
-    left: str  # "old", "new" or "between": steps that are not done, and the commands that read said so
+    left: str  # "old", "new" or "between": some steps of `run` are new, and others not done
     wrong: str
 
 
@@ -476,11 +477,15 @@ def judge(scene: Scene, point: Point, work: Path) -> Verdict:
         shutil.rmtree(work)
         work.mkdir()
         journal.rebuild(work, point.variant, Random(f"{point.seed} {point.scene} {point.at}"))
-    left, said = files_in(work), told(scene, work)
-    wrong = ended.fault() or wrong_files(scene, left) or wrong_answers(scene, said)
+    found, said, left = files_in(work), told(scene, work), files_in(work)
+    wrong = (
+        ended.fault() or wrong_files(scene, found) or wrong_files(scene, left) or wrong_answers(scene, said)
+    )
     state = state_of(scene, left, said)
     if not wrong and ended.code == 0 and state != "new":
         wrong = f"it said it was done, and OUT is {state}: {said}"
+    if not wrong and state == "between" and not point.scene.startswith("run"):
+        wrong = f"neither the old nor the new state: {said}"
     again = forked(lambda: under_fault(scene, work, 0, ""), work.parent)
     wrong = wrong or wrong_again(scene, again, files_in(work))
     call = "end" if over else scene.calls[point.at - 1]

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sealfit.errors import OutError
-from sealfit.store.manifest import STATE
-from sealfit.store.staged_writes import STAGING, disk, sync
+from sealfit.store.manifest import STAGING, STATE, State
+from sealfit.store.staged_writes import disk, finish, refuse_links, sync
 
 # ---------------------------------------------------------------- interrupts
 # Ctrl-C is delayed while files are moved, because an incomplete move leaves OUT stale.
@@ -195,7 +195,8 @@ def _sign(handle: int, path: Path) -> None:
 def held(out: Path) -> Iterator[None]:
     """Hold `out` as its only writer.
 
-    It is created if missing, cleared of staged files, and removed if it stays empty.
+    It is created if missing, and removed if it stays empty. What an interrupted step left to be moved is
+    moved; other staged files are removed.
 
     Raises
     ------
@@ -206,6 +207,10 @@ def held(out: Path) -> Iterator[None]:
     made = _make(out)
     try:
         with only_writer(out):
+            state = State.read(out)
+            if state is not None and state.moving is not None:
+                with undisturbed(), disk(out):
+                    finish(out, state)
             for left in out.glob(f"{STAGING}*"):
                 shutil.rmtree(left, ignore_errors=True)
             yield
@@ -227,7 +232,7 @@ def _make(out: Path) -> bool:
                 file=out,
                 fix="Choose another --out.",
             )
-        _refuse_links(out)
+        refuse_links(out)
         return False
     missing = [folder for folder in (out, *out.absolute().parents) if not folder.exists()]
     with disk(out):
@@ -235,10 +240,3 @@ def _make(out: Path) -> bool:
         for folder in missing:
             sync(folder.absolute().parent)
     return True
-
-
-def _refuse_links(out: Path) -> None:
-    """Raise OutError for a link to a folder in `out`: files would be written and removed elsewhere."""
-    for path in out.iterdir():
-        if path.is_symlink() and path.is_dir():
-            raise OutError(f"'{path.name}' is a link to a folder.", file=out, fix="Delete the link.")

@@ -186,6 +186,7 @@ def _version(package: str) -> str | None:
 # The content of state.json: campaign, config, inputs, and the key of each step.
 
 STATE = "state.json"
+STAGING = ".staging-"  # the beginning of the name of a folder of staged files
 FORMAT = 8
 BATCH = "batch"  # column that names the batch, if nothing else is said
 DEFAULT = "default"
@@ -271,6 +272,17 @@ class Properties:
 
 
 @dataclass(frozen=True, slots=True)
+class Moving:
+    """The files of the last step are being moved to their places from a folder in OUT; some may be there.
+
+    `left_over` are the files of an earlier time of the step, to be removed.
+    """
+
+    folder: str
+    left_over: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class State:
     """The content of state.json; `properties` where the results are of such a table and not of traces."""
 
@@ -281,6 +293,7 @@ class State:
     # SHA-256 of the user's own effects, by file name
     effects: dict[str, str | None] = field(default_factory=dict)
     steps: dict[str, Done] = field(default_factory=dict)
+    moving: Moving | None = None
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -298,6 +311,7 @@ class State:
             "inputs": self.inputs,
             "own_effects": self.effects,
             "steps": {name: asdict(done) for name, done in self.steps.items()},
+            "moving": None if self.moving is None else asdict(self.moving),
         }
 
     @classmethod
@@ -324,6 +338,7 @@ class State:
                 {name: Fingerprint(*mark) for name, mark in kept["inputs"].items()},
                 dict(kept.get("own_effects", {})),
                 {name: _inside(Done(**done)) for name, done in kept["steps"].items()},
+                _moving(kept.get("moving") if kept["steps"] else None),
             )
         except (FileNotFoundError, NotADirectoryError):
             return None
@@ -346,12 +361,29 @@ def _properties(kept: dict | None) -> Properties | None:
     return Properties(kept["table"], tuple(kept["names"]), kept["batch"])
 
 
+def _moving(kept: dict | None) -> Moving | None:
+    """Return what is being moved; ValueError unless it is moved from a staging folder of OUT."""
+    if kept is None:
+        return None
+    folder = kept["folder"]
+    if not folder.startswith(STAGING) or PurePath(folder).name != folder:
+        raise ValueError(f"{folder} is no staging folder")
+    return Moving(folder, tuple(map(_file_of_out, kept["left_over"])))
+
+
 def _inside(done: Done) -> Done:
-    """Return `done`; ValueError if it names a file outside OUT, because these files are read and removed."""
+    """Return `done`; ValueError if it names a file that no step writes."""
     for file in done.files:
-        if PurePath(file).is_absolute() or ".." in PurePath(file).parts:
-            raise ValueError(f"{file} lies outside")
+        _file_of_out(file)
     return done
+
+
+def _file_of_out(file: str) -> str:
+    """Return `file`; ValueError if it is not in OUT or a folder of it: these files are read and removed."""
+    parts = PurePath(file).parts
+    if PurePath(file).is_absolute() or ".." in parts or len(parts) > 2:
+        raise ValueError(f"{file} lies outside")
+    return file
 
 
 def to_json(document: object, *, indent: int | None = 1) -> str:

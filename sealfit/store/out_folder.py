@@ -22,6 +22,7 @@ from sealfit.store.manifest import (
     ConfigCopy,
     Done,
     Fingerprint,
+    Moving,
     Properties,
     State,
     changes,
@@ -32,14 +33,22 @@ from sealfit.store.manifest import (
     to_json,
 )
 from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
-from sealfit.store.staged_writes import PARQUET, Staged, disk, file_size, sync
+from sealfit.store.staged_writes import (
+    BEGUN,
+    ENDED,
+    PARQUET,
+    PROVENANCE,
+    Staged,
+    disk,
+    file_size,
+    finish,
+    sync,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from sealfit.ingest.stored_parts import StoredTraces
-
-PROVENANCE = "provenance.json"
 
 
 class Store:
@@ -88,6 +97,9 @@ class Store:
         """
         opened = _status_of(out)  # before it is read
         state = State.read(out)
+        if state is not None and state.moving is not None:
+            with held(out):  # which finishes it
+                return cls.open(out, effects)
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
             raise OutError(
@@ -187,7 +199,7 @@ class Store:
             try:
                 staged.text(STATE, to_json(tidy.as_dict(), indent=None))
                 with disk(self.out):
-                    staged.move(STATE)
+                    staged.replace(STATE, STATE)
             finally:
                 staged.clear()
 
@@ -371,30 +383,22 @@ class Store:
             files,
             dict(staged.checksums),
         )
-        # The step counts as not done until every file is moved, so that a killed run leaves no mixture of old
-        # and new tables as current. All is on the disk before the first move, so a full disk changes nothing
-        # in OUT.
         steps = self.state.steps
         earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
-        known = inputs if earlier else {}  # none are known of steps not done
-        begun = replace(self.state, inputs=known, steps=earlier)
-        ended = replace(begun, inputs=inputs, steps={**earlier, name: done})
-        staged.text("begun.json", to_json(begun.as_dict(), indent=None))
-        staged.text("ended.json", to_json(ended.as_dict(), indent=None))
+        ended = replace(self.state, inputs=inputs, steps={**earlier, name: done})
+        old = steps[name].files if name in steps else {}
+        begun = replace(ended, moving=Moving(staged.name, tuple(sorted(self._left_over(old, files)))))
+        staged.text(BEGUN, to_json(begun.as_dict(), indent=None))
+        staged.text(ENDED, to_json(ended.as_dict(), indent=None))
         staged.text(PROVENANCE, to_json(provenance(ended), indent=None))
-        old = self.state.steps[name].files if name in self.state.steps else {}
-        with undisturbed(), disk(self.out):  # an incomplete move would leave OUT stale
-            staged.move("begun.json", STATE)
+        # Until state.json is replaced, OUT is what it was. After that the step is done, and whoever opens OUT
+        # next moves the files if this process does not come to it.
+        with undisturbed(), disk(self.out):
+            staged.sync()
+            staged.replace(BEGUN, STATE)
+            staged.committed = True
             sync(self.out)
-            for file in files:
-                staged.move(file)
-            for file in self._left_over(old, files):
-                (self.out / file).unlink(missing_ok=True)
-            staged.move(PROVENANCE)
-            for folder in {self.out, *((self.out / file).parent for file in files)}:
-                sync(folder)
-            staged.move("ended.json", STATE)
-            sync(self.out)
+            finish(self.out, begun)
             self.state = ended
         self._checksums |= done.checksums
         if staged.inputs is not None:
@@ -406,7 +410,12 @@ class Store:
         In the folder of a table nothing else may lie, whoever left it there: readers take all of it.
         """
         folders = {file.split("/")[0] for file in files if "/" in file and not file.startswith("plots/")}
-        lying = {f"{folder}/{path.name}" for folder in folders for path in (self.out / folder).iterdir()}
+        lying = {
+            f"{folder}/{path.name}"
+            for folder in folders
+            if (self.out / folder).is_dir()
+            for path in (self.out / folder).iterdir()
+        }
         return (old.keys() | lying) - files.keys()
 
     # ------------------------------------------------------------ parts of a table

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.errors import OutError
-from sealfit.store.manifest import Fingerprints, fingerprint, to_json
+from sealfit.store.manifest import STAGING, STATE, Fingerprints, State, fingerprint, to_json
 from sealfit.tables import SCHEMAS
 from sealfit.units import Units
 
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
     from sealfit.report.drawing import Drawn
 
-STAGING = ".staging-"
+PROVENANCE = "provenance.json"
+BEGUN, ENDED = "begun.json", "ended.json"  # state.json while the files of a step are moved, and after that
 PARQUET = ".parquet"
 
 
@@ -30,10 +31,12 @@ class Staged:
 
     def __init__(self, out: Path, units: Units, step: str):
         self._out, self._units = out, units
-        self._folder = out / f"{STAGING}{os.getpid()}-{step}"
+        self.name = f"{STAGING}{os.getpid()}-{step}"
+        self._folder = out / self.name
         self.files: dict[str, int] = {}
         self.checksums: dict[str, str | None] = {}
         self.inputs: Fingerprints | None = None  # set by ingest: the files read
+        self.committed = False  # whether state.json says that these files are being moved
 
     def table(self, name: str, frame: pd.DataFrame) -> None:
         """Write table `name` of `tables.SCHEMAS`; ValueError if the frame lacks its columns or types."""
@@ -77,19 +80,61 @@ class Staged:
             self.files[name] = path.stat().st_size
             self.checksums[name] = fingerprint(path).sha256
 
-    def move(self, name: str, to: str | None = None) -> None:
-        """Move a staged file to its final place atomically; a file that is already in OUT stays."""
-        if name in self.files and not os.path.exists(f"{self._folder}/{name}"):
-            return
-        target, source = self._out / (to or name), self._folder / name
+    def sync(self) -> None:
+        """Sync the folders of the staged files to the disk; the files are synced as they are written."""
+        folders = {(self._folder / file).parent for file in self.files}
+        for folder in {*folders, self._folder}:
+            if folder.is_dir():  # else its files are in OUT already
+                sync(folder)
+        sync(self._out)
+
+    def replace(self, name: str, target: str) -> None:
+        """Move a staged file to `target` in OUT, atomically."""
+        os.replace(self._folder / name, self._out / target)
+
+    def clear(self) -> None:
+        """Remove the staged files, unless they are to be moved to their places."""
+        if not self.committed:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def finish(out: Path, state: State) -> None:
+    """Finish the step whose files are being moved: move the rest, remove what is left over, store the state.
+
+    Whatever of it has been done already stays, so it may be interrupted and called again.
+
+    Raises
+    ------
+    OutError
+        If the staged files are not there any more, or a folder of them is a link.
+    """
+    folder, (*_, done) = out / state.moving.folder, state.steps.values()
+    if not folder.is_dir():
+        what = f"lacks {folder.name}, with files of a step that was interrupted."
+        raise OutError(what, file=out, fix="Delete the folder, or choose another --out.")
+    refuse_links(folder)
+    for file in (*done.files, PROVENANCE):
+        source, target = folder / file, out / file
+        if not source.exists():  # it is in OUT already
+            continue
         if target.parent.is_file():  # a table that was one file
             target.parent.unlink()
         target.parent.mkdir(exist_ok=True)
         os.replace(source, target)
+    for file in state.moving.left_over:
+        (out / file).unlink(missing_ok=True)
+    for place in {out, *((out / file).parent for file in done.files)}:
+        sync(place)
+    os.replace(folder / ENDED, out / STATE)
+    sync(out)
+    shutil.rmtree(folder, ignore_errors=True)
 
-    def clear(self) -> None:
-        """Remove the staged files."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+
+def refuse_links(folder: Path) -> None:
+    """Raise OutError for a link to a folder in `folder`: files would be written and removed elsewhere."""
+    for path in folder.iterdir():
+        if path.is_symlink() and path.is_dir():
+            raise OutError(f"'{path.name}' is a link to a folder.", file=folder, fix="Delete the link.")
 
 
 @contextlib.contextmanager
