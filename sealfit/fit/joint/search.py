@@ -226,9 +226,8 @@ def least_squares_within(
     kept = size > 1e-10 * size[-1]
     root, axes = np.sqrt(size[kept]), axes[:, kept]
     bounds = (low[acts] / scale, high[acts] / scale)
-    inside[acts] = (
-        lsq_linear(root[:, None] * axes.T, (axes.T @ (gradient[acts] * scale)) / root, bounds).x * scale
-    )
+    target = (axes.T @ (gradient[acts] * scale)) / root
+    inside[acts] = lsq_linear(root[:, None] * axes.T, target, bounds, method="bvls").x * scale
     return inside
 
 
