@@ -206,6 +206,12 @@ BLOCKS_OF_A_FOLD = (1, 2, 4)
 OUTSIDE = 0.02
 """Share of the range of the other rows by which a held-out row may lie outside without being extrapolated."""
 
+DETERMINED = 2.0
+"""Largest standard error of a held-out force that the other rows determine, in units of the rms residual.
+
+It is below 1.5 in campaigns of many speeds. A speed held out of three or four has 3 to 1e6.
+"""
+
 SAME_SETTING = 0.01
 """Relative difference of measured values of one setting."""
 

@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
-from sealfit.closure.criteria import JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
+from sealfit.closure.criteria import DETERMINED, JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
 from sealfit.closure.error_sizes import level_table
 from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
+from sealfit.closure.intervals import mean_se
 from sealfit.closure.outlier_files import outlier_files
 from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
@@ -103,10 +104,11 @@ def close_loop(
             + (": the search repeated without each fold" if heldout.repeats else "")
         )
         with timed("held out", rows=len(heldout.masks), of="folds"):
-            held_before, held_after, found = heldout.forces(selection, say)
+            held_before, held_after, determined, found = heldout.forces(selection, say)
             if found is not None and not _found_in_folds(selection, found):
                 selection, after, held_after = _all_refused(selection, say), before, held_before
-            models = BeforeAfter(before, after, held_before, held_after, heldout.covered(after.model))
+            within = heldout.covered(after.model)
+            models = BeforeAfter(before, after, held_before, held_after, within, determined)
             selection, models = _only_gains(selection, models, heldout, say)
         break
     before, after = models.before, models.after
@@ -169,33 +171,34 @@ class _HeldOut:
 
     def forces(
         self, selection: Selection, say: Callable[[str], None]
-    ) -> tuple[np.ndarray, np.ndarray, Sequence[Model] | None]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[Model] | None]:
         """Return each row's force before and after, by fits without its group, and the models.
 
-        A force is NaN if its row was never held out. The models are those of the repeated searches; None if
-        the search is not repeated. A repeated search has as many rounds as the full campaign needed for its
-        last effect: with less power it would go on for many rounds with small effects that it refuses.
+        A force is NaN if its row was never held out. The third array is true where the model before is
+        determined. The models are those of the repeated searches; None if the search is not repeated. A
+        repeated search has as many rounds as the full campaign needed for its last effect: with less power it
+        would go on for many rounds with small effects that it refuses.
         """
         if not (selection.added and self.repeats):
-            before = self.refitted(selection.before)
-            return before, self.refitted(selection.after) if selection.added else before, None
+            before, determined = self.refitted(selection.before)
+            after = self.refitted(selection.after)[0] if selection.added else before
+            return before, after, determined, None
         rounds = max(a.round for a in selection.added)
         parts = run_map(_held_out, _Folds(self, selection.before, rounds), workers=self.context.workers)
-        before, after = np.full(self.rows.force.size, np.nan), np.full(self.rows.force.size, np.nan)
-        models = []
-        for k, (out, (*forces, model)) in enumerate(zip(self.masks, parts, strict=True)):
+        before, after = np.full((2, self.rows.force.size), np.nan)
+        determined, models = np.zeros(self.rows.force.size, dtype=bool), []
+        for k, (out, part) in enumerate(zip(self.masks, parts, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
-            before[out], after[out] = forces
-            models.append(model)
-        return before, after, models
+            before[out], after[out], determined[out] = part.before, part.after, part.determined
+            models.append(part.model)
+        return before, after, determined, models
 
-    def refitted(self, fitted: Fitted) -> np.ndarray:
-        """Return each row's force by a model refitted without its fold, shape (n,); NaN if never held out."""
-        force = np.full(self.rows.force.size, np.nan)
-        folds = _Folds(self, fitted, rounds=0)
-        for out, (own, *_) in zip(self.masks, map(_held_out, folds), strict=True):
-            force[out] = own
-        return force
+    def refitted(self, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+        """Return each row's force by a model refitted without its fold, and where it is determined, (n,)."""
+        force, determined = np.full(self.rows.force.size, np.nan), np.zeros(self.rows.force.size, dtype=bool)
+        for out, part in zip(self.masks, map(_held_out, _Folds(self, fitted, rounds=0)), strict=True):
+            force[out], determined[out] = part.before, part.determined
+        return force, determined
 
     def covered(self, model: Model) -> np.ndarray:
         """Return which rows were held out and are covered by the others, shape (n,)."""
@@ -248,8 +251,18 @@ class _Folds(Sequence):
         return _Fold(kept(part.coarse), fine, every, seen, test, quiet, self.start, self.rounds)
 
 
-def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
-    """Return the forces before and after at a fold's rows (equal without a search), and the model after."""
+@dataclass(frozen=True)
+class _Prediction:
+    """Forces at the rows that a fold holds out, shape (n,) each, and the model after."""
+
+    before: np.ndarray
+    after: np.ndarray
+    determined: np.ndarray  # whether the other rows determine the force before
+    model: Model
+
+
+def _held_out(fold: _Fold) -> _Prediction:
+    """Return the forces before and after at a fold's rows; without a search they are equal."""
     if fold.rounds:
         part = select_effects(
             fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds
@@ -258,12 +271,16 @@ def _held_out(fold: _Fold) -> tuple[np.ndarray, np.ndarray, Model]:
     else:
         before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
 
-    def force(fitted: Fitted) -> np.ndarray:
-        own = fitted if fold.every is None else fit(fitted.model, fold.every, fitted.scatter, turns=0)
-        return evaluate(own.model, fold.test, jacobian=False)[0]
+    def on_every(fitted: Fitted) -> Fitted:
+        return fitted if fold.every is None else fit(fitted.model, fold.every, fitted.scatter, turns=0)
 
-    first = force(before)
-    return first, first if after is before else force(after), after.model
+    own = on_every(before)
+    first, tangent = evaluate(own.model, fold.test)
+    second = first
+    if after is not before:
+        second = evaluate(on_every(after).model, fold.test, jacobian=False)[0]
+    scatter = np.sqrt(own.rows.weight @ own.residual**2)
+    return _Prediction(first, second, mean_se(tangent, own.covariance) < DETERMINED * scatter, after.model)
 
 
 def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
@@ -329,7 +346,7 @@ def _only_gains(
             models = replace(models, after=models.before, held_after=models.held_before)
         else:
             models = replace(
-                models, after=after, held_after=heldout.refitted(own), covered=heldout.covered(own.model)
+                models, after=after, held_after=heldout.refitted(own)[0], covered=heldout.covered(own.model)
             )
     strong = tuple(r for r in refused if not r.weak)
     return replace(selection, refused=(*selection.refused, *refused), worse=strong), models

@@ -50,11 +50,12 @@ class BeforeAfter:
     held_before: np.ndarray  # (n,) NaN where never held out
     held_after: np.ndarray
     covered: np.ndarray  # (n,) whether the other rows cover the row; else it is extrapolated
+    determined: np.ndarray  # (n,) whether they determine its force before; else it is extrapolated, too
 
     def heldout_rmse_N(self, held: np.ndarray, *, extrapolated: bool = False) -> float | None:
         """Return the held-out error, on rows that the other rows cover or on extrapolated ones."""
         rows = self.before.rows
-        chosen = np.isfinite(held) & (self.covered != extrapolated)
+        chosen = np.isfinite(held) & ((self.covered & self.determined) != extrapolated)
         weight = rows.weight[chosen]
         if not chosen.any():
             return None
@@ -75,10 +76,15 @@ class BeforeAfter:
         return max(whole) <= (HARMLESS if strong else SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
-        """Return the ratio of errors after and before, in sample and held out (1 if nothing was held out)."""
+        """Return the ratio of errors after and before, in sample and held out (1 if nothing was held out).
+
+        Errors about the means of groups do not need the level of the force to be determined.
+        """
         rows, weight = self.before.rows, self.before.rows.weight
         inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
         known = np.isfinite(self.held_before) & np.isfinite(self.held_after) & self.covered
+        if around is None:
+            known &= self.determined
         held = [1.0, 1.0]
         if known.any():
             test = rows.subset(known)

@@ -218,9 +218,11 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     run = np.random.default_rng(0).normal(0, 3, rows.groups.starts["run"].size)[rows.codes("run")]
     wave = np.sin(rows.values("displacement_mm"))
 
-    def ends(rise, left=0.0):
+    every = np.ones(run.size, dtype=bool)
+
+    def ends(rise, left=0.0, determined=every):
         held = rows.force - run - wave, rows.force - rise * run - left * wave
-        return BeforeAfter(fitted, fitted, *held, np.ones(run.size, dtype=bool))
+        return BeforeAfter(fitted, fitted, *held, every, determined)
 
     assert not ends(1.1).gains(None, weak=False)
     assert ends(1.1).gains("stroke", weak=False)
@@ -228,6 +230,18 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     assert ends(1.1).gains("stroke", weak=True)
     assert ends(1.1, left=0.8).gains("stroke", weak=False)
     assert not ends(1.1, left=0.8).gains("stroke", weak=True)
+    assert ends(40.0, determined=~every).gains("stroke", weak=False)
+    assert not ends(40.0, left=1.1, determined=~every).gains("stroke", weak=False)
+
+
+def test_a_speed_held_out_of_three_is_not_determined_by_the_other_two():
+    bins = make_bins(
+        1, temperatures=(60.0, 70.0, 80.0), days=(4.0,), speeds=(0.5, 5.0, 50.0), bins=4, **SCATTER
+    )
+    made = close(bins[bins["aging_days"] > 0]).document
+    assert made["heldout_unit"] == "run"
+    assert made["before"]["heldout_rmse_N"] is None
+    assert made["before"]["heldout_extrapolated_rmse_N"] > 0
 
 
 def test_weak_evidence_needs_a_lower_error_on_what_was_held_out():
@@ -236,9 +250,8 @@ def test_weak_evidence_needs_a_lower_error_on_what_was_held_out():
     noise = np.random.default_rng(0).normal(0, 1, rows.force.size)
 
     def ends(left):
-        return BeforeAfter(
-            fitted, fitted, rows.force - noise, rows.force - left * noise, np.ones(noise.size, bool)
-        )
+        every = np.ones(noise.size, dtype=bool)
+        return BeforeAfter(fitted, fitted, rows.force - noise, rows.force - left * noise, every, every)
 
     assert ends(1.0).gains(None, weak=False)
     assert not ends(1.0).gains(None, weak=True)

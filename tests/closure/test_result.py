@@ -76,10 +76,12 @@ def candidate(*channels, p_value=1e-3, log_p=-9.0, chi2=20.0, unit="run"):
 def test_an_error_held_out_weighs_rows_and_leaves_out_what_is_not_covered():
     rows = SimpleNamespace(force=np.array([1.0, 2.0, 3.0, 4.0]), weight=np.array([0.1, 0.2, 0.3, 0.4]))
     held = np.array([2.0, np.nan, 5.0, 7.0])  # errors of 1, 2 and 3; the second row was never held out
-    models = BeforeAfter(SimpleNamespace(rows=rows), None, held, held, np.array([True, True, True, False]))
-    assert models.heldout_rmse_N(held) == pytest.approx(np.sqrt((0.1 * 1 + 0.3 * 4) / 0.4))
-    assert models.heldout_rmse_N(held, extrapolated=True) == pytest.approx(3.0)
-    assert models.heldout_rmse_N(np.full(4, np.nan)) is None
+    every, first = np.ones(4, dtype=bool), np.array([True, True, True, False])
+    for covered, determined in ((first, every), (every, first)):
+        models = BeforeAfter(SimpleNamespace(rows=rows), None, held, held, covered, determined)
+        assert models.heldout_rmse_N(held) == pytest.approx(np.sqrt((0.1 * 1 + 0.3 * 4) / 0.4))
+        assert models.heldout_rmse_N(held, extrapolated=True) == pytest.approx(3.0)
+        assert models.heldout_rmse_N(np.full(4, np.nan)) is None
 
 
 @pytest.mark.parametrize(
@@ -99,7 +101,8 @@ def test_the_error_is_compared_with_what_repeats_scatter_by(p_value, floor, stat
 def document(selection, after=None):
     after = selection.after if after is None else after
     held = np.full(after.force.size, np.nan)
-    models = BeforeAfter(selection.before, after, held, held, np.ones(held.size, dtype=bool))
+    every = np.ones(held.size, dtype=bool)
+    models = BeforeAfter(selection.before, after, held, held, every, every)
     return closure_document(replace(selection, after=after), models, "run", Config(), EFFECTS)
 
 
