@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
-from scipy.special import betaincc, gammaincc
+from numpy.polynomial.legendre import legvander
+from scipy.special import betaincc, fdtrc, gammaincc
 
 from sealfit.closure.criteria import (
     ABOVE_BACKGROUND,
@@ -55,6 +57,20 @@ class Peak:
 
 AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 
+LONG_WAVES = np.linspace(1.5, 4.5, 16)
+"""Periods per median stroke that are tried for waves of few periods."""
+
+CURVE_DEGREE = 14
+"""Degree of the Legendre series of a curve of the position; it resolves six periods."""
+
+TRAVEL_DEGREES = np.arange(3, 7)
+"""Degrees of the Legendre series of a smooth curve along the travel, without the parabola."""
+
+WAVE_OF_CURVE = 0.95
+"""Least share of what a curve of the position explains that a wave must explain.
+
+A bump of the position, a change of slope and warming leave 7 % and more of the curve unexplained."""
+
 
 def find_ripple(
     samples: pd.DataFrame, *, common_phase: bool, known: Sequence[tuple[str, float]] = ()
@@ -73,6 +89,8 @@ def find_ripple(
     peaks, locked = [], []
     if common_phase and samples["unit"].nunique() < LEAST_GROUPS_HELD_OUT:
         samples = samples.assign(unit=samples["stroke_id"])  # strokes are held out, too
+    if common_phase:
+        peaks += _long_waves(samples, [length for axis, length in known if axis == "displacement_mm"])
     for spectrum in spectra_of(samples, AXES, known):
         if common_phase and spectrum.axis == "displacement_mm":
             peaks += _coherent(spectrum)
@@ -114,6 +132,70 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
             Peak(spectrum.axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude, energy)
         )
     return peaks
+
+
+def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
+    """Return the best wave of few periods per stroke, per mode, unless a smooth curve is as likely.
+
+    Near its low end a spectrum contains the smooth shapes of strokes. Here the mean over files of the
+    amplitudes of sine and cosine is tested against their scatter (Hotelling's T squared). Nearly all of what
+    any curve of the position that all files share explains must be the wave, and a curve along the travel,
+    as of warming, must explain less.
+    """
+    strokes = Strokes.of(samples, "displacement_mm")
+    units, unit = np.unique(strokes.unit, return_inverse=True)
+    if units.size < LEAST_GROUPS_HELD_OUT:
+        return []
+    span, low, high = np.median(strokes.span), strokes.low.min(), (strokes.low + strokes.span).max()
+    waves = np.array([m for m in LONG_WAVES if all(abs(m - span / length) > 1 for length in known)])
+    if not waves.size:
+        return []
+    pairs = np.arange(2 * waves.size).reshape(2, -1).T  # columns of each wave's sine and cosine
+    curve = pairs.size + np.arange(CURVE_DEGREE)
+    travel = curve[-1] + 1 + np.arange(TRAVEL_DEGREES.size)
+    square, own_square = np.zeros((travel[-1] + 1, travel[-1] + 1)), np.zeros((units.size, waves.size, 2, 2))
+    product = np.zeros((units.size, 2, len(square)))  # with the residual, and with it times the direction
+    for k, own in enumerate(unit):
+        (place, value), direction = strokes.along(k), strokes.direction[k]
+        turn = 2 * np.pi * place[:, None] * waves / span
+        of_place = legvander(2 * (place - low) / (high - low) - 1, CURVE_DEGREE)[:, 1:]
+        of_travel = legvander(direction * _even(place), TRAVEL_DEGREES[-1])[:, TRAVEL_DEGREES]
+        every = np.column_stack([np.sin(turn), np.cos(turn), of_place, of_travel, value])
+        flat = _flattened(place, every)
+        gram = flat.T @ flat
+        square += gram[:-1, :-1]
+        own_square[own] += gram[pairs[:, :, None], pairs[:, None, :]]
+        product[own] += np.outer([1, direction], gram[-1, :-1])
+    peaks = []
+    by_travel = max(_explained(square, own, travel) for own in product.sum(axis=0))
+    for mode in range(min(np.unique(strokes.direction).size, 2)):
+        explained = partial(_explained, square, product[:, mode].sum(axis=0))
+        by_wave = np.array([explained(pair) for pair in pairs])
+        best = int(np.argmax(by_wave))
+        if by_wave[best] < max(WAVE_OF_CURVE * explained(curve), by_travel):
+            continue
+        amplitudes = np.linalg.pinv(own_square[:, best]) @ product[:, mode, pairs[best], None]
+        statistic, p = _mean_of_zero(amplitudes[:, :, 0])
+        amplitude = float(np.linalg.norm(amplitudes.mean(axis=0)))
+        length = span / _summit(waves, by_wave, best)
+        p *= 2 * waves.size  # wavelengths and modes
+        energy = amplitude**2 * unit.size
+        peaks.append(Peak("displacement_mm", length, mode == 0, True, statistic, p, amplitude, energy))
+    return peaks
+
+
+def _explained(square: np.ndarray, product: np.ndarray, columns: np.ndarray) -> float:
+    """Return the sum of squares that some columns explain, from the normal equations of all."""
+    own = product[columns]
+    return float(own @ np.linalg.pinv(square[np.ix_(columns, columns)], rcond=1e-9) @ own)
+
+
+def _mean_of_zero(numbers: np.ndarray) -> tuple[float, float]:
+    """Return F and p of Hotelling's test that the mean of n vectors of k numbers, (n, k), is zero."""
+    n, k = numbers.shape
+    mean = numbers.mean(axis=0)
+    statistic = float((n - k) / k * mean @ np.linalg.pinv(np.cov(numbers.T, ddof=0)) @ mean)
+    return statistic, float(fdtrc(k, n - k, statistic))
 
 
 def _coherence_p(statistic: float, units: int) -> float:
@@ -239,15 +321,24 @@ def _normal_equations(
     place: np.ndarray, value: np.ndarray, lengths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return `square`, `product` and `total` of a stroke of n samples, shape (n,), sorted by place."""
-    root = np.sqrt(np.hanning(place.size + 2)[1:-1])[:, None]
-    even = 2 * (place - place.mean()) / np.ptp(place)
-    trend, _ = np.linalg.qr(root * np.vander(even, 3))
     turn = 2 * np.pi * place[:, None] / lengths
-    columns = root * np.column_stack([np.sin(turn), np.cos(turn), value])
-    columns -= trend @ (trend.T @ columns)
+    columns = _flattened(place, np.column_stack([np.sin(turn), np.cos(turn), value]))
     waves, y = columns[:, :-1].reshape(place.size, 2, lengths.size), columns[:, -1]
     square = np.einsum("nim,njm->mij", waves, waves)
     return square, np.einsum("nim,n->mi", waves, y), float(y @ y)
+
+
+def _flattened(place: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return columns along a stroke, shape (n, k), weighted (Hann window) and without a parabola."""
+    root = np.sqrt(np.hanning(place.size + 2)[1:-1])[:, None]
+    trend, _ = np.linalg.qr(root * np.vander(_even(place), 3))
+    columns = root * columns
+    return columns - trend @ (trend.T @ columns)
+
+
+def _even(place: np.ndarray) -> np.ndarray:
+    """Return places along a stroke from -1 to 1 about their mean, shape (n,)."""
+    return 2 * (place - place.mean()) / np.ptp(place)
 
 
 def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tuple[float, float]:

@@ -82,6 +82,57 @@ def test_correlated_noise_is_not_a_ripple():
     assert np.mean(np.array(found) < 0.005) <= 0.04
 
 
+def short_strokes(seed=0, files=20, shape=None, each=0.0, back=False):
+    """Strokes of 10 mm that start at about 50 mm; `shape(place, travelled)` is in all, `each` is random."""
+    rng = np.random.default_rng(seed)
+    tables = []
+    for k in range(files):
+        direction = -1 if back and k % 2 else 1
+        travelled = np.linspace(0.0, 10.0, 200)
+        x = 50.0 + rng.normal(0, 0.2) + (travelled if direction > 0 else 10.0 - travelled)
+        force = rng.normal(0, 0.1, x.size)
+        for number in range(1, 6):  # a smooth shape of the file's own
+            force += each * rng.normal() * np.cos(np.pi * number * travelled / 10.0) / number**2
+        if shape is not None:
+            force += shape(x, travelled)
+        own = {"stroke_id": k, "unit": k, "direction": direction}
+        tables.append(
+            pd.DataFrame({**own, "displacement_mm": x, "time_s": travelled / 5.0, "residual_N": force})
+        )
+    return pd.concat(tables, ignore_index=True)
+
+
+@pytest.mark.parametrize("back", [False, True])
+@pytest.mark.parametrize("wavelength", [2.4, 3.1, 4.5])
+def test_a_wave_of_few_periods_per_stroke_is_found(wavelength, back):
+    samples = short_strokes(shape=lambda x, _: 0.2 * np.sin(2 * np.pi * x / wavelength), each=0.3, back=back)
+    peak = find_ripple(samples, common_phase=True)
+    assert (peak.axis, peak.common_phase, peak.sign_symmetric) == ("displacement_mm", True, True)
+    assert peak.wavelength == pytest.approx(wavelength, rel=0.03)
+    assert peak.p_value < 1e-6
+
+
+SMOOTH = {
+    "warming": lambda _, travelled: 2.0 * np.exp(-travelled / 2.0),
+    "the rest of a rise": lambda _, travelled: -np.exp(-travelled / 0.7),
+    "a step": lambda x, _: 0.5 * (x > 54.0),
+    "a bump": lambda x, _: 0.5 * np.exp(-0.5 * ((x - 56.0) / 0.8) ** 2),
+    "a slope that changes": lambda x, _: 0.3 * np.maximum(x - 54.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("back", [False, True])
+@pytest.mark.parametrize("shape", SMOOTH)
+def test_a_smooth_shape_of_all_strokes_is_no_wave(shape, back):
+    peak = find_ripple(short_strokes(shape=SMOOTH[shape], each=0.1, back=back), common_phase=True)
+    assert peak.p_value > 1e-3
+
+
+def test_smooth_shapes_of_files_seldom_look_like_a_wave():
+    found = [find_ripple(short_strokes(s, files=8, each=0.5), common_phase=True).p_value for s in range(60)]
+    assert np.mean(np.array(found) < 0.05) <= 0.1  # nominal 5 %
+
+
 def one_file(seed=0, amplitude=0.0):
     """Sixteen strokes of one file, forward and back in turn, at three speeds."""
     samples = make_samples(seed, 16, amplitude, directions=(1,))
