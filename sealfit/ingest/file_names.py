@@ -29,37 +29,43 @@ class TraceRef:
     `file` is relative to the campaign folder, with forward slashes. `channels` always holds `run_id`,
     `repeat`, `specimen_id` and the condition columns (day 0 may lack those other than the days), and where
     they are known `speed_set_mm_s` (magnitude), `load_N`, `started_at` (ISO 8601), `run_order`, `elapsed_h`
-    and the campaign's own channels. What is not known is not there.
+    and the campaign's own channels. What is not known is not there. `cut` says that the file may end within
+    a number.
     """
 
     file: str
     channels: Mapping[str, float | str]
+    cut: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Listing(Sequence[TraceRef]):
     """The trace files of a campaign, or some of them, in order.
 
-    `columns` hold the channels; `conditions` the condition of each file in words.
+    `columns` hold the channels; `conditions` the condition of each file in words; `cut` are the files that
+    may end within a number.
     """
 
     files: list[str]
     columns: Columns
     conditions: list[str]
+    cut: frozenset[str] = frozenset()
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __getitem__(self, i: int) -> TraceRef:
         known = ((name, column[i]) for name, column in self.columns.items())
-        return TraceRef(self.files[i], {name: value for name, value in known if value is not None})
+        channels = {name: value for name, value in known if value is not None}
+        return TraceRef(self.files[i], channels, self.files[i] in self.cut)
 
     def take(self, files: np.ndarray) -> Listing:
         """Return some of the files, by their numbers, with the columns in which any of them has a value."""
         chosen = files.tolist()
         columns = taken(self.columns, chosen)
         filled = {name: c for name, c in columns.items() if any(value is not None for value in c)}
-        return Listing([self.files[i] for i in chosen], filled, [self.conditions[i] for i in chosen])
+        own = [self.files[i] for i in chosen]
+        return Listing(own, filled, [self.conditions[i] for i in chosen], self.cut.intersection(own))
 
 
 # ---------------------------------------------------------------- names

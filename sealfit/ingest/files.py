@@ -7,6 +7,7 @@ import csv
 import os
 import re
 import stat
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -23,6 +24,8 @@ from sealfit.store.manifest import Fingerprint, fingerprint, fingerprint_of
 # fingerprint.
 
 _BLANK = b" \t\r\n\0"
+LINE_ENDS = b"\r\n\x1a"  # the last is DOS's end of a file
+MOST_CUT = 0.25  # Largest share of text files without a line end that are taken for cut: one of four.
 
 
 class Folder:
@@ -88,6 +91,40 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
         If it is missing, outside the campaign, no file, not readable or empty.
     """
     return _read(Folder(campaign).inside(file), file, HEAD_BYTES if head else None)[0]
+
+
+def cut_files(campaign: Path, texts: Sequence[str]) -> frozenset[str]:
+    """Return those of some text files that do not end with a line end although most do.
+
+    A copy that was broken off ends anywhere, and the part of a number is a number. Some programs write no
+    line end after the last line; all of their files lack it.
+    """
+    lacking = [file for file in texts if not _ends_a_line(os.path.join(campaign, file))]
+    return frozenset(lacking if len(lacking) <= MOST_CUT * len(texts) else ())
+
+
+def _ends_a_line(path: str) -> bool:
+    """Whether the last character of a file is a line end, in UTF-16, too; or it cannot be read."""
+    if not os.path.isfile(path):  # a pipe would be waited for
+        return True
+    try:
+        with open(path, "rb") as file:
+            file.seek(-2, os.SEEK_END)
+            return any(byte in LINE_ENDS for byte in file.read())
+    except OSError:
+        return True
+
+
+def whole_lines(text: bytes, file: str) -> tuple[bytes, Fault]:
+    """Return a text without its last line, which may end within a number, and the fault that says so."""
+    end = max(text.rfind(b"\n"), text.rfind(b"\r")) + 1
+    reason = "the last line has no line end, which most files here have: it may be cut within a number."
+    line = text.count(b"\n", 0, end) + 1
+    fix = "Copy the file again; if it is whole, end its last line."
+    fault = Fault(
+        "cut_file", reason, file=file, line=line, severity="warning", action="row left out", fix=fix
+    )
+    return text[:end], fault
 
 
 def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, os.stat_result]:

@@ -25,6 +25,7 @@ from sealfit.ingest.files import (
     read_bytes,
     refuse_marked_up,
     split_line,
+    whole_lines,
 )
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays
 from sealfit.ingest.trace_checks import speed_fault
@@ -102,7 +103,7 @@ def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list
     alike: dict[tuple, list[int]] = {}
     for i, (ref, raw) in enumerate(files):
         try:
-            opened.append(_Opened.of(raw, ref.file, config.trace))
+            opened.append(_Opened.of(raw, ref, config.trace))
             alike.setdefault(opened[i].alike, []).append(i)
         except BadFile as error:
             opened.append(error)
@@ -136,17 +137,21 @@ class _Opened:
     faults: tuple[Fault, ...] = ()
 
     @classmethod
-    def of(cls, raw: bytes, file: str, settings: TraceFormat) -> _Opened:
+    def of(cls, raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Opened:
+        file, faults = ref.file, ()
         if kind_of(file, settings) in OF_ARRAYS:
             found = read_arrays(raw, file, settings)
             layout, body, width = Layout(found.header, found.names, None, 0, 1), b"", len(found.columns)
             arrays, faults = found.columns, found.faults
         else:
             text, layout, settings = _text(raw, file, settings)
+            if ref.cut:
+                text, fault = whole_lines(text, file)
+                faults = (fault,)
             body = body_of(text, layout, settings, file)
             width = width_of(body, settings.delimiter)
             _refuse_narrow(layout, width, settings, file)
-            arrays, faults = (), ()
+            arrays = ()
         try:
             ours = locate(layout, len(layout.names) or width, settings, file)
         except BadFile as error:
@@ -191,11 +196,10 @@ def _cells(files: Sequence[str], opened: Sequence[_Opened]) -> list[Cells]:
     if not first.arrays:
         bodies = [(file, one.body) for file, one in zip(files, opened, strict=True)]
         return read_cells(bodies, first.layout, first.settings, first.numeric)
-    made = []
-    for file, one in zip(files, opened, strict=True):
-        cells = array_cells(one.arrays, one.numeric, one.settings, file)
-        made.append(replace(cells, faults=(*one.faults, *cells.faults)))
-    return made
+    return [
+        array_cells(one.arrays, one.numeric, one.settings, file)
+        for file, one in zip(files, opened, strict=True)
+    ]
 
 
 def _text(
@@ -238,7 +242,7 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
     if settings.compute or settings.keep is not None:
         named = name_parts(file, config.files, config.conversions("names")).values
         known = {**ref.channels, **named, **header_fields(layout.header, config)}
-    faults = list(cells.faults)
+    faults = [*opened.faults, *cells.faults]
     good = ~cells.bad
     first = settings.drop_first_rows
     counted = max(len(good) - first, 1)

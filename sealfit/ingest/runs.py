@@ -51,7 +51,8 @@ from sealfit.ingest.file_names import (
     names_speak,
     unmatched,
 )
-from sealfit.ingest.formats import require_libraries
+from sealfit.ingest.files import cut_files
+from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entries, list_entries
 from sealfit.ingest.reader import read_header, read_trace
 from sealfit.ingest.start_times import add_order, join_date_and_time
@@ -112,7 +113,8 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     columns = add_repeats(add_specimens(columns, conditions))
     faults += disagreements(entries, columns, conditions)
     _stop_at_errors(faults)
-    return Listing(entries.files, _set_speed(columns), conditions), faults
+    cut = cut_files(campaign, [file for file in entries.files if kind_of(file, config.trace) == "csv"])
+    return Listing(entries.files, _set_speed(columns), conditions, cut), faults
 
 
 def _kept(files: np.ndarray, entries: Entries, columns: Columns) -> tuple[Entries, Columns]:

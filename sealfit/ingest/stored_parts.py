@@ -236,7 +236,7 @@ def part_key(listing: Listing, hashes: Sequence[str | None], seen: str) -> str |
     """
     if None in hashes:
         return None
-    about = json.dumps([seen, listing.files, hashes, listing.columns])
+    about = json.dumps([seen, listing.files, hashes, listing.columns, sorted(listing.cut)])
     return hashlib.sha256(about.encode("utf-8", "surrogatepass")).hexdigest()[:20]
 
 

@@ -2,6 +2,7 @@
 
 import os
 import time
+from dataclasses import replace
 
 import pytest
 from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, read, refused, trace
@@ -9,7 +10,9 @@ from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, read
 from sealfit.config import load_config
 from sealfit.errors import CampaignError, ConfigError, Fault, grouped, told
 from sealfit.ingest.campaign import ingest_campaign
+from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
+from sealfit.ingest.stored_parts import part_key
 
 RUNS = """
 file,aging_days,speed_mm_s
@@ -254,3 +257,41 @@ def test_a_copy_is_no_second_measurement(tmp_path, how):
     assert fault.reason.startswith("holds the samples of a.csv")
     used = made.tables["steady"].loc[lambda t: t["used"], "file"].tolist()
     assert used == ["a.csv", "c.csv"]
+
+
+FIVE = "file,aging_days,temperature_C,compression_ratio_pct,speed_mm_s\n" + "".join(
+    f"{name}.csv,{day},60,80,5\n" for day, name in enumerate("abcde")
+)
+
+
+def written(tmp_path, runs, open_ended, encoding="utf-8"):
+    """Write the traces of a table of runs; those named do not end with a line end."""
+    campaign(tmp_path, runs)
+    for name in (line.split(",")[0] for line in runs.strip().splitlines()[1:]):
+        text = csv_of(ROWS).removesuffix("\n") + ("" if name in open_ended else "\n")
+        (tmp_path / name).write_bytes(text.encode(encoding))
+    listing, _ = list_traces(tmp_path, config())
+    return {ref.file: ref for ref in listing}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_a_file_that_was_cut_loses_its_last_line(tmp_path, encoding):
+    refs = written(tmp_path, FIVE, {"c.csv"}, encoding)
+    assert {file for file, ref in refs.items() if ref.cut} == {"c.csv"}
+    whole, cut = (read_trace(tmp_path, refs[file], config()) for file in ("b.csv", "c.csv"))
+    assert len(cut.line) == len(whole.line) - 1
+    (fault,) = cut.faults
+    assert (fault.check, fault.line, fault.action) == ("cut_file", len(ROWS) + 1, "row left out")
+    assert not whole.faults
+
+
+@pytest.mark.parametrize("open_ended", [set(), {"a.csv", "b.csv"}, {f"{name}.csv" for name in "abcde"}])
+def test_files_whose_program_ends_no_last_line_are_whole(tmp_path, open_ended):
+    assert not any(ref.cut for ref in written(tmp_path, FIVE, open_ended).values())
+
+
+def test_what_was_stored_of_a_file_is_read_again_when_others_show_that_it_was_cut(tmp_path):
+    written(tmp_path, FIVE, {"c.csv"})
+    listing, _ = list_traces(tmp_path, config())
+    hashes = ["0"] * len(listing)
+    assert part_key(listing, hashes, "") != part_key(replace(listing, cut=frozenset()), hashes, "")
