@@ -41,6 +41,12 @@ SAME_VALUE = 1e-3
 MOST_SET_VALUES = 50
 """A channel with more groups of values than this is used as measured, not as settings."""
 
+UNEQUAL_RUNS = 1e4
+"""Factor on the p-value of an F test against the scatter of runs, which need not scatter alike.
+
+With two or three runs per parameter the jackknife needs t above 10 where F has p = 1e-15.
+"""
+
 JACKKNIFE_UNITS = 30
 """Number of units from which the jackknife over units is used."""
 

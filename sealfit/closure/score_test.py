@@ -18,6 +18,7 @@ from sealfit.closure.criteria import (
     MANY_RUNS,
     PROMISING,
     TESTED_AGAINST_RUNS,
+    UNEQUAL_RUNS,
 )
 from sealfit.closure.small_sample_test import (
     ClusterTests,
@@ -252,13 +253,15 @@ class ScoreTests:
         log_p = float(log_p_of(score_statistic(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
         if units >= JACKKNIFE_UNITS:
-            explained = _log(chdtrc(left.shape[1], total @ total))
+            explained, against_runs = _log(chdtrc(left.shape[1], total @ total)), 0.0
             if level == "run" and explained < np.log(TESTED_AGAINST_RUNS):
                 test = self.cluster_tests["run"].test(left, target)
                 if test is not None and test.share > CONSTANT_IN_RUNS:
-                    explained = min(explained, test.log_p)
+                    against_runs = test.log_p
+                    explained = min(explained, against_runs)
             if explained < np.log(PROMISING):
                 jackknife = max(self._jackknife(left, level), explained)
+                jackknife = min(jackknife, against_runs + np.log(UNEQUAL_RUNS))
         return ScoreTestResult(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
     def _jackknife(self, left: np.ndarray, level: str) -> float:
