@@ -33,6 +33,8 @@ from sealfit.fit.joint.rows import Rows
 # ---------------------------------------------------------------- forms
 # The forms that are fitted for a candidate, and the grids of their nonlinear parameters.
 
+ADDED = ("force", "add")
+
 MOST_PLACES = 60  # Largest number of places of a jump on a grid.
 
 NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1}
@@ -91,7 +93,9 @@ def _terms_of_single(
     for effect in effects.values():
         if effect.periodic:
             continue
-        if target not in effect.acts_on or not _all_read(effect, channels, fitted.rows, effects):
+        viscous = name == "speed_mm_s" and effect.reads == (name,) and effect.acts_on == (ADDED,)
+        own = ADDED if viscous else target  # the search tests speed on mu and sigma_2 only
+        if own not in effect.acts_on or not _all_read(effect, channels, fitted.rows, effects):
             continue
         if effect.reads in READS_ANY and SECOND not in effect.reads:
             if not _may_follow(effect, channel, fitted):
@@ -102,7 +106,7 @@ def _terms_of_single(
         elif name in effect.reads:
             fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
             grids = grid_of(effect, np.abs(channel.values))
-            yield Term(effect, effect.reads, *target, fixed=fixed), grids
+            yield Term(effect, effect.reads, *own, fixed=fixed), grids
             # the search tests the factor only
             if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids

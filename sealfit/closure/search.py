@@ -100,10 +100,10 @@ def _shape_candidates(
     fitted, rows = tests.fitted, tests.fitted.rows
     if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
         return  # with few speeds a dependence on speed may be the Stribeck curve
-    both_ways = rows.speed.min() < 0 < rows.speed.max()
+    both_ways, loads = rows.speed.min() < 0 < rows.speed.max(), POWER in rows.table
     slopes, places = [], []
     for acts_on, operation in targets:
-        if not (_allowed(channel, acts_on, operation, both_ways) and _declared(fitted, acts_on)):
+        if not (_allowed(channel, acts_on, operation, both_ways, loads) and _declared(fitted, acts_on)):
             continue
         slope = fitted.slope(acts_on, operation)
         if np.abs(slope).max() > 0:
@@ -143,13 +143,13 @@ def _declared(fitted: Fitted, acts_on: str) -> bool:
     return acts_on not in needs or bool((fitted.model.declared.index[needs[acts_on]] >= 0).any())
 
 
-def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool) -> bool:
+def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool, loads: bool) -> bool:
     if channel.name == "direction":
         return both_ways
     if channel.grouping:
         return both_ways and (acts_on, operation) == ("force", "add")
-    if channel.name == "speed_mm_s":
-        return acts_on in ("mu", "a")  # mu_s, mu_c, v_s and sigma_2 describe the dependence on speed
+    if channel.name == "speed_mm_s":  # mu_s, mu_c, v_s and sigma_2 describe the dependence on it
+        return acts_on in (("mu", "a", "sigma_2") if loads else ("mu", "a"))
     return not (channel.name == "load_N" and acts_on == "force")
 
 

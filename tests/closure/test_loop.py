@@ -2,8 +2,9 @@ import json
 
 import numpy as np
 import numpy.testing as npt
+import pandas as pd
 import pytest
-from bins_helpers import make_bins, make_traces, warm
+from bins_helpers import LOAD_N, TRUE, make_bins, make_traces, warm
 
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
@@ -232,6 +233,31 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     assert not ends(1.1, left=0.8).gains("stroke", weak=True)
     assert ends(40.0, determined=~every).gains("stroke", weak=False)
     assert not ends(40.0, left=1.1, determined=~every).gains("stroke", weak=False)
+
+
+def of_two_loads(**options):
+    """Bins of a campaign at two loads, with a force of 0.001 N s^2/mm^2 times the square of the speed."""
+    tables = []
+    for load_N in (20.0, 60.0):
+
+        def force_at(table, force, load_N=load_N):
+            speed = table["speed_mm_s"].to_numpy()
+            viscous = TRUE["sigma_2"] * speed
+            return (force - viscous) * load_N / LOAD_N + viscous + 1e-3 * speed * np.abs(speed)
+
+        bins = make_bins(int(load_N), effect=force_at, **options)
+        names = {name: bins[name].astype(str) + f" {load_N:g} N" for name in ("file", "run_id")}
+        tables.append(bins.assign(load_N=load_N, **names))
+    return pd.concat(tables, ignore_index=True)
+
+
+@pytest.mark.parametrize("directions", [(1,), (1, -1)])
+def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load(directions):
+    bins = of_two_loads(temperatures=(60.0,), days=(4.0,), bins=4, directions=directions, **SCATTER)
+    (found,) = close(bins).document["effects"]
+    assert (found["id"], found["channels"][-1]) == ("power_viscous", "speed_mm_s")
+    values = {p["name"]: p["value"] for p in found["parameters"]}
+    assert values["n"] == pytest.approx(2.0, abs=0.3)
 
 
 def test_a_speed_held_out_of_three_is_not_determined_by_the_other_two():
