@@ -147,6 +147,18 @@ def test_a_rising_curve_through_three_speeds_does_not_start_with_friction_below_
     assert np.sqrt(np.mean(fitted.residual**2)) < 1e-3 * np.abs(rows.force).mean()
 
 
+def test_a_curve_that_one_series_shows_is_that_of_all_with_three_speeds():
+    """Files that scatter hide it in the other, whose line would be off by a tenth between its speeds."""
+    rows = rows_of(speeds=(1.9, 21.6, 245.0), temperatures=(60.0, 80.0), days=(4.0,), repeats=2, bins=4)
+    mu = 0.2 + 0.1 * np.exp(-((np.abs(rows.speed) / 30.0) ** 2))
+    scatter = np.where(rows.values("temperature_C") == 80.0, 0.4, 0.001)
+    files = np.random.default_rng(2).normal(0.0, 1.0, rows.groups.starts["file"].size)[rows.codes("file")]
+    rows = replace(rows, force=rows.load * mu * (1 + scatter * files) * np.sign(rows.speed))
+    noisy = "temperature_C=80, compression_ratio_pct=80"
+    assert declare(rows).stribeck[noisy] == "interpolated"
+    assert declare(rows.subset(rows.values("temperature_C") == 80.0)).stribeck[noisy] == "viscous"
+
+
 def test_a_straight_line_through_three_speeds_is_mostly_left_one():
     rows, forms = rows_of(speeds=(1.0, 8.0, 64.0), repeats=2, bins=4), []
     for seed in range(10):

@@ -28,6 +28,8 @@ DAYS_FOR_LAW = 3
 # P-value below which a line through three speeds is rejected. It is about that at which Akaike's criterion
 # takes one more number (0.157): a needless curve costs little, and a missing one a fifth of the force.
 REJECTED = 0.15
+# The same, times the number of series, for a curve in all series with three speeds.
+REJECTED_ELSEWHERE = 0.01
 # A residual sum of squares below this share of the total is rounding.
 ROUNDING = 1e-24
 
@@ -130,32 +132,38 @@ def series_of_curve(conditions, aging: bool) -> np.ndarray:
 
 
 def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
-    """Return the form of the speed dependence that the speeds of each series determine."""
+    """Return the form of the speed dependence that the speeds of each series determine.
+
+    With three speeds it is a line, unless a line is rejected in this series or, more surely, in another.
+    """
     number, names = pd.factorize(series_of)
     key = 2 * number[rows.condition] + (rows.speed > 0)
     order = np.argsort(key, kind="stable")
     ends = np.searchsorted(key[order], np.arange(2 * names.size + 1))
     levels = [tested_speeds(rows, order[first:last]).size for first, last in itertools.pairwise(ends)]
     most = np.reshape(levels, (names.size, 2)).max(axis=1)  # of the two directions
+    three = [k for k, m in enumerate(most) if SPEEDS_FOR_STRIBECK <= m < SPEEDS_BETWEEN]
+    p_values = {k: _p_of_lines(rows, np.flatnonzero(number[rows.condition] == k)) for k in three}
+    elsewhere = len(three) * min(p_values.values(), default=1.0) < REJECTED_ELSEWHERE
     forms = {}
     for k, (name, m) in enumerate(zip(names, most, strict=True)):
         if m >= SPEEDS_BETWEEN:
             forms[name] = "full"
-        elif m >= SPEEDS_FOR_STRIBECK and _curved(rows, np.flatnonzero(number[rows.condition] == k)):
+        elif k in p_values and (elsewhere or p_values[k] < REJECTED):
             forms[name] = "interpolated"
         else:
             forms[name] = "viscous" if m >= SPEEDS_FOR_VISCOUS else "constant"
     return forms
 
 
-def _curved(rows: Rows, chosen: np.ndarray) -> bool:
-    """Return whether friction at three speeds is no line that rises, by F tests on file means.
+def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
+    """Return the p-value of F tests on file means that friction at three speeds is a line that rises.
 
     A curve through three speeds leaves few degrees of freedom for other effects, so a line is kept if it is
     not rejected. As in the declared model its slope is not negative and shared by all conditions, each of
     which has its own level. The curve adds curvature that all share, and may add a slope of each condition
-    (mu_s less mu_c). The two directions count as repeats. Without a degree of freedom there is no test, and
-    the curve is taken.
+    (mu_s less mu_c). The two directions count as repeats. Without a degree of freedom there is no test; it is
+    0 then, and the curve is taken.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     nearest = np.abs(speed[:, None] - tested_speeds(rows, chosen)).argmin(axis=1)
@@ -179,7 +187,7 @@ def _curved(rows: Rows, chosen: np.ndarray) -> bool:
     curves = [np.column_stack([levels, slopes, bends]) for slopes in (slope, levels * slope)]
     tests = [_p_of_line(levels if falls else line, curve, files["mu"].to_numpy()) for curve in curves]
     p_values = [p for p in tests if p is not None]
-    return not p_values or len(p_values) * min(p_values) < REJECTED
+    return len(p_values) * min(p_values, default=0.0)
 
 
 def _p_of_line(line: np.ndarray, curve: np.ndarray, values: np.ndarray) -> float | None:
