@@ -1,7 +1,6 @@
 """What the README and docs/ show runs, and prints what they say."""
 
 import doctest
-import os
 import re
 import shlex
 import shutil
@@ -10,44 +9,20 @@ import sys
 from pathlib import Path
 
 import pytest
+from page_helpers import DOCS, ROOT, as_in_a_clone, console, has, run
 
 from sealfit.config import load_config, parse_config
 from sealfit.effects.user import load_user_effects
 
-ROOT = Path(__file__).resolve().parents[1]
-DOCS = ROOT / "docs"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.parent.name != "paper")
 WITH_RESULTS = ("notebook.md",)  # run where there are results of the sample campaign: tests/notebook
 EXAMPLES = [page for page in PAGES if ">>>" in page.read_text("utf-8") and page.name not in WITH_RESULTS]
 NAMES = {page: str(page.relative_to(DOCS)) for page in PAGES}
-FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 def blocks(page, language):
     """Return the fenced blocks of a language in a page."""
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
-
-
-def console(page):
-    """Return the commands of a page, each with the output that the page shows."""
-    indented = re.findall(r"(?:^    .*\n|^\n(?=    ))+", page.read_text("utf-8"), re.MULTILINE)
-    for block in indented:
-        for part in re.split(r"^    \$ ", block, flags=re.MULTILINE)[1:]:
-            command, _, output = part.partition("\n")
-            yield command, re.sub(r"^    ", "", output, flags=re.MULTILINE)
-
-
-def has(expected, printed):
-    """Whether an output is what a page shows; `...` stands for anything."""
-    return doctest.OutputChecker().check_output(expected, printed, FLAGS)
-
-
-def as_in_a_clone(folder):
-    """Put the sample data and the configs into a folder."""
-    for name in ("sample_data", "configs"):
-        (folder / name).symlink_to(ROOT / name)
-    shutil.copytree(ROOT / "sample_data" / "simulated", folder / "my_campaign")
-    return folder
 
 
 @pytest.fixture
@@ -64,18 +39,6 @@ def with_results(tmp_path_factory):
     return folder
 
 
-def run(command, folder):
-    """Run a command of a page with this Python's sealfit, and return what it prints on stdout."""
-    words = shlex.split(command)
-    programs = {"sealfit": ["-m", "sealfit"], "python": []}
-    if words[0] in programs:
-        words = [sys.executable, *programs[words[0]], *words[1:]]
-    path = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(words, cwd=folder, env=path, capture_output=True, text=True)
-    assert done.returncode in (0, 1), done.stderr
-    return done.stdout
-
-
 @pytest.mark.parametrize("page", EXAMPLES, ids=[NAMES[page] for page in EXAMPLES])
 def test_examples_print_what_they_say(page):
     failed, tried = doctest.testfile(str(page), module_relative=False, encoding="utf-8")
@@ -85,7 +48,7 @@ def test_examples_print_what_they_say(page):
 
 @pytest.mark.parametrize(
     ("name", "folder"),
-    [("tutorial", "desk"), ("how-to/enough-runs", "with_results"), ("how-to/properties", "desk")],
+    [("how-to/enough-runs", "with_results"), ("how-to/properties", "desk")],
 )
 def test_commands_print_what_they_say(name, folder, request):
     commands = list(console(DOCS / f"{name}.md"))

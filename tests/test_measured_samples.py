@@ -1,33 +1,41 @@
-"""The measured campaigns in sample_data: before and after, with tolerances (their READMEs describe them)."""
+"""The measured campaigns in sample_data: before and after, with tolerances (their READMEs describe them).
 
+The screw drives are those of the tutorial, whose commands make the results.
+"""
+
+import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+from page_helpers import DOCS, ROOT, as_in_a_clone, console, has, run
 
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
 from sealfit.engine.run_map import cores
 from sealfit.ingest.campaign import ingest_campaign
 
-ROOT = Path(__file__).parents[1]
-
-
-def close(campaign, config):
-    checked = load_config(ROOT / "configs" / config)
-    ingested = ingest_campaign(ROOT / "sample_data" / campaign, checked)
-    loop = close_loop(ingested.tables["bins"], ingested.tables["traces"], checked, workers=cores())
-    return ingested, loop
-
 
 @pytest.fixture(scope="module")
-def screwdrive():
-    return close("measured/screwdrive", "screwdrive.toml")
+def tutorial(tmp_path_factory):
+    """Every command of the tutorial with what the page shows and what it printed, and the results."""
+    folder = as_in_a_clone(tmp_path_factory.mktemp("tutorial"))
+    commands = [(command, shown, run(command, folder)) for command, shown in console(DOCS / "tutorial.md")]
+    return commands, folder / "results"
 
 
 @pytest.fixture(scope="module")
 def pneuseal():
-    return close("measured/pneuseal-repeats", "pneuseal.toml")
+    config = load_config(ROOT / "configs" / "pneuseal.toml")
+    tables = ingest_campaign(ROOT / "sample_data" / "measured" / "pneuseal-repeats", config).tables
+    return close_loop(tables["bins"], tables["traces"], config, workers=cores())
+
+
+def test_the_tutorial_prints_what_it_says(tutorial):
+    assert len(tutorial[0]) > 4
+    for command, shown, printed in tutorial[0]:
+        assert has(shown, printed), f"{command}\n{printed}"
 
 
 def rmse_runs(table, drive):
@@ -38,14 +46,14 @@ def rmse_runs(table, drive):
 @pytest.mark.parametrize(
     ("drive", "before", "after"), [("lead screw", 0.357, 0.047), ("worm", 0.482, 0.079)]
 )  # mN m: symmetric Eq. 14, and the same with a constant offset, by the folder's README
-def test_screw_drives_fall_at_least_as_far_as_a_constant_offset_takes_them(screwdrive, drive, before, after):
-    tables = screwdrive[1].tables
-    assert rmse_runs(tables["residuals_before"], drive) == pytest.approx(before, abs=0.005)
-    assert rmse_runs(tables["residuals_after"], drive) <= after + 0.0005
+def test_screw_drives_fall_at_least_as_far_as_a_constant_offset_takes_them(tutorial, drive, before, after):
+    tables = [pd.read_parquet(tutorial[1] / f"residuals_{stage}.parquet") for stage in ("before", "after")]
+    assert rmse_runs(tables[0], drive) == pytest.approx(before, abs=0.005)
+    assert rmse_runs(tables[1], drive) <= after + 0.0005
 
 
-def test_screw_drives_lack_an_offset_between_directions_and_ripple_once_a_turn(screwdrive):
-    document = screwdrive[1].document
+def test_screw_drives_lack_an_offset_between_directions_and_ripple_once_a_turn(tutorial):
+    document = json.loads((tutorial[1] / "closure.json").read_text("utf-8"))
     effects = {e["id"]: e for e in reversed(document["effects"])}
     offset = effects["zero_offset"]["parameters"][0]
     assert offset["unit"] == "mN m"
@@ -58,14 +66,15 @@ def test_screw_drives_lack_an_offset_between_directions_and_ripple_once_a_turn(s
     assert document["after"]["lack_of_fit_p"] is None  # no repeats
 
 
-def test_hand_edited_cells_of_the_worm_drive_are_named(screwdrive):
-    remarks = [f for f in screwdrive[0].faults if "remark" in f.reason]
-    assert {Path(f.file).name for f in remarks} == {"1.csv", "2.csv", "n1.csv"}
-    assert {str(f.value).split(",")[0] for f in remarks} == {"-1200", "-800", "-400"}
+def test_hand_edited_cells_of_the_worm_drive_are_named(tutorial):
+    quality = pd.read_parquet(tutorial[1] / "quality.parquet")
+    remarks = quality[quality["reason"].str.contains("remark")]
+    assert {Path(file).name for file in remarks["file"]} == {"1.csv", "2.csv", "n1.csv"}
+    assert {str(value).split(",")[0] for value in remarks["value"]} == {"-1200", "-800", "-400"}
 
 
 def test_pneumatic_seal_lacks_an_offset_run_in_and_ripples(pneuseal):
-    document = pneuseal[1].document
+    document = pneuseal.document
     effects = {e["id"]: e for e in reversed(document["effects"])}
     offset = effects["zero_offset"]["parameters"][0]
     assert offset["value"] == pytest.approx(3.1, abs=0.5)  # 1.2 to 4.4 N, by pressure and set-up
@@ -85,13 +94,13 @@ def test_pneumatic_seal_lacks_an_offset_run_in_and_ripples(pneuseal):
 
 
 def test_pneumatic_seal_has_an_offset_that_depends_on_the_set_up(pneuseal):
-    left = pneuseal[1].document["left"]  # reconnected 1 has half of it
+    left = pneuseal.document["left"]  # reconnected 1 has half of it
     assert (left["level"], left["channel"]) == ("run", "direction mounting")
     assert left["p_value"] > 0.005  # three mountings prove nothing
 
 
 def test_pneumatic_seal_has_no_stribeck_speed_and_no_effect_of_scatter_between_files(pneuseal):
-    closure = pneuseal[1]
+    closure = pneuseal
     assert set(closure.model["declared"]["stribeck"].values()) == {"constant"}
     for effect in closure.document["effects"]:
         assert (

@@ -209,7 +209,7 @@ def periodic_terms(
 ) -> Iterator[tuple[Term, dict, Candidate]]:
     """Yield the terms that a periodic component may be, each with its grid and a candidate."""
     rows = fitted.rows
-    effect = effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"]
+    effect = _near(effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"], peak)
     both = np.unique(np.sign(rows.speed)).size == 2
     targets = [("force", "add")] if peak.sign_symmetric else []
     if not both or not peak.sign_symmetric:
@@ -234,6 +234,16 @@ def periodic_terms(
                 (peak.axis,), *target, "file", np.empty((0, 0)), test_result, p_value=peak.p_value
             )
             yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
+
+
+def _near(effect: Effect, peak: Peak) -> Effect:
+    """Return a periodic effect with the wavelength bounded to a fifth about that of a peak."""
+    bounds = (0.8 * peak.wavelength, 1.25 * peak.wavelength)
+    parameters = [
+        replace(p, bounds=bounds, start=peak.wavelength) if p.name == "lambda_" else p
+        for p in effect.parameters
+    ]
+    return replace(effect, parameters=tuple(parameters))
 
 
 def reference(values: np.ndarray) -> float:

@@ -60,6 +60,9 @@ AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 LONG_WAVES = np.linspace(1.5, 4.5, 16)
 """Periods per median stroke that are tried for waves of few periods."""
 
+MAIN_LOBE = 2
+"""Periods per stroke about a wave in the model within which what is left of it is found again."""
+
 CURVE_DEGREE = 14
 """Degree of the Legendre series of a curve of the position; it resolves six periods."""
 
@@ -147,7 +150,7 @@ def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
     if units.size < LEAST_GROUPS_HELD_OUT:
         return []
     span, low, high = np.median(strokes.span), strokes.low.min(), (strokes.low + strokes.span).max()
-    waves = np.array([m for m in LONG_WAVES if all(abs(m - span / length) > 1 for length in known)])
+    waves = np.array([m for m in LONG_WAVES if all(abs(m - span / length) > MAIN_LOBE for length in known)])
     if not waves.size:
         return []
     pairs = np.arange(2 * waves.size).reshape(2, -1).T  # columns of each wave's sine and cosine

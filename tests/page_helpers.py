@@ -1,0 +1,68 @@
+"""Commands that pages of the documentation show, run in a folder that is like a clone."""
+
+import doctest
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+from sealfit.simulation import load_spec, simulate
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+OWN = """
+name = "my campaign"
+seed = 3
+[design]
+days = [2, 8]
+speeds_mm_s = [0.5, 2, 5, 20, 50]
+directions = [1, -1]
+repeats = 1
+max_rows = 150
+[[effects]]
+id = "zero_offset"
+acts_on = "force"
+operation = "add"
+parameters = { A = 3.0 }
+[[noise]]
+kind = "white"
+sd_N = 0.1
+"""
+
+
+def console(page):
+    """Return the commands of a page, each with the output that the page shows."""
+    indented = re.findall(r"(?:^    .*\n|^\n(?=    ))+", page.read_text("utf-8"), re.MULTILINE)
+    for block in indented:
+        for part in re.split(r"^    \$ ", block, flags=re.MULTILINE)[1:]:
+            command, _, output = part.partition("\n")
+            yield command, re.sub(r"^    ", "", output, flags=re.MULTILINE)
+
+
+def has(expected, printed):
+    """Whether an output is what a page shows; `...` stands for anything."""
+    return doctest.OutputChecker().check_output(expected, printed, FLAGS)
+
+
+def as_in_a_clone(folder):
+    """Put the sample data, the configs and a small campaign into a folder."""
+    for name in ("sample_data", "configs"):
+        (folder / name).symlink_to(ROOT / name)
+    (folder / "spec.toml").write_text(OWN, "utf-8")
+    simulate(load_spec(folder / "spec.toml"), folder / "my_campaign")
+    return folder
+
+
+def run(command, folder):
+    """Run a command of a page with this Python's sealfit, and return what it prints on stdout."""
+    words = shlex.split(command)
+    programs = {"sealfit": ["-m", "sealfit"], "python": []}
+    if words[0] in programs:
+        words = [sys.executable, *programs[words[0]], *words[1:]]
+    path = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, cwd=folder, env=path, capture_output=True, text=True)
+    assert done.returncode in (0, 1), done.stderr
+    return done.stdout
