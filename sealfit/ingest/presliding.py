@@ -64,6 +64,15 @@ UNLIKELY = 10.0
 LONGER = 3.0
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0
+# Parts of equal rows into which a steady window is cut to see whether it begins within a transient, and how
+# many of the first may be left out: a longer change is an effect.
+PARTS, MOST_PARTS = 20, 2
+# Parts after these to which the parabola is fitted with which they are compared.
+COMPARED = 8
+# Standard errors by which the first part may be off. By chance one window of two thousand is beyond.
+OFF = 8.0
+# Share of the force below which it is not off, whatever the noise: less than specimens scatter by.
+NEGLIGIBLE = 2e-3
 
 
 class Start(NamedTuple):
@@ -396,3 +405,24 @@ def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> float:
         bend = before - 2.0 * here + after
         step = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
     return float(lengths_mm[best] * (lengths_mm[1] / lengths_mm[0]) ** step)
+
+
+def transient_rows(force_N: np.ndarray) -> int:
+    """Return how many of the first rows of a steady window are a transient that the law did not reach.
+
+    The force of n rows is cut into parts. A first part whose mean is far off the parabola through later ones
+    is left out, with the second if that is off, too: a rise or an overshoot of a few samples at a high speed
+    is not fitted, and an effect of so short a distance could not be told from it.
+    """
+    size = len(force_N) // PARTS
+    if size < 1:
+        return 0
+    means = force_N[: size * PARTS].reshape(PARTS, size).mean(axis=1)
+    powers = np.vander(np.arange(MOST_PARTS + COMPARED, dtype=float), 3)
+    later = slice(MOST_PARTS, MOST_PARTS + COMPARED)
+    inverse = np.linalg.pinv(powers[later])
+    residual = means[: len(powers)] - powers @ (inverse @ means[later])
+    spread = np.sqrt(np.sum(residual[later] ** 2) / (COMPARED - 3))
+    error = spread * np.sqrt(1.0 + ((powers[:MOST_PARTS] @ inverse) ** 2).sum(axis=1))
+    off = np.abs(residual[:MOST_PARTS]) > np.maximum(OFF * error, NEGLIGIBLE * abs(float(means.mean())))
+    return size * int(np.count_nonzero(np.logical_and.accumulate(off)))

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import chdtrc
 
-from sealfit.ingest.presliding import Rise, Start, rise_of
+from sealfit.ingest.presliding import Rise, Start, rise_of, transient_rows
 from sealfit.ingest.segments import median, stretches, weighted_median
 
 # Share of the plateau speed below which the platform rests. A ripple of the speed stays above it.
@@ -121,6 +121,7 @@ def steady_window(
             distance = _distance(time_s[rows], along_mm[rows], begin - still, 0 if blurred else half)
             rise = rise_of(Start(distance, force_N[rows], begin - still))
             begin = max(begin, still + _rows_of(rise, distance))
+            begin += transient_rows(force_N[begin:end] - rise.at(distance[begin - still :]))
             steady[begin:end] = True
             left[begin:end] = rise.at(distance[begin - still :])
             length = rise.length_mm

@@ -7,7 +7,7 @@ from scipy.ndimage import uniform_filter1d
 
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.presliding import Start, _before, rise_of
+from sealfit.ingest.presliding import Start, _before, rise_of, transient_rows
 from sealfit.ingest.strokes import find_strokes
 
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
@@ -167,3 +167,33 @@ def test_times_with_long_gaps_are_no_fault_of_the_program(seed):
     force = 10.0 * (1.0 - np.exp(-(displacement - displacement[0]) / rng.uniform(0.1, 5.0)))
     for stroke in find_strokes(time, displacement, force + rng.normal(0.0, 0.1, len(time)), Strokes()):
         assert np.isfinite(stroke.speed_mm_s)
+
+
+def window(shape, n=200, seed=0):
+    """Return the force of a steady window of n rows along a share from 0 to 1 of its length, with noise."""
+    share = np.linspace(0.0, 1.0, n)
+    return 30.0 + shape(share) + np.random.default_rng(seed).normal(0.0, NOISE, n)
+
+
+@pytest.mark.parametrize(("size", "rows"), [(4.0, 10), (-4.0, 10), (40.0, 20)])
+def test_a_transient_at_the_beginning_of_a_window_is_left_out(size, rows):
+    assert transient_rows(window(lambda x: size * np.exp(-x / 0.03))) == rows
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        lambda x: 2.0 * np.exp(-x / 0.25),  # warming
+        lambda x: 2.0 * x - x**2,
+        lambda x: np.sin(2 * np.pi * x / 0.3),  # a ripple
+        lambda x: np.where(x > 0.5, 2.0, 0.0),
+    ],
+)
+def test_what_changes_along_a_stroke_stays_in_its_window(shape):
+    assert transient_rows(window(shape)) == 0
+
+
+def test_noise_is_seldom_a_transient():
+    white = [transient_rows(window(np.zeros_like, seed=seed)) for seed in range(3000)]
+    assert np.count_nonzero(white) <= 6  # 1.5 are expected
+    assert transient_rows(np.full(200, 30.0)) == transient_rows(np.full(12, 30.0)) == 0
