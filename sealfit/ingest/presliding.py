@@ -69,10 +69,9 @@ FAR = 200.0
 PARTS, MOST_PARTS = 20, 2
 # Parts after these to which the parabola is fitted with which they are compared.
 COMPARED = 8
-# Standard errors by which the first part may be off. By chance one window of two thousand is beyond.
-OFF = 8.0
-# Share of the force below which it is not off, whatever the noise: less than specimens scatter by.
-NEGLIGIBLE = 2e-3
+# Standard errors, and share of the force, by which the first part must be off, one pair or the other. What
+# warming leaves beside the parabola in a stroke of low noise reaches 10 standard errors and 2 % of the force.
+OFF = ((20.0, 0.002), (8.0, 0.1))
 
 
 class Start(NamedTuple):
@@ -424,5 +423,6 @@ def transient_rows(force_N: np.ndarray) -> int:
     residual = means[: len(powers)] - powers @ (inverse @ means[later])
     spread = np.sqrt(np.sum(residual[later] ** 2) / (COMPARED - 3))
     error = spread * np.sqrt(1.0 + ((powers[:MOST_PARTS] @ inverse) ** 2).sum(axis=1))
-    off = np.abs(residual[:MOST_PARTS]) > np.maximum(OFF * error, NEGLIGIBLE * abs(float(means.mean())))
+    level, size_N = abs(float(means.mean())), np.abs(residual[:MOST_PARTS])
+    off = np.any([size_N > np.maximum(k * error, share * level) for k, share in OFF], axis=0)
     return size * int(np.count_nonzero(np.logical_and.accumulate(off)))

@@ -175,9 +175,10 @@ def window(shape, n=200, seed=0):
     return 30.0 + shape(share) + np.random.default_rng(seed).normal(0.0, NOISE, n)
 
 
-@pytest.mark.parametrize(("size", "rows"), [(4.0, 10), (-4.0, 10), (40.0, 20)])
-def test_a_transient_at_the_beginning_of_a_window_is_left_out(size, rows):
-    assert transient_rows(window(lambda x: size * np.exp(-x / 0.03))) == rows
+@pytest.mark.parametrize("size", [10.0, -10.0, 20.0])
+@pytest.mark.parametrize(("length", "rows"), [(0.01, 10), (0.04, 20)])
+def test_a_transient_at_the_beginning_of_a_window_is_left_out(size, length, rows):
+    assert 0 < transient_rows(window(lambda x: size * np.exp(-x / length))) <= rows
 
 
 @pytest.mark.parametrize(
@@ -195,5 +196,5 @@ def test_what_changes_along_a_stroke_stays_in_its_window(shape):
 
 def test_noise_is_seldom_a_transient():
     white = [transient_rows(window(np.zeros_like, seed=seed)) for seed in range(3000)]
-    assert np.count_nonzero(white) <= 6  # 1.5 are expected
+    assert not any(white)  # 0.02 are expected
     assert transient_rows(np.full(200, 30.0)) == transient_rows(np.full(12, 30.0)) == 0
