@@ -4,6 +4,7 @@ A shell starts what it puts in the background with Ctrl-C ignored; tests that se
 they run.
 """
 
+import os
 import signal
 
 from sealfit.engine import one_thread
@@ -15,3 +16,8 @@ from hypothesis import settings  # noqa: E402
 
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+
+
+def pytest_xdist_auto_num_workers():
+    """Return a number above that of cores: some tests wait, for a killed worker, a port or a browser."""
+    return len(os.sched_getaffinity(0)) + 1 if hasattr(os, "sched_getaffinity") else None

@@ -31,14 +31,6 @@ def desk(tmp_path):
     return as_in_a_clone(tmp_path)
 
 
-@pytest.fixture(scope="module")
-def with_results(tmp_path_factory):
-    """The same with the results of the sample campaign, as several pages show these."""
-    folder = as_in_a_clone(tmp_path_factory.mktemp("docs"))
-    run("sealfit run sample_data/simulated --out results", folder)
-    return folder
-
-
 @pytest.mark.parametrize("page", EXAMPLES, ids=[NAMES[page] for page in EXAMPLES])
 def test_examples_print_what_they_say(page):
     failed, tried = doctest.testfile(str(page), module_relative=False, encoding="utf-8")
@@ -46,15 +38,9 @@ def test_examples_print_what_they_say(page):
     assert not failed
 
 
-@pytest.mark.parametrize(
-    ("name", "folder"),
-    [("how-to/enough-runs", "with_results"), ("how-to/properties", "desk")],
-)
-def test_commands_print_what_they_say(name, folder, request):
-    commands = list(console(DOCS / f"{name}.md"))
-    assert commands
-    for command, expected in commands:
-        printed = run(command, request.getfixturevalue(folder))
+def test_the_commands_about_properties_print_what_they_say(desk):
+    for command, expected in console(DOCS / "how-to" / "properties.md"):
+        printed = run(command, desk)
         assert has(expected, printed), f"{command}\n{printed}"
 
 
@@ -67,14 +53,6 @@ def test_the_commands_of_the_readme_for_your_own_data_run(desk):
     assert "verdict     closed" in printed
     (code,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert run(f"python -c {shlex.quote(code)}", desk) == ""
-
-
-def test_the_readme_shows_what_make_demo_prints(with_results):
-    text = (ROOT / "README.md").read_text("utf-8")
-    shown = re.findall(r"^    ((?:verdict|   |error|noise).*)$", text, re.MULTILINE)
-    assert len(shown) == 4
-    printed = run("sealfit run sample_data/simulated --out results", with_results)
-    assert all(line in printed for line in shown)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES.get)

@@ -251,9 +251,8 @@ def of_two_loads(**options):
     return pd.concat(tables, ignore_index=True)
 
 
-@pytest.mark.parametrize("directions", [(1,), (1, -1)])
-def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load(directions):
-    bins = of_two_loads(temperatures=(60.0,), days=(4.0,), bins=4, directions=directions, **SCATTER)
+def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load():
+    bins = of_two_loads(temperatures=(60.0,), days=(4.0,), bins=3, **SCATTER)
     (found,) = close(bins).document["effects"]
     assert (found["id"], found["channels"][-1]) == ("power_viscous", "speed_mm_s")
     values = {p["name"]: p["value"] for p in found["parameters"]}

@@ -7,13 +7,13 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from page_helpers import DOCS, ROOT, console, has, run
 
 import sealfit
 from sealfit import commands
@@ -23,8 +23,7 @@ from sealfit.notebook.plots import Plots
 from sealfit.report.summary_lines import lifetime_lines
 from sealfit.store.out_folder import Store
 
-ROOT = Path(__file__).resolve().parents[2]
-TUTORIAL = ROOT / "docs" / "tutorial.ipynb"
+TUTORIAL = DOCS / "tutorial.ipynb"
 CONDITION = "temperature_C=60, compression_ratio_pct=80, aging_days=4"
 FIGURES = sorted(
     name for name, _ in inspect.getmembers(Plots, inspect.isfunction) if not name.startswith("_")
@@ -76,6 +75,13 @@ def out(tutorial):
 
 
 @pytest.fixture(scope="module")
+def clone(tutorial, out):
+    """The folder of the tutorial with its results where pages of the documentation have them."""
+    (tutorial[1] / "results").symlink_to(out)
+    return tutorial[1]
+
+
+@pytest.fixture(scope="module")
 def results(out):
     return sealfit.open(str(out))
 
@@ -114,10 +120,23 @@ def test_the_tutorial_is_kept_without_what_it_shows():
     assert all(not cell.outputs and cell.execution_count is None for cell in code)
 
 
-def test_the_page_about_notebooks_prints_what_it_says(tutorial, out, monkeypatch):
-    page, known = ROOT / "docs" / "how-to" / "notebook.md", {}
-    monkeypatch.chdir(tutorial[1])
-    Path("results").symlink_to(out)
+def test_the_page_about_enough_runs_prints_what_it_says(clone):
+    for command, expected in console(DOCS / "how-to" / "enough-runs.md"):
+        printed = run(command, clone)
+        assert has(expected, printed), f"{command}\n{printed}"
+
+
+def test_the_readme_shows_what_make_demo_prints(clone):
+    text = (ROOT / "README.md").read_text("utf-8")
+    shown = re.findall(r"^    ((?:verdict|   |error|noise).*)$", text, re.MULTILINE)
+    assert len(shown) == 4
+    printed = run("sealfit run sample_data/simulated --out results", clone)
+    assert all(line in printed for line in shown)
+
+
+def test_the_page_about_notebooks_prints_what_it_says(clone, monkeypatch):
+    page, known = DOCS / "how-to" / "notebook.md", {}
+    monkeypatch.chdir(clone)
     (block,) = re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
     exec(block, known)
     failed, tried = doctest.testfile(str(page), module_relative=False, encoding="utf-8", globs=known)
