@@ -121,9 +121,10 @@ def steady_window(
             distance = _distance(time_s[rows], along_mm[rows], begin - still, 0 if blurred else half)
             rise = rise_of(Start(distance, force_N[rows], begin - still))
             begin = max(begin, still + _rows_of(rise, distance))
-            begin += transient_rows(force_N[begin:end] - rise.at(distance[begin - still :]))
+            settled = force_N[begin:end] - rise.at(distance[begin - still :])
+            begin, end = begin + transient_rows(settled), end - transient_rows(settled[::-1])
             steady[begin:end] = True
-            left[begin:end] = rise.at(distance[begin - still :])
+            left[begin:end] = rise.at(distance[begin - still : end - still])
             length = rise.length_mm
             near = first + np.flatnonzero(fast[first:last])
             rows = slice(near[0], near[-1] + 1)
