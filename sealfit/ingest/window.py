@@ -122,7 +122,10 @@ def steady_window(
             rise = rise_of(Start(distance, force_N[rows], begin - still))
             begin = max(begin, still + _rows_of(rise, distance))
             settled = force_N[begin:end] - rise.at(distance[begin - still :])
-            begin, end = begin + transient_rows(settled), end - transient_rows(settled[::-1])
+            off = transient_rows(settled)
+            begin += off
+            if off:  # a subtracted inertia errs at both ends
+                end -= transient_rows(settled[::-1])
             steady[begin:end] = True
             left[begin:end] = rise.at(distance[begin - still : end - still])
             length = rise.length_mm
