@@ -66,3 +66,16 @@ def run(command, folder):
     done = subprocess.run(words, cwd=folder, env=path, capture_output=True, text=True)
     assert done.returncode in (0, 1), done.stderr
     return done.stdout
+
+
+def ran(page, folder):
+    """Run every command of a page in a folder; return each with what the page shows and what it printed."""
+    commands = list(console(page))
+    assert commands
+    return [(command, shown, run(command, folder)) for command, shown in commands]
+
+
+def assert_as_shown(commands):
+    """Fail where a command that `ran` printed something else than its page shows."""
+    for command, shown, printed in commands:
+        assert has(shown, printed), f"{command}\n{printed}"

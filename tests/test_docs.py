@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from page_helpers import DOCS, ROOT, as_in_a_clone, console, has, run
+from page_helpers import DOCS, ROOT, as_in_a_clone, assert_as_shown, ran, run
 
 from sealfit.config import load_config, parse_config
 from sealfit.effects.user import load_user_effects
@@ -39,9 +39,7 @@ def test_examples_print_what_they_say(page):
 
 
 def test_the_commands_about_properties_print_what_they_say(desk):
-    for command, expected in console(DOCS / "how-to" / "properties.md"):
-        printed = run(command, desk)
-        assert has(expected, printed), f"{command}\n{printed}"
+    assert_as_shown(ran(DOCS / "how-to" / "properties.md", desk))
 
 
 def test_the_commands_of_the_readme_for_your_own_data_run(desk):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from page_helpers import DOCS, ROOT, as_in_a_clone, console, has, run
+from page_helpers import DOCS, ROOT, as_in_a_clone, assert_as_shown, ran
 
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
@@ -21,8 +21,7 @@ from sealfit.ingest.campaign import ingest_campaign
 def tutorial(tmp_path_factory):
     """Every command of the tutorial with what the page shows and what it printed, and the results."""
     folder = as_in_a_clone(tmp_path_factory.mktemp("tutorial"))
-    commands = [(command, shown, run(command, folder)) for command, shown in console(DOCS / "tutorial.md")]
-    return commands, folder / "results"
+    return ran(DOCS / "tutorial.md", folder), folder / "results"
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +33,7 @@ def pneuseal():
 
 def test_the_tutorial_prints_what_it_says(tutorial):
     assert len(tutorial[0]) > 4
-    for command, shown, printed in tutorial[0]:
-        assert has(shown, printed), f"{command}\n{printed}"
+    assert_as_shown(tutorial[0])
 
 
 def rmse_runs(table, drive):

@@ -597,7 +597,7 @@ MOMENTS_PER_STEP = 14  # files written and moved, folders synced
 def test_a_kill_at_any_moment_leaves_complete_tables(out, campaign):
     do_all(out, campaign, rows=2)
     reached_end = []
-    for at in range(1, MOMENTS_PER_STEP * len(STEPS) + 2, 9):
+    for at in range(1, MOMENTS_PER_STEP * len(STEPS) + 2, 5):
         (campaign / "a.csv").write_text(f"changed before kill {at}")
         program = KILLED.format(tests=str(HERE), out=str(out), campaign=str(campaign), at=at)
         run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

@@ -211,7 +211,7 @@ def periodic_terms(
     rows = fitted.rows
     effect = _near(effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"], peak)
     both = np.unique(np.sign(rows.speed)).size == 2
-    targets = [("force", "add")] if peak.sign_symmetric else []
+    targets = [ADDED] if peak.sign_symmetric else []
     if not both or not peak.sign_symmetric:
         targets += [("mu", "multiply"), ("force", "multiply")]
     fixed: dict = {"x_ref": 0.0}

@@ -412,7 +412,7 @@ def transient_rows(force_N: np.ndarray) -> int:
     The force of n rows is cut into parts. A first part whose mean is far off the parabola through later ones
     is left out, with the second if that is off, too: a rise or an overshoot of a few samples at a high speed
     is not fitted, and an effect of so short a distance could not be told from it. Of the reversed force it is
-    the number of last rows, in which the platform brakes.
+    the number of last rows.
     """
     size = len(force_N) // PARTS
     if size < 1:

@@ -124,7 +124,7 @@ def steady_window(
             settled = force_N[begin:end] - rise.at(distance[begin - still :])
             off = transient_rows(settled)
             begin += off
-            if off:  # a subtracted inertia errs at both ends
+            if off:  # the force of inertia that was subtracted errs at both ends
                 end -= transient_rows(settled[::-1])
             steady[begin:end] = True
             left[begin:end] = rise.at(distance[begin - still : end - still])

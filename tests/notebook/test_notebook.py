@@ -13,7 +13,7 @@ import numpy.testing as npt
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from page_helpers import DOCS, ROOT, console, has, run
+from page_helpers import DOCS, ROOT, assert_as_shown, ran, run
 
 import sealfit
 from sealfit import commands
@@ -121,9 +121,7 @@ def test_the_tutorial_is_kept_without_what_it_shows():
 
 
 def test_the_page_about_enough_runs_prints_what_it_says(clone):
-    for command, expected in console(DOCS / "how-to" / "enough-runs.md"):
-        printed = run(command, clone)
-        assert has(expected, printed), f"{command}\n{printed}"
+    assert_as_shown(ran(DOCS / "how-to" / "enough-runs.md", clone))
 
 
 def test_the_readme_shows_what_make_demo_prints(clone):
