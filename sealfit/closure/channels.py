@@ -20,6 +20,7 @@ from sealfit.closure.criteria import (
     MANY_RUNS,
     MOST_LEVELS,
     MOST_SET_VALUES,
+    MOST_WITHIN_RUNS,
     SAME_VALUE,
     SHORT_STROKES,
 )
@@ -166,6 +167,21 @@ def level_values(values: np.ndarray, rows: Rows) -> np.ndarray:
     """Return numbers as their means in the groups of the level at which they vary."""
     level = unit_of(values, rows)
     return values if level == "sample" else rows.groups.means(values, level)[rows.codes(level)]
+
+
+def run_means(channel: Channel, rows: Rows) -> Channel | None:
+    """Return a channel as its means over runs if it differs little within them; None otherwise.
+
+    Repeats are more precise than runs are alike, so the columns of a channel that varies within runs are
+    tested mostly within them. A step between two runs is not seen there.
+    """
+    finer = FINER["sample"] < FINER[channel.unit] < FINER["run"]
+    if not (channel.numeric and finer):
+        return None
+    means = rows.groups.means(channel.values, "run")[rows.codes("run")]
+    if np.mean((channel.values - means) ** 2) > MOST_WITHIN_RUNS * np.var(channel.values):
+        return None
+    return replace(channel, values=means, unit="run")
 
 
 def settings(values: np.ndarray) -> np.ndarray:

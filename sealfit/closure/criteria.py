@@ -35,6 +35,9 @@ CONSTANT_SHARE = 1e-4
 Measured speeds of one setting differ by 1e-5 to 1e-3 of their value; settings differ by 10 % and more.
 """
 
+MOST_WITHIN_RUNS = 0.1
+"""Largest share of a channel's variance within runs with which its means over runs are tested too."""
+
 SAME_VALUE = 1e-3
 """Values closer than this share of the channel's scaled range are one setting that was measured twice."""
 

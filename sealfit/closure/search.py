@@ -16,6 +16,7 @@ from sealfit.closure.channels import (
     flip_level,
     free_columns,
     kinks,
+    run_means,
     scatter_level,
     shifted_from_zero,
     unit_of,
@@ -87,6 +88,8 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
     if channel.name == "elapsed_h" and DAY_AND_NIGHT.shown_by(channel.values):
         angle = 2 * np.pi * channel.values[:, None] / DAY_H
         yield from _shape_candidates(tests, channel, np.hstack([np.cos(angle), np.sin(angle)]), MAIN_TARGETS)
+    if means := run_means(channel, rows):
+        yield from channel_candidates(tests, means)
 
 
 def _shape_candidates(

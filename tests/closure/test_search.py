@@ -2,7 +2,15 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.channels import ALONG_STROKES, find_channels, flip_level, free_columns, searched, unit_of
+from sealfit.closure.channels import (
+    ALONG_STROKES,
+    find_channels,
+    flip_level,
+    free_columns,
+    run_means,
+    searched,
+    unit_of,
+)
 from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
 from sealfit.effects import EFFECTS
@@ -184,6 +192,29 @@ def test_a_wave_with_the_time_of_day_has_a_test_of_its_own(hours):
 )
 def test_a_change_with_the_time_of_day_needs_two_days_of_tests(hours, shown):
     assert EFFECTS["day_and_night"].shown_by(hours) == shown
+
+
+@pytest.mark.parametrize("late", [0.0, 0.05])
+def test_a_step_between_runs_is_seen_although_repeats_are_far_more_precise(late):
+    def recalibrated(table, force):
+        return force * (1 + late * (table["elapsed_h"].to_numpy() > 60.0))
+
+    bins = make_bins(bins=4, noise_N=0.02, gain=0.0002, repeats=2, run_channels=WEEK, effect=recalibrated)
+    rows = make_rows(bins.assign(elapsed_h=bins["elapsed_h"] + 3.0 * bins["repeat"]), has_aging=True)
+    assert {c.name: c.unit for c in find_channels(rows)}["elapsed_h"] == "file"
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    assert any(c.p_value < 0.001 for c in found if c.channels == ("elapsed_h",)) == (late > 0)
+
+
+def test_means_of_runs_are_tested_only_where_they_hold_most_of_a_channel():
+    bins = make_bins(bins=4, repeats=2, run_channels=WEEK)
+    rows = make_rows(bins.assign(elapsed_h=bins["elapsed_h"] + 3.0 * bins["repeat"]), has_aging=True)
+    channels = {c.name: c for c in find_channels(rows)}
+    means = run_means(channels["elapsed_h"], rows)
+    assert unit_of(means.values, rows) == means.unit == "run"
+    assert run_means(channels["repeat"], rows) is None
+    assert run_means(channels["time_s"], rows) is None
+    assert run_means(channels["speed_mm_s"], rows) is None
 
 
 def test_a_short_part_of_the_campaign_is_found_by_the_finer_shape():
