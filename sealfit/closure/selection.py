@@ -28,7 +28,7 @@ from sealfit.closure.search import (
     search_pairs,
 )
 from sealfit.effects.contract import Effect
-from sealfit.fit.joint.estimate import Fitted, fit, fit_declared
+from sealfit.fit.joint.estimate import Fitted, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter
@@ -238,7 +238,9 @@ class _Loop:
         )
         added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
-        self.fitted, self.added = _remove_redundant(fit(own.model, self.rows, own.scatter, turns=2), added)
+        self.fitted, self.added = _remove_redundant(
+            fit_with_effects(own.model, self.rows, own.scatter, self.fitted), added
+        )
         # A removed effect is not added again.
         self.refused |= {a.proposal.source for a in added if all(a is not k for k in self.added)}
 

@@ -8,7 +8,7 @@ import pytest
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
 from sealfit.fit.joint.declared import declare, speed_clusters
-from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint.estimate import fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
 from sealfit.fit.joint.rows import make_rows, thin
 from sealfit.fit.joint.start import start_model
@@ -284,3 +284,32 @@ def test_the_force_depends_on_the_speed_of_the_bin_and_the_channel_stays_that_of
     npt.assert_array_equal(rows.values("speed_mm_s"), make_rows(bins, has_aging=True).speed)
     assert "speed_bin_mm_s" not in rows.channels
     npt.assert_array_equal(rows.subset(rows.days > 0).pace, rows.pace[rows.days > 0])
+
+
+def curves_of_their_own(seed):
+    """Specimens that differ by 10 % in v_s and 2 % in F_s, and viscous friction in one direction only."""
+    rng, own = np.random.default_rng(seed), {}
+
+    def force_of(table, force):
+        v_s, gain = own.setdefault(table["specimen_id"].iloc[0], np.exp(rng.normal(0.0, (0.1, 0.02))))
+        true, day = bins_helpers.TRUE, table["aging_days"].iloc[0]
+        speed, sign = np.abs(table["speed_mm_s"].iloc[0]), np.sign(force)
+        mu_s = gain * (true["mu_s0"] - true["a_s"] * np.log1p(day / true["b_s"]))
+        mu_c = true["mu_c0"] - true["a_c"] * np.log1p(day / true["b_c"])
+        mu = mu_c + (mu_s - mu_c) * np.exp(-((speed / (v_s * true["v_s"])) ** 2))
+        return sign * (bins_helpers.LOAD_N * mu + true["sigma_2"] * speed * (1 - sign))
+
+    return force_of
+
+
+def test_an_effect_lowers_the_error_although_the_scatter_of_specimens_is_of_another_kind():
+    speeds = tuple(np.geomspace(1.0, 100.0, 5))
+    both = {"directions": (1, -1), "speeds": speeds, "days": (1.0, 2.0, 4.0, 8.0, 16.0), "repeats": 1}
+    rows = rows_of(bins=4, noise_N=0.02, gain=0.003, effect=curves_of_their_own(5), **both)
+    before = fit_declared(rows)
+    term = Term(EFFECTS["asymmetry"], ("direction",), "sigma_2", "add")
+    model = before.model.with_term(term, {"A": 0.0})
+    assert fit(model, rows, before.scatter, turns=2).rmse_N > 0.9 * before.rmse_N
+    after = fit_with_effects(model, rows, before.scatter, before)
+    assert after.rmse_N < 0.6 * before.rmse_N
+    assert after.model.values[0]["A"] == pytest.approx(-2 * bins_helpers.TRUE["sigma_2"], rel=0.1)
