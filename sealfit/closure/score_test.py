@@ -15,7 +15,6 @@ from sealfit.closure.criteria import (
     CONSTANT_IN_RUNS,
     IDENTIFIABLE,
     JACKKNIFE_UNITS,
-    MANY_RUNS,
     PROMISING,
     TESTED_AGAINST_RUNS,
     UNEQUAL_RUNS,
@@ -50,7 +49,7 @@ from sealfit.fit.joint.tangent import OwnColumns, Tangent
 # leverage and agree by chance, so what the columns explain must be significant too: by chi-squared, or by F
 # against the scatter of runs if they are one number per run. With fewer than thirty specimens, what is
 # constant in them is tested against their own scatter (`small_sample`), and what varies within them against
-# the scatter of their slopes (`slopes`). With fewer than twenty runs, what is constant in runs is tested
+# the scatter of their slopes (`slopes`). With fewer than thirty runs, what is constant in runs is tested
 # against their scatter (`small_sample`).
 
 # A unit alone determines a direction if the eigenvalue of what is left without the unit is smaller.
@@ -231,7 +230,7 @@ class ScoreTests:
 
         It is exact; the variance of a slope from half a dozen runs has two or three degrees of freedom.
         """
-        if not between == level == "run" or self.fitted.rows.groups.starts["run"].size >= MANY_RUNS:
+        if not between == level == "run":
             return None
         tests = [self.cluster_tests["run"].test(left, target) for left in variants]
         if any(test is None or test.share <= CONSTANT_IN_RUNS for test in tests):

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri
+from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri, stdtrit
 
 from sealfit.closure.channels import Channel, scatter_level
 from sealfit.closure.confirm import about_means
@@ -222,12 +222,14 @@ class _Search:
     def surer(self, times: float, candidate: Candidate) -> float:
         """Return the factor on an effect, found with `TARGET_POWER`, with which its evidence is not weak.
 
-        Infinite for few units, whose p-value falls too slowly.
+        Infinite for few units without an F test, whose p-value falls too slowly.
         """
-        if candidate.test_result.units < JACKKNIFE_UNITS:
+        test = candidate.test_result.small_sample
+        if test is None and candidate.test_result.units < JACKKNIFE_UNITS:
             return np.inf
+        df = candidate.test_result.units if test is None else test.error_df
         found, strong = (
-            -ndtri(p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK_P)
+            -stdtrit(df, p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK_P)
         )
         return times * float((strong + ndtri(TARGET_POWER)) / (found + ndtri(TARGET_POWER)))
 
