@@ -78,12 +78,12 @@ class BeforeAfter:
     def _ratios(self, around: str | None) -> tuple[float, float]:
         """Return the ratio of errors after and before, in sample and held out (1 if nothing was held out).
 
-        Errors about the means of groups do not need the level of the force to be determined.
+        Errors about the means of runs or finer groups do not need the force to be determined.
         """
         rows, weight = self.before.rows, self.before.rows.weight
         inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
         known = np.isfinite(self.held_before) & np.isfinite(self.held_after) & self.covered
-        if around is None:
+        if around in (None, "specimen"):
             known &= self.determined
         held = [1.0, 1.0]
         if known.any():

@@ -233,6 +233,8 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     assert not ends(1.1, left=0.8).gains("stroke", weak=True)
     assert ends(40.0, determined=~every).gains("stroke", weak=False)
     assert not ends(40.0, left=1.1, determined=~every).gains("stroke", weak=False)
+    assert ends(40.0, determined=~every).gains("specimen", weak=False)  # of runs at other speeds
+    assert not ends(40.0).gains("specimen", weak=False)
 
 
 def of_two_loads(**options):
