@@ -66,12 +66,15 @@ class BeforeAfter:
 
         With weak evidence the held-out error must be lower. If a level is given, the errors about the means
         of its groups are compared, and the whole errors may be larger by `HARMLESS`. This needs evidence that
-        is not weak, or a held-out error about the means that is halved.
+        is not weak, or a held-out error about the means that is halved. With both, and halved in sample too,
+        the whole held-out error is not compared: it is mostly that of the level of other runs.
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)
         if max(inside) > SAME_ERROR or (weak and inside[1] >= 1):
             return False
+        if around is not None and not weak and max(inside) < HALVED:
+            return whole[0] <= SAME_ERROR
         strong = not weak or inside[1] < HALVED
         return max(whole) <= (HARMLESS if strong else SAME_ERROR)
 

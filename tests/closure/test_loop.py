@@ -1,4 +1,6 @@
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.testing as npt
@@ -235,6 +237,9 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     assert not ends(40.0, left=1.1, determined=~every).gains("stroke", weak=False)
     assert ends(40.0, determined=~every).gains("specimen", weak=False)  # of runs at other speeds
     assert not ends(40.0).gains("specimen", weak=False)
+    rippled = replace(ends(1.2), before=SimpleNamespace(rows=rows, residual=fitted.residual + 9 * wave))
+    assert rippled.gains("stroke", weak=False)  # halved in sample and held out
+    assert not rippled.gains("stroke", weak=True)
 
 
 def of_two_loads(**options):
