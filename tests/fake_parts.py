@@ -26,6 +26,7 @@ ERRORS = {
     "rmse_N": 0.4,
     "rmse_runs_N": 0.3,
     "heldout_rmse_N": 0.5,
+    "heldout_extrapolated_rmse_N": None,
     "max_abs_N": 1.5,
     "mean_abs_pct": 2.0,
     "lack_of_fit_p": None,

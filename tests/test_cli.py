@@ -412,6 +412,13 @@ def test_a_file_that_the_loop_left_out_is_named_beside_the_verdict(sealfit, part
     assert "what all others predict: a.csv (+12 %)" in sealfit("run", campaign, "--out", out).stdout
 
 
+def test_held_out_errors_that_are_all_extrapolated_are_said_to_be(sealfit, parts, campaign, out):
+    errors = {**fake_parts.ERRORS, "heldout_rmse_N": None, "heldout_extrapolated_rmse_N": 3.0}
+    parts.closure = {**fake_parts.CLOSURE, "before": errors, "after": errors}
+    printed = sealfit("run", campaign, "--out", out).stdout
+    assert "rmse 0.4 -> 0.4; held out, all extrapolated 3 -> 3; run means" in printed
+
+
 # ---------------------------------------------------------------- check
 def test_check_lists_every_fault_and_writes_nothing(sealfit, parts, campaign, tmp_path):
     parts.faults = [fake_parts.FAULT] * 30

@@ -172,6 +172,8 @@ def closure_lines(part: Mapping) -> list[str]:
         ("run means", "rmse_runs_N"),
         ("largest", "max_abs_N"),
     )
+    if before["heldout_rmse_N"] is None and before["heldout_extrapolated_rmse_N"] is not None:
+        rows = (rows[0], ("held out, all extrapolated", "heldout_extrapolated_rmse_N"), *rows[2:])
     texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
     found.append(line(f"error ({unit})", "; ".join(texts)))
     if part["noise_floor_N"] is not None:
