@@ -332,8 +332,10 @@ CHANNELS = Schema(
         Column("n", "", INT, "bins rows in the group"),
         Column("before_N", "N", FLOAT, "mean residual before"),
         Column("before_se_N", "N", FLOAT, "its standard error, from whole units"),
+        Column("before_run", "", TEXT, "run with the largest mean residual in the group"),
         Column("after_N", "N", FLOAT, "mean residual after"),
         Column("after_se_N", "N", FLOAT, "its standard error, from whole units"),
+        Column("after_run", "", TEXT, "run with the largest mean residual in the group"),
     ),
 )
 SHAPES = Schema(

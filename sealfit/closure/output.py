@@ -173,7 +173,7 @@ POINTS = 60  # Points of a plotted curve.
 def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
     """Return the mean residual by channel, before and after, with standard errors from whole files."""
     rows = before.rows
-    files = rows.codes("file")
+    files, runs = rows.codes("file"), rows.table["run_id"].to_numpy()
     records = []
     for name, known in selection.channels.items():
         values = rows.values(name) if name != "speed_mm_s" else np.abs(rows.speed)
@@ -198,8 +198,15 @@ def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.Dat
                 per_file = np.bincount(files[inside], weight * (residual - mean))
                 record[f"{stage}_N"] = mean
                 record[f"{stage}_se_N"] = float(np.sqrt((per_file**2).sum()) / weight.sum())
+                record[f"{stage}_run"] = _farthest(runs[inside], weight, residual)
             records.append(record)
     return pd.DataFrame(records, columns=CHANNELS.names())
+
+
+def _farthest(run: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> str:
+    """Return the run with the largest mean residual."""
+    sums = pd.DataFrame({"weight": weight, "residual": weight * residual}).groupby(run).sum()
+    return (sums["residual"] / sums["weight"]).abs().idxmax()
 
 
 def shape_table(after: Fitted, config: Config) -> pd.DataFrame:

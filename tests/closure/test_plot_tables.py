@@ -3,8 +3,10 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.closure.output import POINTS, curve_table
-from sealfit.fit.joint.estimate import fit
+from sealfit.closure.channels import find_channels
+from sealfit.closure.output import POINTS, channel_table, curve_table
+from sealfit.closure.selection import Selection
+from sealfit.fit.joint.estimate import fit, fit_declared
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.start import start_model
 
@@ -27,3 +29,17 @@ def test_curves_go_both_ways_over_the_speeds_of_each_condition_at_its_mean_load(
         assert (reached.min(), reached.max()) == pytest.approx((1.0, 100.0), rel=0.01)
         assert (np.sign(curve["force_after_N"]) == sign).all()
         assert (curve["force_after_lo95_N"] < curve["force_after_N"]).all()
+
+
+def test_a_mean_residual_names_the_run_that_is_farthest_from_the_model():
+    bins = bins_helpers.make_bins(repeats=2, bins=4, temperatures=(60.0,), setup=0.0005)
+    far = bins["run_id"].iloc[-1]
+    bins["force_N"] += np.where(bins["run_id"] == far, 2.0, 0.0)
+    rows = make_rows(bins.assign(batch="A"), has_aging=True)
+    fitted = fit_declared(rows)
+    channels = {c.name: c for c in find_channels(rows)}
+    selection = Selection(fitted, fitted, (), (), (), None, None, channels)
+    table = channel_table(selection, fitted, fitted)
+    along = table[(table["channel"] == "displacement_mm")]
+    assert set(along["before_run"]) == set(along["after_run"]) == {far}
+    assert (table["before_run"].isin(set(bins["run_id"]))).all()

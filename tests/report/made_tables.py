@@ -364,6 +364,7 @@ def channels(found):
                 row |= {
                     f"{stage}_N": units.mean(),
                     f"{stage}_se_N": units.std() / np.sqrt(len(units)) if len(units) > 1 else None,
+                    f"{stage}_run": units.abs().idxmax(),
                 }
             rows.append(row)
     return table("channels", rows)

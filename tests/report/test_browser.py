@@ -57,6 +57,12 @@ frame.onload = () => {
   found.run = dialog.querySelector("h2").textContent;
   found.points = dialog.querySelectorAll("circle").length;
   dialog.close();
+  const residual = page.querySelector("#residual use[data-text]"), spot = residual.getBoundingClientRect();
+  found.residual = residual.dataset.text;
+  residual.closest("svg").dispatchEvent(new frame.contentWindow.PointerEvent("click", {
+    clientX: spot.x + spot.width / 2, clientY: spot.y + spot.height / 2, bubbles: true }));
+  found.farthest = dialog.querySelector("h2").textContent;
+  dialog.close();
   page.querySelector("#force-speed .panel button").click();
   const large = dialog.querySelector("svg");
   const view = () => large.getAttribute("viewBox").split(" ").map(Number), whole = view();
@@ -113,6 +119,7 @@ def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_p
     assert re.match(r"(before|after): .* N\n", found["tip"])
     assert found["mean"].splitlines()[2] in found["run"]
     assert found["points"] == 3 * 20  # repeats and bins of made_campaigns
+    assert found["residual"].splitlines()[3] in found["farthest"]
     assert 0.3 < found["zoom"] < 0.7
     assert found["whole"]
     rising = [float(text.replace("\u2212", "-")) for text in found["rising"]]

@@ -232,8 +232,9 @@ def test_levels_are_drawn_as_variance(ax):
 
 
 def test_channels_have_95_percent_bars(ax):
-    rows = table("channels", [{"channel": "batch", "label": name, "n": 9, "before_N": 1.0, "before_se_N": 0.5,
-                               "after_N": 0.0, "after_se_N": 0.5} for name in "ab"])  # fmt: skip
+    mean = {"before_N": 1.0, "before_se_N": 0.5, "after_N": 0.0, "after_se_N": 0.5}
+    mean |= {"channel": "batch", "n": 9, "before_run": "r", "after_run": "r"}
+    rows = table("channels", [{"label": name, **mean} for name in "ab"])
     draw_channel(ax, rows, "batch", TORQUE)
     ends = ax.containers[0].lines[2][0].get_segments()[0][:, 1]
     npt.assert_allclose(ends, [1 - 0.97998, 1 + 0.97998], rtol=1e-4)  # 1.95996 of 0.5

@@ -284,8 +284,9 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
             names = [number(value, 4) for value in x] if numeric else categories(rows, channel)
             texts = (f"{number(m, 3)} ± {number(s, 2)}" for m, s in zip(mean, spread, strict=True))
             place, unit = channel_label(channel, units), units.unit("force")
-            said = zip(texts, names, strict=True)
-            explain(points, [f"{stage}: {value} {unit}\n{place}: {name}" for value, name in said])
+            said = zip(texts, names, rows[f"{stage}_run"], strict=True)
+            most = "largest in run"  # a click on the point opens it
+            explain(points, [f"{stage}: {v} {unit}\n{place}: {name}\n{most}\n{run}" for v, name, run in said])
     if log:
         log_axis(ax)
     elif numeric:
