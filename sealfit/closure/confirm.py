@@ -329,9 +329,9 @@ def _reason_refused(
         return "it does not lower the error on held-out data"
     if gain.rmse_N < LEAST_GAIN * force and not proposal.term.effect.periodic:
         return NEGLIGIBLE
-    if proposal.p_value > CURVE_P and _changes_the_curve(proposal):
-        return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"
     halved = gain.share > 1 - HALVED
+    if proposal.p_value > CURVE_P and not halved and _changes_the_curve(proposal):
+        return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"
     if proposal.p_value > WITHIN_P and not halved and _shape_along_strokes(proposal.term, fitted.rows):
         return f"its p-value is above {WITHIN_P:g}, and it is a shape along strokes without a mechanism"
     if proposal.p_value > WEAK_P and gain.share < LEAST_FALL:

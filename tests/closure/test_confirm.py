@@ -202,21 +202,22 @@ def test_what_just_suffices_is_accepted(decide, given):
 
 
 @pytest.mark.parametrize(
-    ("effect", "channels", "acts_on", "p_value", "claimed"),
+    ("effect", "channels", "acts_on", "p_value", "share", "claimed"),
     [
-        ("smooth", ("run_order",), "mu", 1e-4, True),
-        ("smooth", ("run_order",), "v_s", 1e-4, False),
-        ("smooth", ("run_order",), "v_s", 1e-6, True),
-        ("surface", ("speed_mm_s", "repeat"), "mu", 1e-4, False),
-        ("surface", ("oil_ppm", "dust_mg"), "mu", 1e-4, True),
-        ("asymmetry", ("direction",), "sigma_2", 1e-4, True),
+        ("smooth", ("run_order",), "mu", 1e-4, 0.4, True),
+        ("smooth", ("run_order",), "v_s", 1e-4, 0.4, False),
+        ("smooth", ("run_order",), "v_s", 1e-4, 0.6, True),
+        ("smooth", ("run_order",), "v_s", 1e-6, 0.4, True),
+        ("surface", ("speed_mm_s", "repeat"), "mu", 1e-4, 0.4, False),
+        ("surface", ("oil_ppm", "dust_mg"), "mu", 1e-4, 0.4, True),
+        ("asymmetry", ("direction",), "sigma_2", 1e-4, 0.4, True),
     ],
 )
 def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
-    decide, effect, channels, acts_on, p_value, claimed
+    decide, effect, channels, acts_on, p_value, share, claimed
 ):
     made = proposal(effect, channels, acts_on, p_value, physical=effect == "asymmetry")
-    found, refused, _ = decide([made], [GOOD])
+    found, refused, _ = decide([made], [Gain(share, 1 - share, 10.0)])
     assert (found is not None) == claimed
     assert [item.weak for item in refused] == ([] if claimed else [True])
 
