@@ -42,7 +42,7 @@ class JointParameter:
     owner: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Declared:
     """The fitted number that each condition uses for each quantity; -1 if the condition's model lacks it."""
 
@@ -68,9 +68,7 @@ def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     between directions could be taken for a Stribeck curve. The result is cached. A part of a campaign with
     the same conditions takes the model of the campaign, `as_in`.
     """
-    if ("declared",) not in rows.cache:
-        rows.cache["declared",] = _declare(rows) if as_in is None else declare(as_in)
-    return rows.cache["declared",]
+    return rows.cache.once(("declared",), lambda: _declare(rows) if as_in is None else declare(as_in))
 
 
 def _declare(rows: Rows) -> Declared:

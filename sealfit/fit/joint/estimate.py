@@ -7,7 +7,7 @@ are fitted alternately until they converge. Priors are in `prior.py`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from sealfit.fit.joint.prior import (
     precision_of,
     smoothed,
 )
-from sealfit.fit.joint.rows import Rows
+from sealfit.fit.joint.rows import Cache, Rows
 from sealfit.fit.joint.search import descend, search_nonlinear
 from sealfit.fit.joint.start import start_model
 from sealfit.fit.joint.tangent import Tangent
@@ -55,7 +55,7 @@ class Fitted:
     deviance: float  # whitened sum of squares + log det: -2 log likelihood without its constant
     whitening: Whitening  # at this scatter and friction
     # Results of `slope`, `unit_shares` and `unit_residual`.
-    cache: dict = field(default_factory=dict, init=False, compare=False, repr=False)
+    cache: Cache = field(default_factory=Cache, init=False, compare=False, repr=False)
 
     @property
     def residual(self) -> np.ndarray:
@@ -78,10 +78,8 @@ class Fitted:
 
     def slope(self, acts_on: str, operation: str) -> np.ndarray:
         """Return the force's derivative dF/dh for the shape h of a term not yet in the model, shape (n,)."""
-        key = ("slope", acts_on, operation)
-        if key not in self.cache:
-            self.cache[key] = term_slope(self.model, self.rows, acts_on, operation)
-        return self.cache[key]
+        make = partial(term_slope, self.model, self.rows, acts_on, operation)
+        return self.cache.once(("slope", acts_on, operation), make)
 
     def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
         """Return eigenvalues and eigenvectors of each group's block of the hat matrix.
@@ -89,11 +87,11 @@ class Fitted:
         Their shapes are (g, k) and (g, k, k). The eigenvectors are in the coordinates of the basis columns
         of the group's block.
         """
-        key = ("shares", level)
-        if key not in self.cache:
-            groups = np.split(self.basis.values, self.rows.groups.starts[level][1:])
-            self.cache[key] = np.linalg.eigh(np.stack([b.T @ b for b in groups]))
-        return self.cache[key]
+        return self.cache.once(("shares", level), partial(self._unit_shares, level))
+
+    def _unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
+        groups = np.split(self.basis.values, self.rows.groups.starts[level][1:])
+        return np.linalg.eigh(np.stack([basis.T @ basis for basis in groups]))
 
     def unit_residual(self, level: str) -> np.ndarray:
         """Return the whitened residual times (I - H_gg)^(-1/2) in each group of a level, shape (n,).
@@ -101,17 +99,15 @@ class Fitted:
         H_gg is the group's block of the hat matrix. This is the CR2 correction (Bell & McCaffrey 2002, Survey
         Methodology 28(2), 169-181).
         """
-        key = ("residual", level)
-        if key not in self.cache:
-            code = self.rows.codes(level)
-            size, axes = self.unit_shares(level)
-            size = np.clip(size, 0.0, 0.98)  # a leverage of 1 leaves no residual to correct
-            grow = np.where(size > 1e-12, (1 / np.sqrt(1 - size) - 1) / np.maximum(size, 1e-12), 0.0)
-            inner = self.basis.sums(self.rows.groups, level, self.white_residual).values
-            rotated = np.einsum("gji,gj->gi", axes, inner) * grow
-            back = np.einsum("gij,gj->gi", axes, rotated)
-            self.cache[key] = self.white_residual + (self.basis.values * back[code]).sum(axis=1)
-        return self.cache[key]
+        return self.cache.once(("residual", level), partial(self._unit_residual, level))
+
+    def _unit_residual(self, level: str) -> np.ndarray:
+        size, axes = self.unit_shares(level)
+        size = np.clip(size, 0.0, 0.98)  # a leverage of 1 leaves no residual to correct
+        grow = np.where(size > 1e-12, (1 / np.sqrt(1 - size) - 1) / np.maximum(size, 1e-12), 0.0)
+        inner = self.basis.sums(self.rows.groups, level, self.white_residual).values
+        back = np.einsum("gij,gj->gi", axes, np.einsum("gji,gj->gi", axes, inner) * grow)
+        return self.white_residual + (self.basis.values * back[self.rows.codes(level)]).sum(axis=1)
 
     @cached_property
     def covariance(self) -> np.ndarray:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import pandas as pd
@@ -53,12 +53,6 @@ class Term:
 
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return the inputs of the effect's shape: channels of the rows, shape (n,), and fixed values."""
-        key = ("inputs", self.shape_key)
-        if key not in rows.cache:
-            rows.cache[key] = self._inputs(rows)
-        return rows.cache[key]
-
-    def _inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         given = {}
         for name, channel in zip(self.effect.reads, self.channels, strict=True):
             values = rows.values(channel)
@@ -79,10 +73,7 @@ class Term:
         variance of the n samples; shapes that may be as narrow as a bin get more nodes. All other shapes are
         evaluated at the bin mean.
         """
-        key = ("nodes", self.shape_key)
-        if key not in rows.cache:
-            rows.cache[key] = self._nodes(rows)
-        return rows.cache[key]
+        return rows.cache.once(("nodes", self.shape_key), lambda: self._nodes(rows))
 
     def _nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         inputs = self.inputs(rows)
@@ -120,16 +111,15 @@ def mean_derivatives(
     term: Term, values: Mapping[str, float], rows: Rows, *, only_linear: bool = False
 ) -> list[np.ndarray]:
     """Return the derivatives of a term's shape, averaged over each row's bin, each of shape (n,)."""
-    parts = [
-        (weight, term_derivatives(term, values, inputs, only_linear=only_linear))
-        for weight, inputs in term.nodes(rows)
-    ]
-    return [_zero_if_unknown(term, sum(w * part[k] for w, part in parts)) for k in range(len(parts[0][1]))]
+    nodes = term.nodes(rows)
+    parts = [term_derivatives(term, values, inputs, only_linear=only_linear) for _, inputs in nodes]
+    return [_mean(term, [weight for weight, _ in nodes], part) for part in zip(*parts, strict=True)]
 
 
-def _zero_if_unknown(term: Term, shape: np.ndarray) -> np.ndarray:
-    """Return a shape, shape (n,), with 0 where the origin of the pass is unknown."""
-    return np.nan_to_num(shape) if "shift" in term.fixed else shape
+def _mean(term: Term, weights: Sequence[float], shapes: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the weighted sum of shapes, shape (n,), with 0 where the origin of the pass is unknown."""
+    mean = sum(weight * shape for weight, shape in zip(weights, shapes, strict=True))
+    return np.nan_to_num(mean) if "shift" in term.fixed else mean
 
 
 def term_derivatives(
@@ -153,45 +143,29 @@ def term_derivatives(
     return result
 
 
-def _linear_columns(term: Term, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the shape's columns of an effect that is linear in all its parameters, shape (n, parameters)."""
-    names = [p.name for p in term.effect.parameters]
-    zero = dict.fromkeys(names, 0.0)
-    return np.column_stack([np.asarray(term.effect.shape(inputs, **{**zero, name: 1.0})) for name in names])
-
-
 def shape_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
     """Return the term's shape at the rows, shape (n,); the last one is cached."""
     if not term.effect.nonlinear:
-        return _columns_of(term, rows) @ np.array([values[p.name] for p in term.effect.parameters])
+        return np.array([values[p.name] for p in term.effect.parameters]) @ derivatives_of(term, values, rows)
 
     def make() -> np.ndarray:
-        mean = sum(weight * term.effect.shape(inputs, **values) for weight, inputs in term.nodes(rows))
-        return _zero_if_unknown(term, mean)
+        nodes = term.nodes(rows)
+        return _mean(term, [w for w, _ in nodes], [term.effect.shape(own, **values) for _, own in nodes])
 
-    return _cached("shape", term, values, rows, make)
-
-
-def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> list[np.ndarray] | np.ndarray:
-    """Return a shape's derivatives with respect to its parameters, shape (n,) each; the last are cached."""
-    if not term.effect.nonlinear:
-        return _columns_of(term, rows).T
-    return _cached("derivatives", term, values, rows, lambda: mean_derivatives(term, values, rows))
+    return rows.cache.once(("shape", term.shape_key), make, at=tuple(values.values()))
 
 
-def _cached(what: str, term: Term, values: Mapping[str, float], rows: Rows, make: Callable):
-    """Return a term's cached result, or compute it if its values changed: a step may leave a term fixed."""
-    key, at = (what, term.shape_key), tuple(values.values())
-    if key not in rows.cache or rows.cache[key][0] != at:
-        rows.cache[key] = (at, make())
-    return rows.cache[key][1]
+def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
+    """Return a shape's derivatives with respect to its parameters, (parameters, n); the last are cached.
 
-
-def _columns_of(term: Term, rows: Rows) -> np.ndarray:
-    key = ("columns", term.shape_key)
-    if key not in rows.cache:
-        rows.cache[key] = _linear_columns(term, term.inputs(rows))
-    return rows.cache[key]
+    Those of a linear effect are constant.
+    """
+    linear = not term.effect.nonlinear
+    return rows.cache.once(
+        ("derivatives", term.shape_key),
+        lambda: np.stack(mean_derivatives(term, values, rows, only_linear=linear)),
+        at=() if linear else tuple(values.values()),
+    )
 
 
 # ---------------------------------------------------------------- joint
@@ -302,26 +276,29 @@ def _layout(model: Model, rows: Rows) -> Layout:
 
     A block has the declared numbers of a specimen's conditions, then the parameters of all terms.
     """
-    declared, size = model.declared, model.theta.size
-    key, made = ("blocks",), ("layout", model.size)
-    if made in rows.cache and rows.cache[made][0] is declared:
-        return rows.cache[made][1]
-    if key not in rows.cache or rows.cache[key][0] is not declared:
-        used = np.stack([declared.index[quantity] for quantity in QUANTITIES], axis=1)
-        of_condition = [frozenset(numbers[numbers >= 0].tolist()) for numbers in used]
-        specimen, conditions = rows.codes("specimen"), len(used)
-        touched: dict[int, frozenset[int]] = {}
-        for pair in np.unique(specimen * conditions + rows.condition).tolist():
-            number, condition = divmod(pair, conditions)
-            touched[number] = touched.get(number, frozenset()) | of_condition[condition]
-        sets = [frozenset(range(size))] * len(touched) if size <= DENSE_NUMBERS else list(touched.values())
-        index, block = blocks_of(sets, size)
-        rows.cache[key] = (declared, index, block[specimen])
-    _, index, block = rows.cache[key]
+    make = partial(_make_layout, model, rows)
+    return rows.cache.once(("layout", model.size), make, at=model.declared)
+
+
+def _make_layout(model: Model, rows: Rows) -> Layout:
+    size = model.theta.size
+    index, block = rows.cache.once(("blocks",), partial(_blocks, model.declared, rows), at=model.declared)
     added = np.arange(size, model.size)
     index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
-    rows.cache[made] = (declared, Layout(model.size, index, block))
-    return rows.cache[made][1]
+    return Layout(model.size, index, block)
+
+
+def _blocks(declared: Declared, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Return the declared numbers of each block, and the block of each row."""
+    size, used = len(declared.parameters), np.stack(list(declared.index.values()), axis=1)
+    of_condition = [frozenset(numbers[numbers >= 0].tolist()) for numbers in used]
+    specimen = rows.codes("specimen")
+    touched: dict[int, frozenset[int]] = {}
+    for number, condition in np.unique(np.column_stack([specimen, rows.condition]), axis=0).tolist():
+        touched[number] = touched.get(number, frozenset()) | of_condition[condition]
+    sets = [frozenset(range(size))] * len(touched) if size <= DENSE_NUMBERS else list(touched.values())
+    index, block = blocks_of(sets, size)
+    return index, block[specimen]
 
 
 def friction_of(model: Model, rows: Rows) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -145,6 +146,16 @@ NOT_CHANNELS = {
 }
 
 
+class Cache(dict):
+    """Derived values that are computed once."""
+
+    def once(self, key: Hashable, make: Callable, at: object = None):
+        """Return the value of a key; `make` computes it at first, and again if `at` has changed since."""
+        if key not in self or self[key][0] != at:
+            self[key] = (at, make())
+        return self[key][1]
+
+
 @dataclass(frozen=True)
 class Rows:
     """Sorted rows of `bins` as arrays.
@@ -169,8 +180,8 @@ class Rows:
     weight: np.ndarray  # (n,) sums to 1; all files have equal weight
     # Channels that some files lack: `fill_missing`.
     filled: dict[str, np.ndarray] = field(default_factory=dict)
-    cache: dict = field(default_factory=dict, init=False, compare=False, repr=False)
-    """Derived values that are computed once; the key names all that they depend on besides the rows."""
+    # Keys name all that the values depend on besides the rows.
+    cache: Cache = field(default_factory=Cache, init=False, compare=False, repr=False)
 
     @property
     def channels(self) -> list[str]:
@@ -181,15 +192,13 @@ class Rows:
         """Return a channel, shape (n,): floats, or strings if it is categorical; missing values filled in."""
         if channel in self.filled:
             return self.filled[channel]
-        if channel not in self.cache:
-            column = self.table[channel]
-            if pd.api.types.is_numeric_dtype(column):
-                self.cache[channel] = column.to_numpy(dtype=float, na_value=np.nan)
-            else:
-                self.cache[channel] = (
-                    column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
-                )
-        return self.cache[channel]
+        return self.cache.once(channel, lambda: self._values(self.table[channel]))
+
+    @staticmethod
+    def _values(column: pd.Series) -> np.ndarray:
+        if pd.api.types.is_numeric_dtype(column):
+            return column.to_numpy(dtype=float, na_value=np.nan)
+        return column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
 
     def bin_width(self, channel: str) -> np.ndarray:
         """Return the width of each row's bin in a channel, shape (n,).
@@ -197,15 +206,13 @@ class Rows:
         It is the number of samples times the step between them. The step is the difference of neighbouring
         bin means over half the sum of their numbers of samples.
         """
-        key = ("width", channel)
-        if key not in self.cache:
-            values, code, samples = self.values(channel), self.codes("stroke"), self.samples
-            inside = np.diff(code) == 0
-            step = np.where(inside, np.diff(values) / ((samples[1:] + samples[:-1]) / 2), 0.0)
-            left, right = np.r_[0.0, step], np.r_[step, 0.0]
-            own = np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
-            self.cache[key] = samples * own
-        return self.cache[key]
+        return self.cache.once(("width", channel), lambda: self._bin_width(channel))
+
+    def _bin_width(self, channel: str) -> np.ndarray:
+        samples, inside = self.samples, np.diff(self.codes("stroke")) == 0
+        step = np.where(inside, np.diff(self.values(channel)) / ((samples[1:] + samples[:-1]) / 2), 0.0)
+        left, right = np.r_[0.0, step], np.r_[step, 0.0]
+        return samples * np.where(left == 0, right, np.where(right == 0, left, (left + right) / 2))
 
     @property
     def samples(self) -> np.ndarray:
@@ -218,15 +225,15 @@ class Rows:
 
     def sparse(self, most: int) -> Rows:
         """Return about `most` or fewer rows of each stroke, evenly spread, for effects on whole strokes."""
-        key = ("sparse", most)
-        if key not in self.cache:
-            start, code = self.groups.starts["stroke"], self.codes("stroke")
-            for channel in (name for name in ALONG if name in self.table):
-                self.bin_width(channel)  # from all bins, not from the ones that remain
-            place = np.arange(code.size) - start[code]
-            step = -(-np.bincount(code) // most)[code]  # rounded up
-            self.cache[key] = self.subset(place % step == step // 2)
-        return self.cache[key]
+        return self.cache.once(("sparse", most), lambda: self._sparse(most))
+
+    def _sparse(self, most: int) -> Rows:
+        code = self.codes("stroke")
+        for channel in (name for name in ALONG if name in self.table):
+            self.bin_width(channel)  # from all bins, not from the ones that remain
+        place = np.arange(code.size) - self.groups.starts["stroke"][code]
+        step = -(-np.bincount(code) // most)[code]  # rounded up
+        return self.subset(place % step == step // 2)
 
     def subset(self, mask: np.ndarray) -> Rows:
         """Return the rows where `mask`, shape (n,), is true; conditions keep the numbers that models need."""
@@ -245,9 +252,9 @@ class Rows:
             weight=weight / weight.sum(),
             filled={name: values[mask] for name, values in self.filled.items()},
         )
-        for name, values in self.cache.items():
-            if isinstance(name, str) or name[0] == "width":  # channels, and widths of all bins
-                part.cache[name] = values[mask]
+        for key, (at, values) in self.cache.items():
+            if isinstance(key, str) or key[0] == "width":  # channels, and widths of all bins
+                part.cache[key] = (at, values[mask])
         return part
 
 
@@ -264,27 +271,13 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
         `Rows.conditions` of the campaign of which these bins are a part, so that its model applies to them.
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
-    base_run = nesting_run(table)
-    keys = pd.DataFrame(
-        {
-            "specimen": pd.factorize(table["specimen_id"], sort=True)[0],
-            "run": pd.factorize(base_run, sort=True)[0],
-            "file": pd.factorize(table["record"], sort=True)[0],
-            "stroke": table["stroke"].to_numpy(),
-        }
-    )
-    order = np.lexsort([keys[name].to_numpy() for name in ("stroke", "file", "run", "specimen")])
+    keys = [table["record"], nesting_run(table), table["specimen_id"]]
+    codes = [table["stroke"].to_numpy(), *(pd.factorize(key, sort=True)[0] for key in keys)]
+    order = np.lexsort(codes)
     table = table.iloc[order].reset_index(drop=True)
-    keys = keys.iloc[order]
-    stroke = pd.factorize(keys["file"] * (int(keys["stroke"].max()) + 1) + keys["stroke"])[0]
-    groups = Groups.of(
-        {
-            "stroke": stroke,
-            "file": keys["file"].to_numpy(),
-            "run": keys["run"].to_numpy(),
-            "specimen": keys["specimen"].to_numpy(),
-        }
-    )
+    stroke, file, *_ = codes = [code[order] for code in codes]
+    codes[0] = file * (int(stroke.max()) + 1) + stroke
+    groups = Groups.of(dict(zip(LEVELS, codes, strict=True)))
     has_load = "load_N" in table and bool(table["load_N"].notna().all())
     if has_load and POWER not in table and np.ptp(table["load_N"]) > 1e-3 * table["load_N"].abs().max():
         table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])

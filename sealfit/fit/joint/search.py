@@ -160,10 +160,7 @@ def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, 
     acts = (np.bincount(specimen, acts) > 0)[specimen]
     if acts.all() or not acts.any():
         return rows, None
-    key = ("split", acts.tobytes())
-    if key not in rows.cache:
-        rows.cache[key] = (rows.subset(acts), rows.subset(~acts))
-    return rows.cache[key]
+    return rows.cache.once(("split", acts.tobytes()), lambda: (rows.subset(acts), rows.subset(~acts)))
 
 
 def solve_linear(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
