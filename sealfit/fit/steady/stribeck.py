@@ -10,9 +10,6 @@ from scipy.special import stdtr
 
 from sealfit.fit.least_squares import Separable, covariance_of, even_grid, global_optimum, profile, solve_kept
 
-# ---------------------------------------------------------------- interval
-# Exact intervals of nonnegative coefficients from the sum of squares.
-
 # A coefficient is unbounded if the share of its column's variance that other columns do not explain is below
 # this.
 FREE = 1e-12
@@ -21,9 +18,9 @@ FREE = 1e-12
 def constrained_ends(columns, y, limit, nonnegative):
     """Return the ends of {c_j : the least sum of squares at fixed c_j, the others nonnegative, <= `limit`}.
 
-    At fixed c_j every active set of zeros among the others gives a parabola in c_j. The constrained optimum
-    at an end lies on one of them, so that the ends are the outermost feasible crossings: exact, without
-    iteration.
+    For every active set of zeros among the others, the sum of squares is a parabola in c_j. The constrained
+    optimum at an end lies on one of them, so that the ends are the outermost feasible crossings: exact,
+    without iteration.
 
     Parameters
     ----------
@@ -42,69 +39,44 @@ def constrained_ends(columns, y, limit, nonnegative):
         NaN if the sum of squares exceeds the limit everywhere; inf if c_j is unbounded.
     """
     nonnegative = np.asarray(nonnegative, bool)
-    p = columns.shape[-1]
     norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
     safe = np.where(norm > 0, norm, 1.0)
     scaled = columns / safe[..., None, :]
-    # Sums of squares are relative to the unconstrained optimum, which avoids cancellation.
-    gram = np.swapaxes(scaled, -1, -2) @ scaled
-    everything = np.ones((*gram.shape[:-2], p), bool)
-    moment = (np.swapaxes(scaled, -1, -2) @ y[..., None])[..., 0]
-    centre = solve_kept(gram, moment, everything)
-    rest = y - (scaled @ centre[..., None])[..., 0]
-    centre = centre + solve_kept(gram, (np.swapaxes(scaled, -1, -2) @ rest[..., None])[..., 0], everything)
-    rest = y - (scaled @ centre[..., None])[..., 0]
-    floor = np.einsum("...n,...n->...", rest, rest)
-    spare = limit[:, None] - floor  # the set is (c - centre)' gram (c - centre) <= spare
-    low, high = np.full(moment.shape, np.nan), np.full(moment.shape, np.nan)
-    for j in range(p):
-        others = [k for k in range(p) if k != j and nonnegative[k]]
-        for zeros in product((False, True), repeat=len(others)):
-            keep = np.ones(p, bool)
-            keep[[k for k, zero in zip(others, zeros, strict=True) if zero]] = False
+    transposed = np.swapaxes(scaled, -1, -2)
+    gram = transposed @ scaled
+    low, high = np.full(norm.shape, np.nan), np.full(norm.shape, np.nan)
+    for kept in product(*((False, True) if may_be_zero else (True,) for may_be_zero in nonnegative)):
+        keep = np.broadcast_to(kept, norm.shape)
+        centre, rest = np.zeros(norm.shape), y
+        for _ in range(2):  # the second time recovers the digits that normal equations lose
+            centre = centre + solve_kept(gram, (transposed @ rest[..., None])[..., 0], keep)
+            rest = y - (scaled @ centre[..., None])[..., 0]
+        spare = limit[:, None] - np.einsum("...n,...n->...", rest, rest)
+        for j in np.flatnonzero(kept):
             low_here, high_here = _ends(gram, centre, spare, j, keep, nonnegative)
             low[..., j], high[..., j] = np.fmin(low[..., j], low_here), np.fmax(high[..., j], high_here)
-    if nonnegative.any():
-        low[..., nonnegative] = np.maximum(low[..., nonnegative], 0.0)
-        high[..., nonnegative] = np.where(high[..., nonnegative] < 0, np.nan, high[..., nonnegative])
-        low = np.where(np.isnan(high), np.nan, low)
+    low = np.where(nonnegative, np.maximum(low, 0.0), low)
+    high = np.where(nonnegative & (high < 0), np.nan, high)
+    low = np.where(np.isnan(high), np.nan, low)
     return low / safe, np.where(norm > 0, high / safe, np.inf)
 
 
 def _ends(gram, centre, spare, j, keep, nonnegative):
-    """Return the crossings of one parabola: c_k = 0 for k not in `keep`, c_j = t, others at their optimum."""
-    rest = keep.copy()
-    rest[j] = False
-    mask = np.broadcast_to(rest, centre.shape)
-    off = ~keep
-    # With d = c - centre: d_k = -centre_k outside `keep`, d_j = t - centre_j. The cost is quadratic in d_j.
-    fixed = np.where(off, -centre, 0.0)
-    pull = (gram @ fixed[..., None])[..., 0]
-    by_fixed = solve_kept(gram, pull, mask)  # -d_rest at d_j = 0
-    by_j = solve_kept(gram, gram[..., :, j], mask)  # -d_rest per unit of d_j
-    own = gram[..., j, j] - np.einsum("...k,...k->...", by_j, gram[..., :, j] * rest)
-    cross = pull[..., j] - np.einsum("...k,...k->...", by_fixed, gram[..., :, j] * rest)
-    base = np.einsum("...k,...k->...", fixed, pull) - np.einsum("...k,...k->...", by_fixed, pull * rest)
-    bounded = own > FREE
-    safe = np.where(bounded, own, 1.0)
-    least = -cross / safe
-    spread = (spare - base + np.where(bounded, cross**2 / safe, 0.0)) / safe
-    possible = spread >= 0
-    half = np.sqrt(np.maximum(spread, 0.0))
+    """Return the crossings of the parabola about `centre`: c_j moves, the others in `keep` are optimal."""
+    others = keep & (np.arange(keep.shape[-1]) != j)
+    pull = solve_kept(gram, gram[..., :, j], others)  # fall of the others per unit of c_j
+    own = gram[..., j, j] - np.einsum("...k,...k->...", pull, gram[..., :, j])
+    bounded, possible = own > FREE, spare >= 0
+    half = np.where(bounded & possible, np.sqrt(np.maximum(spare, 0.0) / np.where(bounded, own, 1.0)), np.nan)
+    # Smaller coefficients are rounding.
+    least = -1e-12 * np.abs(centre).max(axis=-1, keepdims=True)
     ends = []
-    for sign in (-1, 1):
-        d_j = least + sign * half
-        d_rest = -by_fixed - by_j * d_j[..., None]
-        c_rest = centre + d_rest
-        feasible = ~np.any(
-            (c_rest < -1e-12 * np.abs(centre).max(axis=-1, keepdims=True)) & rest & nonnegative, axis=-1
-        )
-        value = np.where(possible & bounded & feasible, centre[..., j] + d_j, np.nan)
-        if sign > 0:  # unbounded if all coefficients stay feasible as c_j grows
-            open_ = ~bounded & (spare - base >= 0) & ~np.any((by_j > 1e-9) & rest & nonnegative, axis=-1)
-            value = np.where(open_, np.inf, value)
-        ends.append(value)
-    return ends
+    for away in (-half, half):
+        negative = (centre - pull * away[..., None] < least) & others & nonnegative
+        ends.append(np.where(negative.any(axis=-1), np.nan, centre[..., j] + away))
+    low, high = ends
+    falling = ((pull > 1e-9) & others & nonnegative).any(axis=-1)
+    return low, np.where(~bounded & possible & ~falling, np.inf, high)
 
 
 # ---------------------------------------------------------------- stribeck
