@@ -204,21 +204,6 @@ class Tangent:
         return np.einsum("ikr,kr->ki", self.jacobian, self.residual)
 
 
-@dataclass(frozen=True)
-class _Columns:
-    """The columns of level and start, linear in tau, shape (2, strokes, rows) each.
-
-    whole[0] + tau whole[1] is the force from relaxed bristles, start[0] + tau start[1] that of a start of 1
-    N.
-    """
-
-    whole: np.ndarray
-    start: np.ndarray
-
-    def at(self, tau: float) -> tuple[np.ndarray, np.ndarray]:
-        return self.whole[0] + tau * self.whole[1], self.start[0] + tau * self.start[1]
-
-
 class Rises:
     """The strokes of a condition, padded to one length and simulated together."""
 
@@ -230,43 +215,41 @@ class Rises:
             padded[self.there] = np.concatenate([getattr(s, name) for s in strokes])
         self.step[:, 1:] = np.maximum(np.diff(self.step, axis=1), 0.0) * self.there[:, 1:]
         self.step[:, 0] = 0.0
-        self.share = np.array([s.share for s in strokes])[:, None]
         self.file = np.unique([s.file for s in strokes], return_inverse=True)[1]
         self.run = np.unique([s.run for s in strokes], return_inverse=True)[1]
-        self._follow(curve)
-
-    def _follow(self, curve: Curve) -> None:
-        self.limit = curve.limit_N(self.speed) * self.share
+        self.limit = curve.limit_N(self.speed) * np.array([s.share for s in strokes])[:, None]
         self.viscous = curve.sigma_2 * self.speed
-        between = self.limit.copy()
-        between[:, 1:] = (self.limit[:, 1:] + self.limit[:, :-1]) / 2
-        self.between, self.lengths = between, self.step / between  # steps, in lengths of a rise of 1 N/mm
+        self.between = self.limit.copy()
+        self.between[:, 1:] = (self.limit[:, 1:] + self.limit[:, :-1]) / 2
 
-    def along(self, curve: Curve) -> Rises:
-        """Return the same strokes on another curve."""
-        other = object.__new__(Rises)
-        other.__dict__.update(self.__dict__)
-        other._follow(curve)
-        return other
+    def _columns(self, sigma_0: float, *, slopes: bool) -> list[np.ndarray]:
+        """Return the columns at sigma_0, and with `slopes` their derivatives with respect to log sigma_0.
 
-    def _columns(self, sigma_0: float, *, slopes: bool) -> list[_Columns]:
-        """Return the columns at sigma_0, and with `slopes` their derivatives with respect to log sigma_0."""
-        slid = sigma_0 * self.lengths
+        The shape of each is (2, strokes, 2, rows): the first plus tau times the second are the force from
+        relaxed bristles, and that of a start of 1 N.
+        """
+        slid = sigma_0 * self.step / self.between
         kept = np.exp(-slid)
         bristles = _followed(slid, (1 - kept) * self.between)
         start = np.exp(-np.cumsum(slid, axis=1))
         rate = sigma_0 * self.speed * self.there
         lag = rate / self.limit
-        whole = np.stack([(bristles + self.viscous) * self.there, rate - bristles * lag])
-        made = [_Columns(whole, np.stack([start * self.there, -start * lag]))]
+        whole = (bristles + self.viscous) * self.there
+        made = [_stacked(whole, start * self.there, rate - bristles * lag, -start * lag)]
         if slopes:
             before = np.zeros(bristles.shape)
             before[:, 1:] = bristles[:, :-1]
             rising = _followed(slid, (self.between - before) * slid * kept)
             falling = start * np.cumsum(slid, axis=1)
-            whole = np.stack([rising * self.there, rate - (bristles + rising) * lag])
-            made.append(_Columns(whole, np.stack([-falling * self.there, (falling - start) * lag])))
+            lagging = rate - (bristles + rising) * lag, (falling - start) * lag
+            made.append(_stacked(rising * self.there, -falling * self.there, *lagging))
         return made
+
+    def _solved(self, both: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the inverse normal matrices of level and start, their values, and the residual."""
+        inverse = _inverse(both @ both.transpose(0, 2, 1))
+        linear = inverse @ (both @ self.force[..., None])
+        return inverse, linear, self.force - (linear * both).sum(axis=1)
 
     def tangent(self, at: np.ndarray) -> Tangent:
         """Return the residual at (log sigma_0, tau), and its derivative.
@@ -274,23 +257,14 @@ class Rises:
         The derivative of the linear parameters is that of their normal equations (Golub and Pereyra 1973).
         """
         (columns, slopes), tau = self._columns(float(np.exp(at[0])), slopes=True), float(at[1])
-        both = np.stack(columns.at(tau), axis=1)  # (strokes, 2, rows)
-        inverse = _inverse(both @ both.transpose(0, 2, 1))
-        level, begin = (inverse @ (both @ self.force[..., None]))[..., 0].T
-        residual = self.force - level[:, None] * both[:, 0] - begin[:, None] * both[:, 1]
+        both = columns[0] + tau * columns[1]
+        inverse, linear, residual = self._solved(both)
         moved = []
-        for by in (slopes.at(tau), (columns.whole[1], columns.start[1])):
-            by = np.stack(by, axis=1)
-            model = level[:, None] * by[:, 0] + begin[:, None] * by[:, 1]
-            linear = inverse @ (by @ residual[..., None] - both @ model[..., None])
-            moved.append(-model - linear[:, 0] * both[:, 0] - linear[:, 1] * both[:, 1])
-        return Tangent(level, begin, residual, np.stack(moved))
-
-    def solved(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return levels at (log sigma_0, tau), shape (strokes,), and residuals, shape (strokes, rows)."""
-        both = np.stack(self._columns(float(np.exp(at[0])), slopes=False)[0].at(float(at[1])), axis=1)
-        linear = _inverse(both @ both.transpose(0, 2, 1)) @ (both @ self.force[..., None])
-        return linear[:, 0, 0], self.force - (linear * both).sum(axis=1)
+        for by in (slopes[0] + tau * slopes[1], columns[1]):
+            model = (linear * by).sum(axis=1)
+            change = inverse @ (by @ residual[..., None] - both @ model[..., None])
+            moved.append(-model - (change * both).sum(axis=1))
+        return Tangent(linear[:, 0, 0], linear[:, 1, 0], residual, np.stack(moved))
 
     def best_of_grid(self) -> tuple[np.ndarray, tuple[float, float]]:
         """Return the best point of a grid, (log sigma_0, tau), and the range of log sigma_0 of the grid."""
@@ -298,25 +272,15 @@ class Rises:
         steps = self.step[self.step > 0]
         lengths = np.geomspace(0.3 * np.median(steps), self.step.sum(axis=1).max(), STIFFNESSES)
         pace = float(np.median(self.speed.max(axis=1)))
-        squares = np.array([self._squares(level / length, DAMPINGS * length / pace) for length in lengths])
+        squares = np.zeros((STIFFNESSES, DAMPINGS.size))
+        for k, length in enumerate(lengths):
+            constant, lagging = self._columns(level / length, slopes=False)[0]
+            for m, tau in enumerate(DAMPINGS * length / pace):
+                squares[k, m] = (self._solved(constant + tau * lagging)[2] ** 2).sum()
         best, damping = np.unravel_index(np.argmin(squares), squares.shape)
         low, high = np.log(level / lengths[[-1, 0]])
         tau = DAMPINGS[damping] * lengths[best] / pace
         return np.array([np.log(level / lengths[best]), tau]), (float(low), float(high))
-
-    def _squares(self, sigma_0: float, tau: np.ndarray) -> np.ndarray:
-        """Return the sums of squares at one stiffness and all dampings, shape of `tau`."""
-        columns = self._columns(sigma_0, slopes=False)[0]
-        parts = np.stack([*columns.whole, *columns.start], axis=1)  # (strokes, 4, rows)
-        products, moments = parts @ parts.transpose(0, 2, 1), parts @ self.force[..., None]
-        total = float((self.force**2).sum())
-        mixed = np.zeros((tau.size, 2, 4))  # level and start from the four parts
-        mixed[:, 0, 0] = mixed[:, 1, 2] = 1.0
-        mixed[:, 0, 1] = mixed[:, 1, 3] = tau
-        mixed = mixed[:, None]
-        moment = mixed @ moments
-        solved = _inverse(mixed @ products @ mixed.swapaxes(-1, -2)) @ moment
-        return total - (solved * moment).sum(axis=(1, 2, 3))
 
     def noise_N(self) -> float:
         """Return the standard deviation of a sample in N, from second differences."""
@@ -346,6 +310,11 @@ class Rises:
         height = 1 - start_N / np.maximum(levels * self.limit[:, 0], 1e-300)
         remaining = np.exp(-slid * sigma_0 / self.limit) * height[:, None]
         return int(((remaining > 1 - SHARE[1]) & (remaining < 2 - SHARE[0]) & (slid > 0) & self.there).sum())
+
+
+def _stacked(whole: np.ndarray, start: np.ndarray, *lagging: np.ndarray) -> np.ndarray:
+    """Return the columns of level and start, without and with lag, shape (2, strokes, 2, rows)."""
+    return np.stack([np.stack(both, axis=1) for both in ((whole, start), lagging)])
 
 
 def _followed(slid: np.ndarray, added: np.ndarray, begin: np.ndarray | float = 0.0) -> np.ndarray:

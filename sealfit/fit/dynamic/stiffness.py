@@ -24,6 +24,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from sealfit.fit.dynamic.bristle_model import Curve, Rises, Stroke, Tangent
+from sealfit.fit.joint.search import least_squares_within
 from sealfit.fit.least_squares import levenberg_marquardt
 
 # Number of samples inside the rise that an estimate needs.
@@ -116,11 +117,10 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     level = rises.run_levels(found.level)
     inverse = np.linalg.pinv(found.normal.sum(axis=0), rcond=1e-12, hermitian=True)
     shifts = []
-    for other in (rises.along(moved) for moved in curve.moved()):
-        at = x + _step(
-            found.normal.sum(axis=0), np.einsum("ikr,kr->i", found.jacobian, other.solved(x)[1]), x, bounds
-        )
-        shifts.append(at - x + [other.run_levels(other.solved(at)[0]).mean() - level.mean(), 0.0])
+    for other in (Rises(strokes, moved) for moved in curve.moved()):
+        pull = np.einsum("ikr,kr->i", found.jacobian, other.tangent(x).residual)
+        at = x + _step(found.normal.sum(axis=0), pull, *(bounds - x))
+        shifts.append(at - x + [other.run_levels(other.tangent(at).level).mean() - level.mean(), 0.0])
     by_files, df = _between_files(found, inverse, rises.file)
     by_level = float(level.var(ddof=1) / level.size) if level.size > 1 else np.nan
     by_curve = np.array(shifts).T @ np.array(shifts) if shifts else np.zeros((2, 2))
@@ -143,20 +143,12 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     )
 
 
-def _step(normal: np.ndarray, pull: np.ndarray, x: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Return a Gauss-Newton step from J'J and J'r, shape (p,), parameters fixed at bounds it would cross."""
-    step, free = np.zeros(x.size), np.ones(x.size, bool)
+def _step(normal: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return a Gauss-Newton step within bounds from J'J and J'r, shape (p,)."""
     scale = np.sqrt(np.diag(normal))
     scale = np.where(scale > 0, scale, 1.0)
-    for _ in range(x.size):
-        target = -(pull + normal @ np.where(free, 0.0, step)) / scale
-        scaled = (normal / np.outer(scale, scale))[np.ix_(free, free)]
-        step[free] = np.linalg.lstsq(scaled, target[free], rcond=1e-12)[0] / scale[free]
-        over = free & ((x + step < bounds[0]) | (x + step > bounds[1]))
-        if not over.any():
-            break
-        step[over], free = (np.clip(x + step, *bounds) - x)[over], free & ~over
-    return step
+    scaled = normal / np.outer(scale, scale)
+    return least_squares_within(scaled, -pull / scale, low * scale, high * scale) / scale
 
 
 def together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray:
