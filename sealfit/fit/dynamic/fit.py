@@ -119,9 +119,6 @@ def dynamic_units(config: Config) -> Mapping[str, str]:
 # Columns of table `traces` that are read.
 OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]
 
-# Columns of a table, all of one length.
-Columns = dict[str, np.ndarray]
-
 
 @dataclass(frozen=True)
 class Dynamic:
@@ -171,120 +168,77 @@ def fit_dynamic(
     """
     steady = steady[steady["used"].astype(bool) & steady["condition"].notna()].reset_index(drop=True)
     asked = _asked(traces, steady, steady_fit)
-    found = [
-        one for made in run_map(partial(_fit_some, config=config), asked, workers=workers) for one in made
-    ]
-    found.sort(key=lambda one: one.name)
-    curves, broken, largest = (_stacked(found, name) for name in ("curves", "broken", "largest"))
-    rows = [
-        pd.DataFrame([row for one in found for row in one.rows]),
+    found = run_map(partial(_fit_some, config=config), asked, workers=workers)
+    rows, curves, broken, largest = (_together(tables) for tables in zip(*found, strict=True))
+    tables = [
+        rows,
         largest_rows(largest, config) if len(largest) else largest,
         break_away_rows(broken, _widened(steady_fit), config) if len(broken) else broken,
     ]
     keys = condition_keys(steady, config)
-    table = pd.concat([part for part in rows if len(part)], ignore_index=True)
+    table = pd.concat([part for part in tables if len(part)], ignore_index=True)
     table = table.merge(keys, on="condition", how="left", validate="many_to_one").assign(model="before")
     fixed = DYNAMIC_FIT.names()
     table = table.reindex(columns=[*fixed, *(name for name in keys.columns if name not in fixed)])
     return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """Some conditions: their traces, and their rows of `steady` and `steady_fit`."""
-
-    traces: pd.DataFrame | StoredTraces
-    steady: pd.DataFrame
-    steady_fit: pd.DataFrame
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Results of one condition: rows of the fit; columns of mean starts, break-aways and largest forces."""
-
-    name: str
-    rows: list[dict]
-    curves: Columns
-    broken: Columns
-    largest: Columns
+# The traces of some conditions, and their rows of `steady` and `steady_fit`.
+Asked = tuple[pd.DataFrame | StoredTraces, pd.DataFrame, pd.DataFrame]
 
 
 def _asked(
     traces: pd.DataFrame | Sequence[StoredTraces], steady: pd.DataFrame, steady_fit: pd.DataFrame
-) -> list[_Asked]:
+) -> list[Asked]:
     """Return the conditions to fit, in partitions that are read together."""
     if isinstance(traces, pd.DataFrame):
-        return [_Asked(traces, steady, steady_fit)]
+        return [(traces, steady, steady_fit)]
     piece = {condition: k for k, part in enumerate(traces) for condition in part.conditions}
     rows = [dict(iter(table.groupby(table["condition"].map(piece)))) for table in (steady, steady_fit)]
     return [
-        _Asked(part, rows[0][k], rows[1].get(k, steady_fit.iloc[:0]))
+        (part, rows[0][k], rows[1].get(k, steady_fit.iloc[:0]))
         for k, part in enumerate(traces)
         if k in rows[0]
     ]
 
 
-def _stacked(found: Sequence[_Found], name: str) -> pd.DataFrame:
-    """Return the columns in one attribute of all conditions as one table, with the condition."""
-    parts = [(one.name, getattr(one, name)) for one in found if getattr(one, name)]
-    if not parts:
-        return pd.DataFrame()
-    table = {key: np.concatenate([columns[key] for _, columns in parts]) for key in parts[0][1]}
-    sizes = [len(columns["direction"]) for _, columns in parts]
-    return pd.DataFrame({"condition": np.repeat([one for one, _ in parts], sizes), **table})
+def _together(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return tables of conditions as one, in order of the conditions."""
+    parts = [table for table in tables if len(table)]
+    return pd.concat(parts).sort_values("condition", kind="stable", ignore_index=True) if parts else tables[0]
 
 
-class _Strokes:
-    """Table `steady` as arrays of shape (strokes,), and the groups of one condition, speed and direction."""
-
-    def __init__(self, steady: pd.DataFrame) -> None:
-        self.load_N, self.speed_mm_s, force = (
-            steady[name].to_numpy(float) for name in ("load_N", "speed_mm_s", "force_N")
-        )
-        self.direction, self.speed_set_mm_s = (
-            steady[name].to_numpy() for name in ("direction", "speed_set_mm_s")
-        )
-        self.size_N = force * self.direction
-        self.file = pd.factorize(steady["file"])[0]
-        self.group = (
-            steady.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False).ngroup().to_numpy()
-        )
-        self.conditions = steady.groupby("condition", sort=True).indices
-
-
-def _fit_some(asked: _Asked, config: Config) -> list[_Found]:
-    traces = (
-        asked.traces
-        if isinstance(asked.traces, pd.DataFrame)
-        else asked.traces.read(OF_TRACES, coded=["file"])
-    )
-    table = asked.steady.reset_index(drop=True)
+def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
+    """Return the rows of the fit, the mean starts, the break-aways and the largest forces of conditions."""
+    traces, steady, steady_fit = asked
+    if not isinstance(traces, pd.DataFrame):
+        traces = traces.read(OF_TRACES, coded=["file"])
+    groups = steady.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False)
+    numbers = {"group": groups.ngroup(), "file_number": pd.factorize(steady["file"])[0]}
+    table = steady.assign(size_N=steady["force_N"] * steady["direction"], **numbers).reset_index(drop=True)
     along = _less_effects(strokes_along(traces, table), table)
     starts = {start.row: start for start in starts_of(along)}
     wholes = {whole.row: whole for whole in whole_strokes(along)}
-    strokes, fitted = _Strokes(table), _fitted(asked.steady_fit)
-    run = np.full(len(table), -1)
-    run[list(starts)] = pd.factorize(nesting_run(table.iloc[list(starts)]))[0]
-    made = []
-    for name, rows in strokes.conditions.items():
-        rows = rows[np.argsort(strokes.group[rows], kind="stable")]
-        own, whole = ([parts[row] for row in rows.tolist() if row in parts] for parts in (starts, wholes))
-        curve = _curve(fitted.get(name, {}), strokes, rows)
-        braked = _against_motion(own, strokes)
-        found = fit_stiffness(_evidence(own, strokes, run, curve), curve) if braked else None
-        models = found.forces_N if found is not None and found.seen else None
-        fit = [{"condition": name, **row} for row in bristle_rows(found, curve, config, braked=braked)]
-        begun = _Grouped(own, strokes) if own else None
-        made.append(
-            _Found(
-                name,
-                rows=fit,
-                curves=begun.curves(models) if begun else {},
-                broken=begun.peaks() if begun else {},
-                largest=_Grouped(whole, strokes).peaks() if whole else {},
-            )
+    begun = steady.iloc[list(starts)]
+    table.loc[list(starts), "run_number"] = pd.factorize(nesting_run(begun))[0]
+    fitted = _fitted(steady_fit)
+    tables = [[], [], [], []]
+    for name, own in table.sort_values("group", kind="stable").groupby("condition", sort=True):
+        start, whole = (
+            [parts[row] for row in own.index.tolist() if row in parts] for parts in (starts, wholes)
         )
-    return made
+        curve = _curve(name, fitted, own)
+        of_starts = own.loc[[one.row for one in start]]
+        braked = bool((of_starts["size_N"] > 0).all())  # as the model needs
+        found = fit_stiffness(_evidence(start, of_starts, curve), curve) if braked else None
+        models = found.forces_N if found is not None and found.seen else None
+        made = [pd.DataFrame(bristle_rows(found, curve, config, braked=braked))]
+        grouped = _Grouped(start, table) if start else None
+        made += [grouped.curves(models), grouped.peaks()] if grouped else [pd.DataFrame(), pd.DataFrame()]
+        made.append(_Grouped(whole, table).peaks() if whole else pd.DataFrame())
+        for kept, one in zip(tables, made, strict=True):
+            kept.append(one.assign(condition=name))
+    return [pd.concat(parts, ignore_index=True) for parts in tables]
 
 
 def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Along]:
@@ -298,26 +252,22 @@ def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Al
 class _Grouped:
     """Parts of strokes of one condition, in groups of one commanded speed and direction."""
 
-    def __init__(self, parts: Sequence[Part], strokes: _Strokes) -> None:
-        rows = np.array([part.row for part in parts])
-        group = np.unique(strokes.group[rows], return_inverse=True)[1]
-        self.cells, self.file = Cells(parts, group), strokes.file[rows]
-        first = rows[self.cells.groups.start]
-        self.at = {"speed_set_mm_s": strokes.speed_set_mm_s[first], "direction": strokes.direction[first]}
+    def __init__(self, parts: Sequence[Part], table: pd.DataFrame) -> None:
+        own = table.loc[[part.row for part in parts]]
+        group = np.unique(own["group"], return_inverse=True)[1]
+        self.cells, self.file = Cells(parts, group), own["file_number"].to_numpy()
+        self.at = own[["speed_set_mm_s", "direction"]].iloc[self.cells.groups.start].reset_index(drop=True)
 
-    def peaks(self) -> Columns:
-        """Return the columns of `peaks`, with speed and direction."""
+    def peaks(self) -> pd.DataFrame:
+        """Return the result of `peaks` as a table, with speed and direction."""
         found = peaks(self.cells, self.file)
-        group = found.pop("group")
-        return {**{name: values[group] for name, values in self.at.items()}, **found}
+        at = self.at.iloc[found.pop("group")].reset_index(drop=True)
+        return at.assign(**found)
 
-    def curves(self, models: Sequence[np.ndarray] | None) -> Columns:
+    def curves(self, models: Sequence[np.ndarray] | None) -> pd.DataFrame:
         """Return the mean starts, measured and, if there is a fit, modelled, as table `dynamic_curves`."""
         force, error, n = mean_over(self.cells, self.cells.force_N)
-        model = (
-            np.full(n.shape, np.nan) if models is None else mean_over(self.cells, self.cells.means(models))[0]
-        )
-        group, cell = np.nonzero(n > 0)
+        model = mean_over(self.cells, self.cells.means(models))[0] if models else np.full(n.shape, np.nan)
         table = {
             "distance_mm": self.cells.middle_mm,
             "force_N": force,
@@ -325,8 +275,9 @@ class _Grouped:
             "n": n,
             "model_N": model,
         }
-        columns = {name: values[group, cell] for name, values in table.items()}
-        return {**{name: values[group] for name, values in self.at.items()}, **columns}
+        group, cell = np.nonzero(n > 0)
+        at = self.at.iloc[group].reset_index(drop=True)
+        return at.assign(**{name: values[group, cell] for name, values in table.items()})
 
 
 def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
@@ -340,29 +291,20 @@ def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
     return (float(table["chi2"].sum()) / df, df) if df > 0 else (1.0, 1.0)
 
 
-def _against_motion(starts: Sequence[Start], strokes: _Strokes) -> bool:
-    """Return whether the sliding force of every start opposes the motion, as the model needs.
-
-    An offset between the directions or a wrong sign can reverse it.
-    """
-    return all(strokes.size_N[start.row] > 0 for start in starts)
-
-
-def _evidence(starts: Sequence[Start], strokes: _Strokes, run: np.ndarray, curve: Curve) -> list[Stroke]:
+def _evidence(starts: Sequence[Start], steady: pd.DataFrame, curve: Curve) -> list[Stroke]:
     """Return the starts of a condition with their units of evidence and their ratio to the curve.
 
-    The ratio is that of the loads, or of the sliding forces if the curve is not determined.
+    The ratio is that of the loads, or of the sliding forces if the curve is not determined. `steady` has the
+    row of each start.
     """
-    rows = np.array([start.row for start in starts], int)
-    size = (strokes.load_N if curve.known else strokes.size_N)[rows]
+    size = steady["load_N" if curve.known else "size_N"].to_numpy(float)
     known = size[~np.isnan(size)]
     ratio = size / (curve.coulomb_N if not curve.known else known.mean() if known.size else 1.0)
-    units = (_numbered(numbers[rows]).tolist() for numbers in (strokes.file, run))
+    ratio = np.where(np.isnan(ratio), 1.0, ratio).tolist()
+    units = (_numbered(steady[name].to_numpy(int)).tolist() for name in ("file_number", "run_number"))
     return [
         Stroke(file, run, part, s.distance_mm, s.speed_mm_s, s.force_N)
-        for file, run, part, s in zip(
-            *units, np.where(np.isnan(ratio), 1.0, ratio).tolist(), starts, strict=True
-        )
+        for file, run, part, s in zip(*units, ratio, starts, strict=True)
     ]
 
 
@@ -371,41 +313,38 @@ def _numbered(numbers: np.ndarray) -> np.ndarray:
     return numbers if (numbers != numbers[:1]).any() else np.arange(len(numbers))
 
 
-def _fitted(steady_fit: pd.DataFrame) -> dict[str, dict[tuple[str, str], float]]:
-    """Return the values of table `steady_fit` by condition, quantity and parameter; only identified ones."""
-    made: dict[str, dict[tuple[str, str], float]] = {}
-    names = ("condition", "quantity", "parameter", "value", "identified")
-    for condition, quantity, parameter, value, identified in zip(
-        *(steady_fit[name].tolist() for name in names), strict=True
-    ):
-        if identified or quantity != "steady":
-            made.setdefault(condition, {}).setdefault((quantity, parameter), value)
-    return made
+# Values of table `steady_fit` by condition, quantity and parameter.
+Known = Mapping[tuple[str, str, str], float]
 
 
-def _curve(fitted: Mapping[tuple[str, str], float], strokes: _Strokes, rows: np.ndarray) -> Curve:
+def _fitted(steady_fit: pd.DataFrame) -> Known:
+    """Return the values of table `steady_fit`, of parameters only identified ones."""
+    rows = steady_fit[steady_fit["identified"].to_numpy(bool) | (steady_fit["quantity"] != "steady")]
+    keys = zip(rows["condition"], rows["quantity"], rows["parameter"], strict=True)
+    return dict(zip(keys, rows["value"].tolist(), strict=True))
+
+
+def _curve(condition: str, fitted: Known, steady: pd.DataFrame) -> Curve:
     """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified."""
-    load = strokes.load_N[rows].mean()
-    sigma_2 = max(float(fitted.get(("steady", "sigma_2"), 0.0)), 0.0)
-    flat = float(np.median(strokes.size_N[rows] - sigma_2 * np.abs(strokes.speed_mm_s[rows])))
+    load = steady["load_N"].mean(skipna=False)
+    sigma_2 = max(float(fitted.get((condition, "steady", "sigma_2"), 0.0)), 0.0)
     for static, coulomb, factor in (("mu_s", "mu_c", load), ("F_s", "F_c", 1.0)):
-        known = [fitted.get(("steady", name)) for name in (static, coulomb, "v_s")]
+        known = [fitted.get((condition, "steady", name)) for name in (static, coulomb, "v_s")]
         if None not in known:
             own_unit = np.array([factor, factor, 1.0, 1.0])
-            covariance = _covariance(fitted, (static, coulomb, "v_s", "sigma_2")) * np.outer(
-                own_unit, own_unit
-            )
-            df = int(fitted.get(("statistics", "df"), 1))
+            covariance = _covariance(condition, fitted, (static, coulomb, "v_s", "sigma_2"))
+            df = int(fitted.get((condition, "statistics", "df"), 1))
+            covariance = covariance * np.outer(own_unit, own_unit)
             return Curve(known[0] * factor, known[1] * factor, known[2], sigma_2, covariance, df)
+    flat = float(np.median(steady["size_N"] - sigma_2 * steady["speed_mm_s"].abs()))
     return Curve(flat, flat, np.inf, sigma_2)
 
 
-def _covariance(fitted: Mapping[tuple[str, str], float], names: Sequence[str]) -> np.ndarray:
+def _covariance(condition: str, fitted: Known, names: Sequence[str]) -> np.ndarray:
     """Return the covariance of a steady fit's parameters, shape (p, p), 0 if unknown."""
     covariance = np.zeros((len(names), len(names)))
-    for i, one in enumerate(names):
-        for j, other in enumerate(names):
-            pairs = (("covariance", f"{one},{other}"), ("covariance", f"{other},{one}"))
-            value = next((fitted[pair] for pair in pairs if pair in fitted), np.nan)
-            covariance[i, j] = value if np.isfinite(value) else 0.0
+    for i, j in np.ndindex(covariance.shape):
+        value = fitted.get((condition, "covariance", f"{names[i]},{names[j]}"), np.nan)
+        if np.isfinite(value):
+            covariance[i, j] = covariance[j, i] = value
     return covariance
