@@ -367,7 +367,11 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     FitError
         If a measured value or weight is not finite, or a weight is negative.
     """
-    check(problems.y, problems.weight)
+    y, weight = problems.y, problems.weight
+    if not (np.all(np.isfinite(y)) and np.all(np.isfinite(weight)) and np.all(weight >= 0)):
+        raise FitError(
+            "measured values and weights must be finite, weights not negative.", fix="Look for empty cells."
+        )
     rss, _ = profile(problems, grid)
     inner = rss[:, 1:-1]
     problem, k = np.nonzero((inner <= rss[:, :-2]) & (inner <= rss[:, 2:]))
@@ -419,17 +423,3 @@ def even_grid(low, high, per_decade: int) -> np.ndarray:
     """Return `per_decade` or more even points from `low` to `high`, natural logarithms, (problems, g)."""
     points = int(np.ceil(per_decade * np.max(high - low) / np.log(10))) + 1
     return low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
-
-
-def check(y, weight) -> None:
-    """Check measured values and weights.
-
-    Raises
-    ------
-    FitError
-        If one is not finite, or a weight is negative.
-    """
-    if not (np.all(np.isfinite(y)) and np.all(np.isfinite(weight)) and np.all(weight >= 0)):
-        raise FitError(
-            "measured values and weights must be finite, weights not negative.", fix="Look for empty cells."
-        )

@@ -12,7 +12,7 @@ from scipy.special import fdtrc, stdtrit
 
 from sealfit.effects import aging_laws
 from sealfit.errors import FitError
-from sealfit.fit.aging.joint_least_squares import solved, solved_without
+from sealfit.fit.aging.joint_least_squares import solved, solved_many
 from sealfit.fit.aging.law import paule_mandel
 from sealfit.fit.joint.prior import covariance_of
 from sealfit.fit.joint.whitening import blockwise
@@ -421,20 +421,13 @@ def left_out(law: JointLaw) -> dict[str, float]:
 
     Each of up to `MOST_LEFT_OUT` series is left out in turn.
     """
-    aged, drivers = law.aged, law.aged.drivers()
-    whole = aged.whole_series()
-    folds = {"series": whole if len(whole) > 2 else [], "last_day": aged.last_days()}
+    aged, whole = law.aged, law.aged.whole_series()
     plain = replace(aged, variance=None)  # `part` need not copy the covariance
-    kept = {
-        name: [out for out in masks if plain.part(~out).drivers() == drivers] for name, masks in folds.items()
-    }
-    masks = np.array([out for own in kept.values() for out in own])
-    if not len(masks):
-        return dict.fromkeys(kept, np.nan)
-    errors = law.at(aged, solved_without(law, aged.spread.whitening(law.scatter), masks)) - aged.value
-    found, start = {}, 0
-    for name, own in kept.items():
-        squares = errors[start : start + len(own)][masks[start : start + len(own)]] ** 2
-        found[name] = float(np.sqrt(np.mean(squares))) if squares.size else np.nan
-        start += len(own)
+    white, found = aged.spread.whitening(law.scatter), {}
+    for name, masks in (("series", whole if len(whole) > 2 else []), ("last_day", aged.last_days())):
+        kept = np.array([out for out in masks if plain.part(~out).drivers() == aged.drivers()])
+        found[name] = np.nan
+        if len(kept):
+            predicted = law.at(aged, solved_many(law, white, np.broadcast_to(aged.value, kept.shape), kept))
+            found[name] = float(np.sqrt(np.mean((predicted - aged.value)[kept] ** 2)))
     return found

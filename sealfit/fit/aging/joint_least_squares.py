@@ -51,47 +51,28 @@ def solved(law: JointLaw, white: csr_array, start: np.ndarray | None = None) -> 
     return x[np.argmin(rss)]
 
 
-def solved_many(law: JointLaw, white: csr_array, values: np.ndarray) -> np.ndarray:
-    """Return the parameters for many draws of the values, shape (draws, p), computed together.
+def solved_many(
+    law: JointLaw, white: csr_array, values: np.ndarray, masks: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the parameters for many sets of values, shape (sets, p), computed together.
 
     Parameters
     ----------
     law, white
         As `solved`; the parameters of the law are the starting point.
-    values : ndarray, shape (draws, n)
-        The draws.
+    values : ndarray, shape (sets, n)
+        The sets.
+    masks : ndarray of bool, shape (sets, n), optional
+        Values to leave out of each set.
     """
-    return _Projected(law, white, values).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
-
-
-def solved_without(law: JointLaw, white: csr_array, masks: np.ndarray) -> np.ndarray:
-    """Return the parameters without the values of each mask, shape (masks, p), computed together.
-
-    Parameters
-    ----------
-    law, white
-        As `solved`; the parameters of the law are the starting point.
-    masks : ndarray of bool, shape (masks, n)
-        Values to leave out.
-    """
-    values = np.broadcast_to(law.aged.value, masks.shape)
-    return _Projected(law, white, values, masks).polished(np.tile(law.x[LINEAR:], (len(masks), 1)))[0]
+    return _Projected(law, white, values, masks).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
 
 
 class _Projected:
     """Variable projection of a law on sets of values: mu_0 and a are solved for.
 
-    Parameters
-    ----------
-    values : ndarray, shape (sets, n)
-        Sets of values; `law` and `white` as in `solved`.
-    masks : ndarray of bool, shape (sets, n), optional
-        Values to leave out of each set.
-
-    Notes
-    -----
-    Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036, with the tangent of
-    Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995.
+    Its arguments are those of `solved_many`. Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
+    doi:10.1137/0710036, with the tangent of Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995.
     """
 
     def __init__(self, law: JointLaw, white: csr_array, values: np.ndarray, masks: np.ndarray | None = None):

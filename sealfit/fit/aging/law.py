@@ -11,7 +11,7 @@ doi:10.1137/0710036). The cost is proportional to the number of series.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -148,15 +148,14 @@ class Values:
         """Return some of the values, with origins and curves renumbered."""
         curve = self.curve[keep]
         numbered = np.searchsorted(np.unique(curve[curve >= 0]), curve)
-        return Values(
-            self.days[keep],
-            self.value[keep],
-            np.unique(self.origin[keep], return_inverse=True)[1],
-            np.where(curve >= 0, numbered, -1),
-            self.covariance[keep][:, keep],
-            None if self.size is None else self.size[keep],
-            self.replicates_df,
-            self.level_df,
+        return replace(
+            self,
+            days=self.days[keep],
+            value=self.value[keep],
+            origin=np.unique(self.origin[keep], return_inverse=True)[1],
+            curve=np.where(curve >= 0, numbered, -1),
+            covariance=self.covariance[keep][:, keep],
+            size=None if self.size is None else self.size[keep],
         )
 
     def scale(self, model: np.ndarray) -> np.ndarray:
@@ -197,23 +196,12 @@ class Groups:
         self.bounds = np.full((2, *self.places.shape), np.inf)  # of the parameters
         self.bounds[0] *= -1
         self.bounds[:, :, b] = np.array(values.limits)[:, curves]
-        white, count = values.whitening.tocoo(), np.arange(rows.shape[1])
-        number, place = np.full(values.value.size, -1), np.zeros(values.value.size, int)
-        number[rows], place[rows] = np.arange(len(rows))[:, None], count
-        own = number[white.row] >= 0
-        number, column, data = number[white.row[own]], place[white.col[own]], white.data[own]
-        down = place[white.row[own]] - column
-        # Of the whitening, from the main one downwards: as many as there are values of a condition.
-        self.diagonals = [np.zeros((len(rows), count.size - d)) for d in range(down.max() + 1)]
-        for d, diagonal in enumerate(self.diagonals):
-            diagonal[number[down == d], column[down == d]] = data[down == d]
+        row, column = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
+        self.whitening = values.whitening[row.ravel(), column.ravel()].reshape(row.shape)
 
     def white(self, columns: np.ndarray, of: np.ndarray) -> np.ndarray:
         """Return whitened columns, shape (r, c, n), of the groups `of`, shape (r,)."""
-        found = self.diagonals[0][of, None] * columns
-        for down, own in enumerate(self.diagonals[1:], start=1):
-            found[..., down:] += own[of, None] * columns[..., :-down]
-        return found
+        return columns @ np.swapaxes(self.whitening[of], 1, 2)
 
     def evaluate(self, x: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whitened residuals, shape (r, n), and derivatives, (r, p, n), of groups at x, (r, p)."""

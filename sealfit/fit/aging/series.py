@@ -276,25 +276,19 @@ def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.
         Table `aging_curves`; the band is that of the population mean, from the covariance of mu_0, a and ln
         b.
     """
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in AGING_CURVES.names()}
+    tables = []
     for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
-        known = dict(
-            zip(zip(own["quantity"], own["parameter"], strict=True), own["value"].tolist(), strict=True)
-        )
+        keys = zip(own["quantity"], own["parameter"], strict=True)
+        known = dict(zip(keys, own["value"].tolist(), strict=True))
         for quantity in [quantity for quantity, parameter in known if parameter == "mu_0"]:
-            curve = _curve(known, quantity, days)
-            for name, values in curve.items():
-                parts[name].append(values)
-            if curve:
-                parts["series"].append(np.full(curve["value"].size, series, object))
-                parts["quantity"].append(np.full(curve["value"].size, quantity, object))
-    texts = {name: "str" if name in ("series", "quantity") else float for name in parts}
-    return pd.DataFrame(
-        {
-            name: pd.Series(np.concatenate(own) if own else [], dtype=texts[name])
-            for name, own in parts.items()
-        }
-    )
+            curve = pd.DataFrame(_curve(known, quantity, days), columns=AGING_CURVES.names())
+            tables.append(curve.assign(series=series, quantity=quantity))
+    return pd.concat([curve for curve in tables if len(curve)] or [_no_curve()], ignore_index=True)
+
+
+def _no_curve() -> pd.DataFrame:
+    texts = dict.fromkeys(("series", "quantity"), "str")
+    return pd.DataFrame(columns=AGING_CURVES.names(), dtype=float).astype(texts)
 
 
 def _curve(
