@@ -135,18 +135,11 @@ def _squares(rest: np.ndarray) -> np.ndarray:
 
 
 def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
-    """Return the derivative of `residual` at `x`, shape (n, p), by central differences of fourth order.
+    """Return the derivative of `residual`, (p,) -> (n,), at `x`, shape (n, p), by fourth-order differences.
 
     The step is 1e-4 of each parameter. Rounding errors are near 1e-12 of the derivative, and a location
     parameter a hundred widths from the origin (a peak at 450 nm, 4 nm wide) changes by a hundredth of its
     width.
-
-    Parameters
-    ----------
-    residual : callable
-        (p,) -> (n,).
-    x : ndarray, shape (p,)
-        Point of evaluation.
     """
     h = 1e-4 * np.where(x == 0, 1.0, np.abs(x))
     points = x + np.array([-2, -1, 1, 2])[:, None, None] * np.diag(h)
@@ -157,12 +150,8 @@ def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray
 def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return (J'J)^-1, shape (..., p, p), and its rank; undetermined parameters have infinite variance.
 
-    Parameters
-    ----------
-    jacobian : ndarray, shape (..., n, p)
-        Derivative J of the weighted residual, of one or many problems.
-    free : ndarray of bool, shape (..., p), optional
-        Parameters that are fitted; the others have variance 0.
+    J, shape (..., n, p), is the derivative of the weighted residual, of one or many problems. Parameters not
+    in `free`, shape (..., p), are fixed: their variance is 0.
     """
     n, p = jacobian.shape[-2:]
     free = np.ones(p, bool) if free is None else free
@@ -235,10 +224,8 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
 
     Parameters
     ----------
-    gram : ndarray, shape (..., p, p)
-        B'B of the columns, scaled to unit diagonal (0 for a column of zeros).
-    moment : ndarray, shape (..., p)
-        B'y.
+    gram, moment : ndarray, shape (..., p, p) and (..., p)
+        B'B of the columns, scaled to unit diagonal (0 for a column of zeros), and B'y.
     nonnegative : sequence of bool, length p
         Which coefficients are nonnegative.
 
@@ -322,19 +309,10 @@ class Separable:
 
 
 def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least weighted sum of squares and the coefficients at given nonlinear parameters.
+    """Return the least weighted sums of squares, (problems, g), and coefficients, (problems, g, p).
 
-    Parameters
-    ----------
-    u : ndarray, shape (problems, g)
-        Nonlinear parameters.
-    refine : int
-        Steps of iterative refinement: 0 for a search, 2 for full accuracy.
-
-    Returns
-    -------
-    rss : ndarray, shape (problems, g)
-    coefficients : ndarray, shape (problems, g, p)
+    `u`, shape (problems, g), are the nonlinear parameters. `refine` steps of iterative refinement are made: 0
+    for a search, 2 for full accuracy.
     """
     y, weight, nonnegative = problems.y, problems.weight, problems.nonnegative
     root, rows = np.sqrt(weight), np.arange(len(y))
@@ -353,14 +331,10 @@ def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.
 
 
 def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
-    """Return the global least-squares optimum of each problem on the range of its grid.
+    """Return the global least-squares optimum of each problem on the range of its grid, shape (problems, g).
 
-    Every local minimum along the grid is refined. The result is the best of them, or an end of the grid.
-
-    Parameters
-    ----------
-    grid : ndarray, shape (problems, g)
-        Rising nonlinear parameters, so close that no minimum lies between two of them.
+    The grid rises, so closely that no minimum lies between two points. Every local minimum along it is
+    refined. The result is the best of them, or an end of the grid.
 
     Raises
     ------

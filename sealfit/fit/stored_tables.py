@@ -85,12 +85,7 @@ def _without_intervals(rows: pd.DataFrame) -> pd.DataFrame:
 def whole_steady_fit(read: Callable[[str], pd.DataFrame], suffix: str = "") -> pd.DataFrame:
     """Return the long table that `fit_conditions` returned, from those in which it is stored.
 
-    Parameters
-    ----------
-    read : callable
-        Returns a stored table by its name.
-    suffix : str
-        "_after" for the fit with the loop's effects taken out.
+    `read` returns a stored table by its name; `suffix` is "_after" for the fit without the loop's effects.
     """
     fit, covariance, shift = (read(f"{name}{suffix}") for name in ("steady_fit", *SPLIT["steady_fit"]))
     pairs = covariance["parameter"] + "," + covariance["other"]

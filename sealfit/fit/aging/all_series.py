@@ -28,15 +28,7 @@ START_POINTS = 20
 
 
 def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
-    """Return the values of one quantity of a rubber at the conditions where the forces determine it.
-
-    Parameters
-    ----------
-    levels : Levels
-        Result of `shared_levels`.
-    rubber, quantity : str
-        Name of the rubber; "mu_s", "mu_c", "F_s" or "F_c".
-    """
+    """Return the values of one quantity of a rubber at the conditions where the forces determine it."""
     of = (levels.table["rubber"] == rubber) & (levels.table["quantity"] == quantity)
     rows, here = levels.table[of], of.to_numpy()
 
@@ -57,14 +49,7 @@ def joint_laws(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions.
 
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady`: the forces.
-    steady_fit : DataFrame
-        Table `steady_fit` with the condition columns.
-    config : Config
-        Says whether rubber is aged, and gives the units.
+    They are fitted to the forces in table `steady`, with `steady_fit` and its condition columns.
     """
     data = {}
     if config.aging and "aging_days" in steady_fit.columns:
@@ -178,16 +163,7 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
 def law_of(
     steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: str | None = None
 ) -> list[JointLaw]:
-    """Return the laws of one quantity in order of BIC, or only a named one.
-
-    Parameters
-    ----------
-    steady, steady_fit : DataFrame
-        Tables of these names.
-    quantity : str
-        "mu_s", "mu_c", "F_s" or "F_c".
-    name : str, optional
-        Name of the law.
+    """Return the laws of one quantity, such as "mu_s", in order of BIC, or only a named one.
 
     Raises
     ------

@@ -89,12 +89,8 @@ class Aged:
     def covariance(self, scatter: float, about: np.ndarray | None = None) -> csr_array:
         """Return the covariance of the values, shape (n, n).
 
-        Parameters
-        ----------
-        scatter : float
-            Relative standard deviation between specimens, beyond the measured variance.
-        about : ndarray, shape (n,), optional
-            Values to which it is relative without `size`; default the measured ones.
+        `scatter` is the relative standard deviation between specimens, beyond the measured variance. Without
+        `size` it is relative to `about`, shape (n,), by default the measured values.
         """
         measured = np.zeros(self.value.size) if self.variance is None else self.variance
         about = self.value if about is None else about
@@ -162,17 +158,8 @@ class Aged:
 class Spread:
     """The covariance C(s) = M + s^2 diag(size)^2 of values for any scatter s, decomposed once.
 
-    Parameters
-    ----------
-    measured : sparse array, shape (n, n)
-        M.
-    size : ndarray, shape (n,)
-        Values to which the scatter is relative.
-
-    Notes
-    -----
-    Divided by the sizes, C is M' + s^2, and its eigenvectors are those of M' for every s. They are found for
-    each independent block of M.
+    M, shape (n, n), is the measured covariance. Divided by the sizes, shape (n,), C is M' + s^2, and its
+    eigenvectors are those of M' for every s. They are found for each independent block of M.
     """
 
     def __init__(self, measured: csr_array, size: np.ndarray) -> None:
@@ -348,14 +335,7 @@ class JointLaw:
 def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> JointLaw:
     """Fit one law to all series of a quantity, and the scatter between specimens.
 
-    Parameters
-    ----------
-    aged : Aged
-        Values of at least as many conditions as the law has parameters.
-    loss : str
-        Name in `LOSSES`.
-    acts_on : str
-        "rate" or "loss".
+    `loss` is a name in `LOSSES`; the law acts on "rate" or "loss".
 
     Raises
     ------

@@ -36,14 +36,8 @@ DEPENDENT = 1e-20
 def solved(law: JointLaw, white: csr_array, start: np.ndarray | None = None) -> np.ndarray:
     """Return the least-squares parameters, shape (p,), from a start or from the best points of a grid.
 
-    Parameters
-    ----------
-    law : JointLaw
-        Gives the shape, its target, the values and the references.
-    white : sparse array, shape (n, n)
-        W with W C W' = 1 for the covariance C of the values.
-    start : ndarray, shape (p,), optional
-        Starting point.
+    `law` gives the shape, its target, the values and the references; `white` is W, shape (n, n), with W C W'
+    = 1 for the covariance C of the values.
     """
     problem = _Projected(law, white, law.aged.value[None])
     nonlinear = problem.grid() if start is None else start[None, LINEAR:]
@@ -56,14 +50,7 @@ def solved_many(
 ) -> np.ndarray:
     """Return the parameters for many sets of values, shape (sets, p), computed together.
 
-    Parameters
-    ----------
-    law, white
-        As `solved`; the parameters of the law are the starting point.
-    values : ndarray, shape (sets, n)
-        The sets.
-    masks : ndarray of bool, shape (sets, n), optional
-        Values to leave out of each set.
+    As `solved`, from the law's parameters. The values in `masks` are left out; both have the shape (sets, n).
     """
     return _Projected(law, white, values, masks).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
 
@@ -103,12 +90,8 @@ class _Projected:
     def solve(self, nonlinear: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mu_0 and a, shape (r, 2), the whitened residual, (r, n), and its derivative, (r, p - 2, n).
 
-        Parameters
-        ----------
-        nonlinear : ndarray, shape (r, p - 2)
-            All other parameters.
-        of : ndarray of int, shape (r,)
-            Number of the set of values.
+        `nonlinear`, shape (r, p - 2), are all other parameters; `of`, shape (r,), the numbers of the sets of
+        values.
         """
         law, measured = self.law, self.measured[of]
         # The law with mu_0 = 0 and a = -1 is the loss.

@@ -167,21 +167,9 @@ class Groups:
     """Groups of values and of their curves, of one size each and independent given mu_0.
 
     A group is a series with its correlated quantities, an unaged condition, or, if batches correlate
-    conditions, several of them. The parameters of a group are all mu_0, then a, then ln b of its curves.
-
-    Parameters
-    ----------
-    values : Values
-        All values.
-    rows, curves : ndarray of int, shape (g, n) and (g, w)
-        The values and the curves of each group, ascending.
-
-    Attributes
-    ----------
-    places : ndarray of int, shape (g, p)
-        Places of the parameters of each group among all parameters.
-    bounds : ndarray, shape (2, g, p)
-        Limits of the parameters.
+    conditions, several of them. `rows`, shape (g, n), and `curves`, (g, w), are its values and curves,
+    ascending. Its p parameters are all mu_0, then a, then ln b of its curves; `places`, shape (g, p), are
+    their places among all parameters, and `bounds`, shape (2, g, p), their limits.
     """
 
     def __init__(self, values: Values, rows: np.ndarray, curves: np.ndarray) -> None:
@@ -224,12 +212,7 @@ class Groups:
     def eliminated(self, x: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Return whitened derivatives with respect to mu_0 and a column, a and b eliminated, (g, m + 1, n).
 
-        Parameters
-        ----------
-        x : ndarray, shape (all,)
-            All parameters.
-        column : ndarray, shape (g, n)
-            Any whitened column.
+        `x`, shape (all,), are all parameters; `column`, shape (g, n), is any whitened column.
         """
         _, slope = self.evaluate(x[self.places], np.arange(len(self.rows)))
         columns = np.concatenate([slope[:, : self.m], column[:, None]], axis=1)
@@ -278,14 +261,7 @@ def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
 
     Every curve is first fitted alone (with the unaged values of its quantity). Then all are fitted together
     from this start. Then each b is searched over its whole range with the other parameters fixed, until none
-    improves the fit.
-
-    Parameters
-    ----------
-    values : Values
-        At least one value per parameter.
-    start : ndarray, shape (p,), optional
-        Parameters of a fit to nearly the same values, for a local fit only.
+    improves the fit. From `start`, the parameters of a fit to nearly the same values, the fit is only local.
     """
     if start is not None:
         return _polished(values, start)
@@ -407,18 +383,9 @@ def _rescan(found: LawFit) -> np.ndarray | None:
 def paule_mandel(chi2: Callable[[float], float], df: float, residual: np.ndarray) -> float:
     """Return the relative scatter that reduces chi-square to its degrees of freedom; 0 if it is not larger.
 
-    Parameters
-    ----------
-    chi2 : callable
-        Chi-square as a function of the scatter, with which it falls.
-    df : float
-        Its degrees of freedom.
-    residual : ndarray
-        Relative residuals; the search starts at their RMS.
-
-    Notes
-    -----
-    Paule and Mandel 1982, J. Res. NBS 87(5), 377-385, doi:10.6028/jres.087.022.
+    `chi2` is chi-square as a function of the scatter, with which it falls; `residual` are the relative
+    residuals, at whose RMS the search starts. Paule and Mandel 1982, J. Res. NBS 87(5), 377-385,
+    doi:10.6028/jres.087.022.
     """
     if df < 1 or not chi2(0.0) > df:  # also if chi-square is NaN
         return 0.0

@@ -26,18 +26,8 @@ FIRST_STEP = 0.25
 def elsewhere(fit: LawFit, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return what all other groups contribute to the normal matrix of mu_0 and a whitened column.
 
-    Parameters
-    ----------
-    fit : LawFit
-        Joint fit.
-    columns : sequence of ndarray, shape (g, n) each
-        The column, by `values.groups`.
-
-    Returns
-    -------
-    list of ndarray, shape (g, m + 1, m + 1) each
-        By `values.groups`; a and b of the other groups are eliminated. Groups are independent, and their
-        contributions add.
+    `columns`, shape (g, n) each, and the results, shape (g, m + 1, m + 1) each, are by `values.groups`. a and
+    b of the other groups are eliminated. Groups are independent, and their contributions add.
     """
     pairs = zip(fit.values.groups, columns, strict=True)
     rows = [own.eliminated(fit.x, column) for own, column in pairs]
@@ -64,12 +54,7 @@ def likelihoods(fit: LawFit) -> list[tuple[np.ndarray, np.ndarray]]:
 def curve_errors(fit: LawFit, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the covariance of mu_0, a and ln b of curves, (curves, 3, 3), and their shift, (curves, 3).
 
-    Parameters
-    ----------
-    fit : LawFit
-        Joint fit.
-    moved : ndarray, shape (n,)
-        Change of the values that causes the shift.
+    `moved`, shape (n,), is the change of the values that causes the shift.
     """
     values, m = fit.values, fit.values.origins
     covariance, shift = np.zeros((values.curves, 3, 3)), np.zeros((values.curves, 3))
@@ -114,16 +99,9 @@ End = tuple[float, bool]  # of an interval of ln b, and whether it is open
 def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterval]:
     """Return the profile-likelihood intervals of every curve.
 
-    The interval of b is where the least chi-square at fixed ln b exceeds the minimum by at most the rise.
-    Those of a and c = -a ln b, which are linear in a at fixed b, are the unions of their intervals over these
-    b.
-
-    Parameters
-    ----------
-    fit : LawFit
-        Joint fit.
-    rise_of_origin : ndarray, shape (origins,)
-        t^2 of each quantity.
+    The interval of b is where the least chi-square at fixed ln b exceeds the minimum by at most the rise, t^2
+    of each quantity, shape (origins,). Those of a and c = -a ln b, which are linear in a at fixed b, are the
+    unions of their intervals over these b.
     """
     intervals: dict[int, CurveInterval] = {}
     for own, others in zip(fit.values.groups, likelihoods(fit), strict=True):
@@ -150,21 +128,8 @@ def _intervals(profile: _Profile, rise: np.ndarray) -> list[CurveInterval]:
 class _Profile:
     """The profile of chi-square along ln b of one curve in each of some groups.
 
-    Parameters
-    ----------
-    fit : LawFit
-        Joint fit.
-    own : Groups
-        The groups.
-    others : tuple of ndarray
-        The likelihood of mu_0 from all others, as in `likelihoods`.
-    place : int
-        Number of the curve within its group.
-
-    Attributes
-    ----------
-    chi2, log_b : ndarray, shape (g,)
-        Chi-square and ln b at the joint optimum.
+    `others` is the likelihood of mu_0 from all other groups, as in `likelihoods`, and `place` the number of
+    the curve within its group. `chi2` and `log_b`, shape (g,), are those of the joint optimum.
     """
 
     def __init__(self, fit: LawFit, own: Groups, others: tuple[np.ndarray, np.ndarray], place: int) -> None:

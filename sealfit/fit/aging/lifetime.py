@@ -221,12 +221,7 @@ def resampled(
     """Return the ends of the 95 % interval of the lifetime by a parametric bootstrap.
 
     Quantiles of the logarithm are multiplied by Student's over the normal quantile, as the scatter is an
-    estimate.
-
-    Parameters
-    ----------
-    draws, seed : int
-        Number of draws, and seed of the random numbers.
+    estimate. `seed` is that of the random numbers.
     """
     rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_pct)
     mean = law.at(law.aged)
@@ -332,14 +327,8 @@ def answer(
 ) -> dict:
     """Return a law's answer as plain values: the lifetime with its interval, or temperature for a lifetime.
 
-    Parameters
-    ----------
-    law, goal, temperature_C, compression_pct
-        As `lifetime`.
-    years : float, optional
-        Lifetime for which the temperature is computed.
-    resample : bool
-        Whether the interval is checked by `resampled`.
+    With `years` it is the temperature for this lifetime. With `resample` the interval is checked by
+    `resampled`.
 
     Raises
     ------

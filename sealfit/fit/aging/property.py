@@ -86,13 +86,7 @@ class Means:
 
 
 def means_of(specimens: pd.DataFrame) -> Means:
-    """Return the means of one property of one rubber, and their covariance.
-
-    Parameters
-    ----------
-    specimens : DataFrame
-        Rows of table `property_values` of one rubber and property.
-    """
+    """Return the means of one property of one rubber, and their covariance, from rows of its specimens."""
     specimens = specimens.assign(batch=specimens["batch"].fillna(""))
     specimen, batch, df = _variances(specimens)
     cells = specimens.groupby(["condition", "batch"], sort=True)["value"].agg(["mean", "size"]).reset_index()
@@ -193,15 +187,6 @@ def fit_properties(specimens: pd.DataFrame, config: Config) -> dict[str, pd.Data
 
 def laws_of_property(specimens: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
     """Return the laws of one property for all series in order of BIC, or only a named one.
-
-    Parameters
-    ----------
-    specimens : DataFrame
-        Table `property_values`.
-    quantity : str
-        Name of the property.
-    name : str, optional
-        Name of the law.
 
     Raises
     ------

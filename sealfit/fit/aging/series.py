@@ -166,12 +166,8 @@ def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], 
 def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> csr_array:
     """Return the covariance of steady values, shape (n, n); it is 0 between conditions.
 
-    Parameters
-    ----------
-    used : DataFrame
-        The values: `condition`, `quantity` (mu_s, ...) and `value`.
-    known : dict
-        The covariances: `values_of(steady_fit, "covariance")`.
+    `used` has the values: `condition`, `quantity` (mu_s, ...) and `value`. `known` are the covariances,
+    `values_of(steady_fit, "covariance")`.
     """
     quantity, n = used["quantity"].to_numpy(object), len(used)
     pairs, found = [], []
@@ -225,16 +221,9 @@ def between_scatter(values: Values) -> tuple[float, LawFit]:
 def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndarray) -> Iterator[dict]:
     """Yield the rows of table `aging_fit` of one rubber.
 
-    Parameters
-    ----------
-    values : Values
-        The fitted values.
-    curves : list of Curve
-        All curves, those without a law too.
-    fitted : list of str
-        Quantities with a law, in the order of `values.origin`.
-    moved : ndarray, shape (n,)
-        Change of the values if the sensor reads one standard uncertainty too high.
+    `fitted` are the quantities with a law, in the order of `values.origin`; `curves` are all, those without a
+    law too. `moved`, shape (n,), is the change of the values if the sensor reads one standard uncertainty too
+    high.
     """
     quantities = {}
     model = np.empty(values.value.size)

@@ -146,14 +146,8 @@ def largest_rows(found: pd.DataFrame, config: Config) -> pd.DataFrame:
     """Return rows of table `dynamic_fit` for the largest force in strokes over their sliding force.
 
     It may be at the end of a stroke as well as at its start, so it is no break-away; `reason` has its
-    position.
-
-    Parameters
-    ----------
-    found : DataFrame
-        Result of `peaks` for whole strokes, with the condition, commanded speed and direction of each unit.
-    config : Config
-        Gives the units.
+    position. `found` is the result of `peaks` for whole strokes, with condition, commanded speed and
+    direction.
     """
     groups = found.assign(**{RATIO: np.log(found[RATIO])}).groupby(AT, dropna=False, sort=False)
     table = groups.agg({RATIO: "mean", WHERE: "first", REACH: "first"}).reset_index()
@@ -225,12 +219,9 @@ def _places(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the cells of the peaks: per stroke from its group's other units, per group from all units.
 
-    Parameters
-    ----------
-    above, hits : ndarray, shape (strokes, cells)
-        Sum of the force above sliding over a window about each cell, and number of cells in the sum.
-    unit : ndarray of int, shape (strokes,)
-        Unit of evidence of each stroke.
+    `above` and `hits`, shape (strokes, cells), are the sum of the force above sliding over a window about
+    each cell, and the number of cells in the sum; `unit`, shape (strokes,), is the unit of evidence of each
+    stroke.
     """
 
     def highest(total: np.ndarray, count: np.ndarray) -> np.ndarray:

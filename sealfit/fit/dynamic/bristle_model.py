@@ -69,13 +69,7 @@ class Cells:
         return np.bincount(self._cell, minlength=self._shape[0] * self._shape[1]).reshape(self._shape)[:, :-1]
 
     def means(self, values: Sequence[np.ndarray]) -> np.ndarray:
-        """Return each stroke's mean in each cell, shape (strokes, cells); NaN without a sample.
-
-        Parameters
-        ----------
-        values : sequence of ndarray, shape (n,) each
-            Values of the samples of each stroke.
-        """
+        """Return each stroke's mean in each cell, shape (strokes, cells); NaN without a sample."""
         total = np.bincount(self._cell, np.concatenate(values), minlength=self._shape[0] * self._shape[1])
         return np.where(
             self._hits > 0, total.reshape(self._shape)[:, :-1] / np.maximum(self._hits, 1), np.nan
@@ -94,10 +88,7 @@ class Cells:
 def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the mean over strokes in each cell, its standard error and their number, (groups, cells) each.
 
-    Parameters
-    ----------
-    values : ndarray, shape (strokes, cells)
-        Values, NaN if missing.
+    `values`, shape (strokes, cells), are NaN if missing.
     """
     there = np.isfinite(values)
     n = cells.totals(there.astype(np.int64))
@@ -321,14 +312,7 @@ def _followed(slid: np.ndarray, added: np.ndarray, begin: np.ndarray | float = 0
     r"""Return x of the recursion :math:`x_k = e^{-s_k} x_{k-1} + a_k` along the last axis.
 
     With D the cumulative sum of s, :math:`x_k = e^{-D_k} (x_{-1} + \sum_j a_j e^{D_j})`. If that would
-    overflow, the rows are split in two halves.
-
-    Parameters
-    ----------
-    slid, added : ndarray, shape (strokes, rows)
-        s >= 0, and a.
-    begin : float or ndarray, shape (strokes, 1)
-        x before the first row.
+    overflow, the rows are split in two halves. s >= 0 and a have the shape (strokes, rows).
     """
     far = np.cumsum(slid, axis=-1)
     rows = slid.shape[-1]

@@ -42,16 +42,8 @@ def bristle_rows(
 ) -> Iterator[dict]:
     """Yield rows of table `dynamic_fit` for one condition: sigma_0, sigma_1 and statistics of the fit.
 
-    Parameters
-    ----------
-    found : Stiffness or None
-        Estimates; None if no stroke has a recorded start.
-    curve : Curve
-        Stribeck curve of the fit.
-    config : Config
-        Gives the units and the sensor's accuracy.
-    braked : bool
-        Whether the sliding force of every stroke opposes its motion.
+    `found` is None if no stroke has a recorded start; `braked` is whether the sliding force of every stroke
+    opposes its motion.
     """
     units = dynamic_units(config)
     if found is None or not found.seen:

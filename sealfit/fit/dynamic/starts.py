@@ -264,14 +264,8 @@ class Along:
 def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
     """Return all strokes with a steady window that begin at rest or at a turn.
 
-    A steady speed or a turn in the midst of a motion does not: its time counts from an earlier row.
-
-    Parameters
-    ----------
-    traces : DataFrame
-        Table `traces`; the samples of a stroke are adjacent.
-    steady : DataFrame
-        Table `steady`.
+    A steady speed or a turn in the midst of a motion does not: its time counts from an earlier row. The
+    samples of a stroke are adjacent in `traces`.
     """
     edges, own = strokes_of(traces, stroke_index(steady))
     time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))

@@ -162,13 +162,7 @@ def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tup
     """Return the cluster-robust covariance of estimates, shape (p, p), and degrees of freedom, shape (p,).
 
     It is the jackknife over files (CR3). The degrees of freedom depend on the leverages of the files.
-
-    Parameters
-    ----------
-    inverse : ndarray, shape (p, p)
-        Inverse of J'J.
-    file : ndarray of int, shape (strokes,)
-        Number of each stroke's file.
+    `inverse` is that of J'J, and `file`, shape (strokes,), the number of each stroke's file.
     """
     files, p = int(file.max()) + 1, len(inverse)
     if files < 2:

@@ -108,16 +108,10 @@ def _declare(rows: Rows) -> Declared:
 
 
 def series_of_curve(conditions, aging: bool) -> np.ndarray:
-    """Return the series whose v_s and sigma_2 each condition uses.
+    """Return the series whose v_s and sigma_2 each condition uses, shape (conditions,).
 
-    Unaged rubber belongs to the series of its rubber if there is exactly one.
-
-    Parameters
-    ----------
-    conditions : DataFrame
-        A row per condition with `series`, `rubber` and, where rubber is aged, `aging_days`.
-    aging : bool
-        Whether rubber is aged.
+    Unaged rubber belongs to the series of its rubber if there is exactly one. `conditions` has the columns
+    `series`, `rubber` and, where rubber is aged, `aging_days`.
     """
     series = conditions["series"].to_numpy(dtype=object).copy()
     if aging:

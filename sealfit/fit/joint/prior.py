@@ -76,14 +76,8 @@ def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
 def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
     """Return the smoothness lambda that maximises the restricted likelihood.
 
-    Parameters
-    ----------
-    normal : ndarray, shape (p, p)
-        G, all other parameters eliminated.
-    gradient : ndarray, shape (p,)
-        g, at zero amplitudes.
-    rough : ndarray, shape (p, p)
-        S; straight lines are its null space.
+    G and g are those of the amplitudes, all other parameters eliminated, g at zero amplitudes. Straight lines
+    are the null space of S, `rough`, shape (p, p).
     """
     unit = np.trace(normal) / np.trace(rough)
     if not unit > 0:
@@ -101,12 +95,7 @@ def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray)
 def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> tuple[np.ndarray, float]:
     """Return a free shape's amplitudes, shape (p,), and its effective degrees of freedom, tr (G + P)^-1 G.
 
-    Parameters
-    ----------
-    normal, gradient : ndarray, shape (p, p) and (p,)
-        G and g as above.
-    penalty : ndarray, shape (p, p)
-        P, the prior's precision.
+    G and g are as above, and P, shape (p, p), is the prior's precision.
     """
     posterior = normal + penalty + np.diag(RIDGE * np.diag(normal))
     solved = np.linalg.solve(posterior, np.c_[gradient, normal])
@@ -116,12 +105,8 @@ def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> 
 def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
     """Return the model with the smoothness of its free shapes estimated by REML, one after the other.
 
-    Parameters
-    ----------
-    normal : ndarray, shape (model.size, model.size)
-        Normal matrix of the whitened tangent, without prior.
-    gradient : ndarray, shape (model.size,)
-        Whitened tangent times whitened residual.
+    `normal` is the normal matrix of the whitened tangent, without prior, and `gradient` the whitened tangent
+    times the whitened residual.
     """
     for number, term in enumerate(model.terms):
         if term.smoothness is None:

@@ -259,16 +259,10 @@ class Rows:
 
 
 def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame | None = None) -> Rows:
-    """Return `bins` as sorted arrays with nested groups.
+    """Return table `bins` as sorted arrays with nested groups.
 
-    Parameters
-    ----------
-    bins : DataFrame
-        Table `bins`, shape (n, columns).
-    has_aging : bool
-        Whether the config's condition has `aging_days`.
-    conditions : DataFrame, optional
-        `Rows.conditions` of the campaign of which these bins are a part, so that its model applies to them.
+    `has_aging` is whether the config's condition has `aging_days`. `conditions` are those of the campaign of
+    which these bins are a part, so that its model applies to them.
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
     keys = [table["record"], nesting_run(table), table["specimen_id"]]
@@ -316,13 +310,6 @@ def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
     A missing value becomes the mean of its stroke, file, run or specimen, the first of these that has values,
     else the mean of all files. A channel that was constant in a group remains so, and files without a value
     have little leverage on a slope along it. Channels that too many files lack are left out.
-
-    Parameters
-    ----------
-    table : DataFrame
-        Rows of `bins`, sorted.
-    groups : Groups
-        Of these rows.
     """
     found, files = {}, groups.starts["file"].size
     for name in open_columns(table):
@@ -353,16 +340,10 @@ def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
 
 
 def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
-    """Return `bins` with neighbouring bins of a stroke merged into means over all their samples.
+    """Return table `bins` with neighbouring bins of a stroke merged into means over all their samples.
 
     This loses nothing for shapes that are smooth over a few bins. A ripple needs the original bins.
-
-    Parameters
-    ----------
-    bins : DataFrame, shape (n, ...)
-        Table `bins`.
-    together : int or ndarray of int, shape (n,)
-        Number of bins per row, constant within a stroke.
+    `together`, the number of bins per row, may have the shape (n,) and then is constant within a stroke.
     """
     place = bins.groupby(["file", "stroke"], sort=False).cumcount() // together
     keys = [bins["file"], bins["stroke"], place.rename("place")]
@@ -411,16 +392,8 @@ def point_rows(
 ) -> Rows:
     """Return the points of a prediction as `Rows`, one group per point.
 
-    Parameters
-    ----------
-    table : DataFrame, shape (n, ...)
-        `speed_mm_s` and all channels that the model reads.
-    condition : ndarray, shape (n,)
-        Number of each point's condition in `conditions`.
-    conditions : DataFrame
-        `condition`, `series`, `rubber` and `aging_days`.
-    has_load, has_aging : bool
-        As in the rows to which the model was fitted.
+    `table`, shape (n, ...), has `speed_mm_s` and all channels that the model reads; `condition`, shape (n,),
+    is the number of each point's condition in `conditions`; the others are as in the rows of the fit.
     """
     n = len(table)
     every = np.arange(n)

@@ -120,8 +120,7 @@ def pairs_and_shared(
 
     Returns
     -------
-    tuple
-        Pairs, shape (groups, 2), and the shared number.
+    pairs, number : ndarray, shape (groups, 2), and float
     """
     one, length = _unit(columns[0], code)
     along = np.bincount(code, one * columns[1])

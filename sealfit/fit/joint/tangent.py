@@ -220,12 +220,8 @@ class Tangent:
 class OwnColumns:
     """One column per specimen, zero outside its rows; they are orthogonal, so no matrix is inverted.
 
-    Parameters
-    ----------
-    code : ndarray, shape (n,)
-        Specimen of each row.
-    load : ndarray, shape (n,)
-        Value of its column there. Columns of zeros do not count.
+    `code`, shape (n,), is the specimen of each row, and `load`, shape (n,), the value of its column there.
+    Columns of zeros do not count.
     """
 
     def __init__(self, code: np.ndarray, load: np.ndarray) -> None:
@@ -242,18 +238,8 @@ class OwnColumns:
 def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return blocks that contain sets of columns, and each set's block; one block if a set has most columns.
 
-    Parameters
-    ----------
-    sets : sequence of frozenset
-        Columns that must be in one block.
-    size : int
-        Number of columns.
-
-    Returns
-    -------
-    tuple of ndarray
-        Column at each place, shape (blocks, k), `size` if empty; and number of each set's block, shape
-        (sets,).
+    The blocks have the column at each place, shape (blocks, k), or `size`, the number of columns, if the
+    place is empty. The number of each set's block has the shape (sets,).
     """
     kept: list[frozenset[int]] = []
     home: dict[frozenset[int], int] = {}

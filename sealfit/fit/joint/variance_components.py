@@ -63,14 +63,8 @@ def reml(
 ) -> tuple[Component, ...]:
     """Return the variance components of group means by restricted maximum likelihood.
 
-    Parameters
-    ----------
-    jacobian : Tangent, shape (m, p)
-        Mean tangent of the model, for the restricted likelihood.
-    kinds : sequence of (level, kind)
-        Components to estimate, finest level first.
-    start : sequence of float, optional
-        Starting values of the variances.
+    `jacobian`, shape (m, p), is the mean tangent of the model; `kinds` are the level and kind of the
+    components, finest level first, and `start` their starting variances.
     """
     if not kinds:
         return ()
@@ -105,14 +99,7 @@ def reml(
 class RestrictedLikelihood:
     """Half the restricted deviance of group means, and its gradient, as functions of the variances.
 
-    Parameters
-    ----------
-    means : GroupMeans
-        As for `reml`.
-    basis : Tangent, shape (m, p)
-        Orthonormal columns that span the model's tangent.
-    kinds : sequence of (level, kind)
-        Components, finest level first.
+    `basis`, shape (m, p), has orthonormal columns that span the model's tangent; `kinds` are as in `reml`.
     """
 
     def __init__(self, means: GroupMeans, basis: Tangent, kinds: Sequence[tuple[str, str]]) -> None:
@@ -225,16 +212,9 @@ def estimate_scatter(
 ) -> Scatter:
     """Return row noise and variance components of the residual of a model, by REML.
 
-    Parameters
-    ----------
-    rows : Rows
-        Data.
-    residual, friction : ndarray, shape (n,)
-        Measured minus model, and the model's friction, to which noise and gains are proportional, in N.
-    jacobian : Tangent, shape (n, p)
-        Tangent of the model.
-    start : Scatter, optional
-        Starting values.
+    `residual`, measured minus model, and `friction`, to which noise and gains are proportional, have the
+    shape (n,) and are in N. `jacobian`, shape (n, p), is the tangent of the model. `start` has starting
+    values.
     """
     s0, g, design_effect = row_noise(rows, residual, friction)
     shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * friction) ** 2) * design_effect))
@@ -245,15 +225,7 @@ def estimate_scatter(
 def estimate_components(
     rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, scatter: Scatter
 ) -> Scatter:
-    """Return a scatter with re-estimated variance components and the same row noise.
-
-    Parameters
-    ----------
-    rows, residual, friction, jacobian
-        As `estimate_scatter`.
-    scatter : Scatter
-        Row noise, and starting values of the components.
-    """
+    """Return a scatter with re-estimated components and the same row noise; see `estimate_scatter`."""
     groups, level = rows.groups, "stroke"
     means = groups.means(np.column_stack([residual, friction]), level)
     noise = groups.means(scatter.noise_sd(friction) ** 2, level)
@@ -354,12 +326,8 @@ def shape_scatter(rows: Rows, residual: np.ndarray, sd: np.ndarray) -> float:
     """Return the variance of shapes along strokes between files over that expected of row noise, at least 1.
 
     Slope and curvature of each pass along displacement are compared with their mean over all passes of that
-    direction. Without this factor hundreds of rows would outweigh the few files they come from.
-
-    Parameters
-    ----------
-    residual, sd : ndarray, shape (n,)
-        Measured minus model, and standard deviation of row noise, in N.
+    direction. Without this factor hundreds of rows would outweigh the few files they come from. `residual`
+    and `sd`, the standard deviation of row noise, have the shape (n,) and are in N.
     """
     groups = rows.groups
     code, start = groups.codes["stroke"], groups.starts["stroke"]

@@ -75,21 +75,9 @@ class Scatter:
 class Between:
     """Whitening of a few numbers per stroke with independent noise, under the variance components.
 
-    Parameters
-    ----------
-    variance : ndarray, shape (m,)
-        Variance of each number's own noise.
-    loads : mapping
-        `offset` and `gain` -> change of each number per unit of the random effect, shape (m,).
-    groups : Groups
-        Nested groups of the m numbers.
-    components : sequence of Component
-        Variance components, finest level first.
-
-    Attributes
-    ----------
-    logdet : float
-        log det of the covariance.
+    `variance`, shape (m,), is that of each number's own noise; `loads`, shape (m,) each, are the changes of
+    the numbers per unit of an `offset` and a `gain`; `components` are finest level first. `logdet` is the log
+    determinant of the covariance.
     """
 
     def __init__(
@@ -133,19 +121,8 @@ class Between:
 class Whitening:
     """A root of the inverse covariance of rows, computed once and applied to many columns.
 
-    Parameters
-    ----------
-    scatter : Scatter
-        Row noise and components.
-    friction : ndarray, shape (n,)
-        The model's friction, signed; noise and gains are proportional to it.
-    groups : Groups
-        Nested groups of the rows, strokes first.
-
-    Attributes
-    ----------
-    logdet : float
-        log det of the covariance.
+    Noise and gains are proportional to the model's signed friction, shape (n,). The groups are nested,
+    strokes first. `logdet` is the log determinant of the covariance.
     """
 
     def __init__(self, scatter: Scatter, friction: np.ndarray, groups: Groups) -> None:

@@ -115,8 +115,7 @@ def _shared(
     """Return the values of a series on a shared curve, or None if its days do not share one.
 
     Returns the values, their covariance, their change along the directions of the effects' uncertainty, shape
-    (values, k), and the conditions on the curve. `widened`, shape (conditions,), is the factor on the stated
-    variances.
+    (values, k), and the conditions on the curve. `widened`, shape (conditions,), is the factor on variances.
     """
     is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]

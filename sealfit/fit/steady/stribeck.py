@@ -124,13 +124,7 @@ class StribeckFit:
 
 
 def stribeck_basis(speed, load):
-    """Return the columns of Eq. 14 along ln v_s, as `profile` calls them.
-
-    Parameters
-    ----------
-    speed, load : ndarray, shape (problems, n)
-        |v| and N; anything finite where the weight is 0.
-    """
+    """Return the columns of Eq. 14 along ln v_s for `profile`, from |v| and N, shape (problems, n) each."""
 
     def basis(u, rows):
         v, n = speed[rows][:, None, :], load[rows][:, None, :]
@@ -183,25 +177,12 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
 
 # ---------------------------------------------------------------- intervals
 def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
-    """Return the ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2.
+    """Return the ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2, (problems, 4) each.
 
-    The interval of v_s is where the least sum of squares exceeds the minimum by at most `rise`. Those of the
-    others are unions, over these v_s, of the exact interval at that v_s with nonnegative coefficients. No
-    quadratic approximation is made, so that intervals may be asymmetric or open.
-
-    Parameters
-    ----------
-    speed, load, force, weight
-        As `solve_stribeck`.
-    fit : StribeckFit
-        Its result.
-    rise : ndarray, shape (problems,)
-        t^2 times the variance of unit weight.
-
-    Returns
-    -------
-    low, high : ndarray, shape (problems, 4)
-        For v_s 0 or inf if the interval reaches a limit of the search.
+    The interval of v_s is where the least sum of squares exceeds the minimum by at most `rise`, shape
+    (problems,): t^2 times the variance of unit weight. Its end is 0 or inf if it reaches a limit of the
+    search. Those of the others are unions, over these v_s, of the exact interval at that v_s with nonnegative
+    coefficients. No quadratic approximation is made, so that intervals may be asymmetric or open.
     """
     problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
     limit = fit.rss + rise

@@ -121,11 +121,8 @@ def run_weights(runs: pd.DataFrame, scatter: Scatter) -> np.ndarray:
 def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
     """Return 1/variance of run means with a scatter proportional to the friction, shape (n,), up to a factor.
 
-    Parameters
-    ----------
-    fitted_N : ndarray, shape (n,)
-        Friction of every run from a fit with equal weights. With the measured force the weight would depend
-        on its error, and a run whose force an offset brings near zero would dominate.
+    The friction is that of a fit with equal weights. With the measured force the weight would depend on its
+    error, and a run whose force an offset brings near zero would dominate.
     """
     size = np.abs(fitted_N)
     return 1.0 / np.maximum(size, SMALLEST_SHARE * size.max(initial=0.0) or 1.0) ** 2
@@ -134,14 +131,8 @@ def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
 def more_likely(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) -> int:
     """Return the number of the most likely weights: the least n ln(chi2/df) - sum ln w, -2 log likelihood.
 
-    Parameters
-    ----------
-    chi2 : sequence of float
-        Weighted sum of squares of the whole campaign under each choice.
-    weights : sequence of ndarray, shape (n,)
-        The choices.
-    df : float
-        Degrees of freedom of chi2.
+    `chi2` is the weighted sum of squares of the whole campaign under each choice, with `df` degrees of
+    freedom.
     """
     if not df > 0:
         return 0
