@@ -106,34 +106,15 @@ def aging_law_as_printed(days, *, mu_0, a, b, c):
 
 @dataclass(frozen=True)
 class Loss:
-    """One shape of the loss over time.
-
-    Attributes
-    ----------
-    name : str
-        Name as above.
-    form : str
-        Equation in plain text.
-    parameters : tuple of str
-        Names of its parameters, all positive: times in days, and exponents.
-    units : tuple of str
-        Their units.
-    value : callable
-        (days, *parameters) -> phi, broadcast.
-    time : callable
-        (phi, *parameters) -> days until the loss is phi; inf if it is not reached.
-    slopes : callable
-        (days, *parameters) -> derivatives of phi with respect to ln t and the logarithm of each parameter,
-        broadcast.
-    """
+    """One shape of the loss over time; its parameters are positive: times in days, and exponents."""
 
     name: str
-    form: str
+    form: str  # equation in plain text
     parameters: tuple[str, ...]
     units: tuple[str, ...]
-    value: Callable
-    time: Callable
-    slopes: Callable
+    value: Callable  # (days, *parameters) -> phi, broadcast
+    time: Callable  # (phi, *parameters) -> days until the loss is phi; inf if it is not reached
+    slopes: Callable  # (days, *parameters) -> derivatives by ln t and the logarithm of each parameter
 
 
 def _log(days, b):

@@ -9,7 +9,7 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.aging.joint_law import Aged, JointLaw, fit_laws, left_out, reference_of, rivals_of
+from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw, fit_laws, left_out, rivals_of
 from sealfit.fit.aging.law import Values, fit_law, law_model
 from sealfit.fit.steady.fit import FORCES, parameter_units
 from sealfit.fit.steady.shared_curve import Levels, shared_levels
@@ -151,7 +151,7 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     first = scaled[scaled > 0].min() / 3
     near = first * np.linspace(0, 1, START_POINTS, endpoint=False) ** 2  # laws fall fastest there
     days = np.r_[near, np.geomspace(first, scaled.max() * 1.5, CURVE_POINTS)]
-    middle = (None if c is None else np.full(days.size, reference_of(c[aged.days > 0])) for c in tested)
+    middle = [np.full(days.size, aged.middle[name]) if name in aged.middle else None for name, *_ in DRIVERS]
     at = Aged(days, np.zeros(days.size), *middle)
     slope = law.slope(at)
     half = law.t * np.sqrt(np.einsum("in,ij,jn->n", slope, law.covariance, slope))

@@ -120,7 +120,8 @@ class Aged:
     def middle(self) -> dict[str, float]:
         """Reference temperature and compression, the middle of the tested ones, by the coefficient's name."""
         there = ((name, getattr(self, column)) for name, column, _ in DRIVERS)
-        return {name: reference_of(at[self.days > 0]) for name, at in there if at is not None}
+        aged = ((name, at[self.days > 0]) for name, at in there if at is not None)
+        return {name: float(np.median(np.unique(tested))) for name, tested in aged}
 
     def away(self, name: str, middle: float) -> np.ndarray:
         """Return the factor of a coefficient in ln k relative to a temperature or compression, shape (n,)."""
@@ -183,11 +184,6 @@ class Spread:
         return float(np.log(self._variance + scatter**2).sum() + 2 * np.log(self._size).sum())
 
 
-def reference_of(tested: np.ndarray) -> float:
-    """Return the middle of the tested temperatures or compressions, at which k is 1."""
-    return float(np.median(np.unique(tested)))
-
-
 # ---------------------------------------------------------------- joint law
 # One law of aging for all temperatures and compressions of a rubber, and the evidence for its shape.
 #
@@ -216,34 +212,16 @@ KNOWN = np.log(100.0)
 
 @dataclass(frozen=True)
 class JointLaw:
-    """A law fitted to all series of one quantity.
-
-    Attributes
-    ----------
-    aged : Aged
-        Data.
-    loss, acts_on : Loss, str
-        Shape, and what temperature and compression change: "rate" or "loss".
-    names : tuple of str
-        Parameters: mu_0, a, those of the shape, and E and kappa if varied.
-    x : ndarray, shape (p,)
-        Estimates; those of the shape are logarithms.
-    covariance : ndarray, shape (p, p)
-        Covariance of x.
-    scatter : float
-        Relative standard deviation between specimens in addition to the measurement variance.
-    bic : float
-        -2 log L + p log n.
-    """
+    """A law fitted to all series of one quantity."""
 
     aged: Aged
-    loss: Loss
-    acts_on: str
-    names: tuple[str, ...]
-    x: np.ndarray
-    covariance: np.ndarray
-    scatter: float
-    bic: float
+    loss: Loss  # its shape
+    acts_on: str  # what temperature and compression change: "rate" or "loss"
+    names: tuple[str, ...]  # parameters: mu_0, a, those of the shape, and E and kappa if varied
+    x: np.ndarray  # (p,) estimates; those of the shape are logarithms
+    covariance: np.ndarray  # (p, p) of x
+    scatter: float  # relative standard deviation between specimens, beyond the measurement variance
+    bic: float  # -2 log L + p log n
 
     @property
     def df(self) -> float:

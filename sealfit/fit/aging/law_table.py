@@ -73,37 +73,21 @@ def t_of_95(df: float) -> float:
     return float(stdtrit(df, 0.975) if df > 0 else ndtri(0.975))
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """mu_0, a and ln b of one curve.
+def law_rows(
+    curve: Curve, x: np.ndarray, covariance: np.ndarray, shift: np.ndarray, ends: CurveInterval, df: float
+) -> Iterator[dict]:
+    """Return the rows of mu_0, a, b and c.
 
-    Attributes
-    ----------
-    x, shift : ndarray, shape (3,)
-        Estimates, and their change if the sensor reads one standard uncertainty too high.
-    covariance : ndarray, shape (3, 3)
-        Covariance of x.
+    `x`, shape (3,), are mu_0, a and ln b, and `shift` their change if the sensor reads one standard
+    uncertainty too high. `df` are the degrees of freedom of mu_0's interval.
     """
-
-    x: np.ndarray
-    covariance: np.ndarray
-    shift: np.ndarray
-
-    def error_of_c(self) -> float:
-        """Return the standard error of c = -a ln b."""
-        gradient = np.array([0.0, -self.x[2], -self.x[1]])
-        with np.errstate(invalid="ignore"):
-            return float(np.sqrt(gradient @ self.covariance @ gradient))
-
-
-def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, df: float) -> Iterator[dict]:
-    """Return the rows of mu_0, a, b and c; `df` are the degrees of freedom of mu_0's interval."""
-    mu_0, a, u = found.x
-    unit = curve.unit
-    se = np.sqrt(np.diag(found.covariance))
-    b, se_c = np.exp(u), found.error_of_c()
+    mu_0, a, u = x
+    unit, b, se = curve.unit, np.exp(u), np.sqrt(np.diag(covariance))
+    to_c = np.array([0.0, -u, -a])
+    with np.errstate(invalid="ignore"):
+        se_c = np.sqrt(to_c @ covariance @ to_c)
     beside, t = "" if df > 0 else NO_SCATTER, t_of_95(df)
-    move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # the rest is rounding
+    move = np.where(np.abs(shift) > 1e-12 * np.abs(x), shift, 0.0)  # the rest is rounding
     judged = _judge(curve, a, b, ends)
     limits = {"mu_0": (mu_0 - t * se[0], mu_0 + t * se[0]), "a": ends.a, "b": ends.b, "c": ends.c}
     numbers = {
@@ -237,7 +221,6 @@ def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Itera
             parameter=f"{name}:{statistic}",
             value=value,
             unit=its_unit,
-            identified=True,
             reason=why,
         ) | {"series": curve.series}
 

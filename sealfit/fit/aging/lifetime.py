@@ -154,11 +154,6 @@ def over_laws(
     return ends[0], ends[1]
 
 
-def ends_of(values: np.ndarray) -> tuple[float, float]:
-    """Return the smallest and the largest value."""
-    return float(values.min()), float(values.max())
-
-
 def _asked(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Iterator[tuple]:
     """Yield per driver of aging: name, option's name and value, tested values, allowed range, and unit."""
     asked = (temperature_C, compression_pct)
@@ -203,8 +198,8 @@ def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
 def _outside(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> tuple[str, ...]:
     found = []
     for _, what, value, tested, *_ in _asked(law, temperature_C, compression_pct):
-        low, high = (np.nan, np.nan) if tested is None else ends_of(tested[law.aged.days > 0])
-        if value is not None and (value < low or value > high):
+        aged = np.array([np.nan]) if tested is None else tested[law.aged.days > 0]
+        if value is not None and (value < aged.min() or value > aged.max()):
             found.append(what)
     return tuple(found)
 
@@ -349,7 +344,8 @@ def answer(
     found["lack_of_fit_p"] = _finite(law.lack_of_fit_p())
     if years is not None:
         celsius, *ends = temperature_for(law, goal, years, compression_pct)
-        low, high = ends_of(law.aged.temperature_C[law.aged.days > 0])
+        tested = law.aged.temperature_C[law.aged.days > 0]
+        low, high = float(tested.min()), float(tested.max())
         found |= {"years": years, "temperature_C": _finite(celsius), "temperature_ci95": finite_ends(ends)}
         found |= {"always": None if np.isfinite(celsius) else "longer" if celsius > 0 else "shorter"}
         return {
@@ -363,8 +359,6 @@ def answer(
         "threshold": life.threshold,
         "days": _finite(life.days),
         "ci95": finite_ends((life.low, life.high)),
-    }
-    found |= {
         "extrapolated": life.extrapolated,
         "beyond_tests": _finite(life.beyond),
         "outside": list(life.outside),

@@ -25,7 +25,7 @@ from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, law_tables, l
 from sealfit.fit.aging.joint_law import Aged, JointLaw
 from sealfit.fit.aging.law import Values
 from sealfit.fit.aging.law_table import without_law
-from sealfit.fit.aging.series import SMALLEST, aging_curves, curves_of, rubber_rows
+from sealfit.fit.aging.series import SMALLEST, WITHOUT_LAW, aging_curves, curves_of, numbers_of, rubber_rows
 from sealfit.tables import AGING_FIT
 
 # Largest ratio of the variance between batches to that between specimens that is searched.
@@ -40,26 +40,16 @@ TINY = 1e-300
 class Means:
     """Means of one property of one rubber over specimens and batches, by condition.
 
-    Attributes
-    ----------
-    table : DataFrame
-        A row per condition: `series`, `condition`, the condition columns, `value`, and `n`, its specimens.
-    covariance : ndarray, shape (n, n)
-        Covariance of the means.
-    specimen_sd, batch_sd : float
-        Standard deviations between specimens of one condition and batch, and between batches; nan where
-        these values do not determine them.
-    df, level_df : float
-        Degrees of freedom of the covariance of differences between means, and of their common level
-        (Satterthwaite); 0 without replicates.
+    Standard deviations are nan where these values do not determine them. Degrees of freedom are
+    Satterthwaite's, and 0 without replicates.
     """
 
-    table: pd.DataFrame
-    covariance: np.ndarray
-    specimen_sd: float
-    batch_sd: float
-    df: float
-    level_df: float
+    table: pd.DataFrame  # a row per condition: series, condition, its columns, value, and n, its specimens
+    covariance: np.ndarray  # (n, n) of the means
+    specimen_sd: float  # between specimens of one condition and batch
+    batch_sd: float  # between batches
+    df: float  # of the covariance of differences between means
+    level_df: float  # of their common level
 
     @property
     def size(self) -> np.ndarray:
@@ -204,12 +194,12 @@ def _law_per_series(means: Means, quantity: str, unit: str) -> list[dict]:
     days, series = table["aging_days"].to_numpy(float), table["series"]
     columns = [name for name in (TEMPERATURE, COMPRESSION) if name in table]
     order = table[days > 0].sort_values(columns, kind="stable")["series"] if columns else series[days > 0]
-    curves = curves_of(table.assign(quantity=quantity), list(dict.fromkeys(order)), [quantity], unit)
-    places = {curve.series: curve.place for curve in curves}
-    if max(places.values()) < 0:
+    table = table.assign(quantity=quantity)
+    curves = curves_of(table, list(dict.fromkeys(order)), [quantity], unit)
+    if all(curve.place < 0 for curve in curves):
         return [row for curve in curves for row in without_law(curve)]
-    number = np.array([-1 if day == 0 else places[name] for day, name in zip(days, series, strict=True)])
-    kept = (days == 0) | (number >= 0)
+    number = numbers_of(table, curves)
+    kept = number > WITHOUT_LAW
     values = Values(
         days, table["value"].to_numpy(float), np.zeros(days.size, int), number, means.covariance, means.size,
         means.df, means.level_df,

@@ -16,7 +16,6 @@ from sealfit.fit.aging.law_profiles import curve_errors, curve_intervals
 from sealfit.fit.aging.law_table import (
     DAYS_FOR_LAW,
     Curve,
-    Estimate,
     OneQuantity,
     covariance_rows,
     law_rows,
@@ -29,6 +28,8 @@ from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT
 
 PAIRS = (("mu_s", "mu_c"), ("F_s", "F_c"))
+# Number of the curve of values that no law is fitted to.
+WITHOUT_LAW = -2
 # Smallest relative standard deviation of a steady value.
 SMALLEST = 1e-6
 # Number of points of a curve.
@@ -94,22 +95,11 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     quantities = [name for name in pair if (found["quantity"] == name).any()]
     unit = str(found["unit"].iloc[0])
     curves = curves_of(found, list(dict.fromkeys(aged["series"])), quantities, unit)
-    place = {(c.series, c.quantity): c.place for c in curves}
-    number = np.array(
-        [
-            -1 if day == 0 else place[series, quantity] if place[series, quantity] >= 0 else -2
-            for day, series, quantity in zip(
-                found["aging_days"], found["series"], found["quantity"], strict=True
-            )
-        ],
-        int,
-    )
-    used = found[number >= -1]
     fitted = [name for name in quantities if any(c.place >= 0 and c.quantity == name for c in curves)]
-    used = used[used["quantity"].isin(fitted)]
-    number = number[(number >= -1) & found["quantity"].isin(fitted).to_numpy()]
     if not fitted:
         return [row for curve in curves for row in without_law(curve)]
+    number = numbers_of(found, curves)
+    used, number = found[number > WITHOUT_LAW], number[number > WITHOUT_LAW]
     values = Values(
         used["aging_days"].to_numpy(float),
         used["value"].to_numpy(float),
@@ -153,6 +143,15 @@ def curves_of(found: pd.DataFrame, series: list[str], quantities: list[str], uni
             curves.append(Curve(name, quantity, place if enough else -1, days, quantity in unaged, unit))
             place += enough
     return curves
+
+
+def numbers_of(found: pd.DataFrame, curves: list[Curve]) -> np.ndarray:
+    """Return the number of each value's curve, shape (n,); -1 for unaged rubber, `WITHOUT_LAW` for none."""
+    place = {(c.series, c.quantity): c.place for c in curves if c.place >= 0}
+    keys = zip(found["series"], found["quantity"], strict=True)
+    own = np.array([place.get(key, WITHOUT_LAW) for key in keys], int)
+    has_law = found["quantity"].isin({quantity for _, quantity in place}).to_numpy()
+    return np.where((found["aging_days"] == 0).to_numpy() & has_law, -1, own)
 
 
 def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], float]:
@@ -242,10 +241,10 @@ def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: n
             yield from without_law(curve)
             continue
         one = quantities[curve.quantity]
-        found = Estimate(x[curve.place], covariance[curve.place], shift[curve.place])
-        yield from law_rows(curve, found, intervals[curve.place], one.level_df)
+        estimate = x[curve.place], covariance[curve.place], shift[curve.place]
+        yield from law_rows(curve, *estimate, intervals[curve.place], one.level_df)
         yield from statistics_rows(curve, joint, one)
-        yield from covariance_rows(curve, found.covariance)
+        yield from covariance_rows(curve, covariance[curve.place])
 
 
 # ---------------------------------------------------------------- curves

@@ -62,7 +62,7 @@ def bristle_rows(
         ("files", found.files, ""),
         ("rmse", found.rmse_N, config.units.unit("force")),
     ):
-        yield table_row(quantity="statistics", parameter=name, value=value, unit=unit, identified=True)
+        yield table_row(quantity="statistics", parameter=name, value=value, unit=unit)
 
 
 def _stiffness_row(found: Stiffness, curve: Curve, unit: str, config: Config) -> dict:
@@ -90,10 +90,9 @@ def _damping_row(found: Stiffness, curve: Curve, unit: str) -> dict:
     low, high = max(found.sigma_1 - half, 0.0), found.sigma_1 + half
     row |= {"lo95": low, "hi95": high, "se": found.damping_se}
     if low > 0.0:
-        return table_row(**row, identified=True)
-    return table_row(
-        **row, identified=False, reason=f"no damping of the bristles is seen: at most {high:.2g} {unit}"
-    )
+        return table_row(**row)
+    reason = f"no damping of the bristles is seen: at most {high:.2g} {unit}"
+    return table_row(**row, identified=False, reason=reason)
 
 
 def dynamic_units(config: Config) -> Mapping[str, str]:

@@ -244,37 +244,25 @@ def estimate_components(
 def usable_components(rows: Rows) -> list[tuple[str, str]]:
     """Return (level, kind) of the random effects that these groups distinguish, finest level first."""
     counts = {level: rows.groups.starts[level].size for level in LEVELS}
-    used, finer = [], None
-    for level in LEVELS:
-        if finer is None:
-            if counts[level] > counts["file"] or level != "stroke":
-                used.append(level)
-                finer = level
-        elif counts[level] < counts[finer] and counts[level] > 2:
+    used = ["stroke"] if counts["stroke"] > counts["file"] else []
+    for level in LEVELS[1:]:
+        if not used or 2 < counts[level] < counts[used[-1]]:
             used.append(level)
-            finer = level
-    if used and used[-1] == "specimen" and not _specimens_free(rows):
+    # Specimen scatter needs replicates of a condition, or a law across conditions.
+    if used[-1] == "specimen" and counts["specimen"] - declare(rows).mu_parameter_count < 2:
         used.pop()
-    both = (
-        rows.speed.min() < 0 < rows.speed.max() or np.ptp(np.abs(rows.force)) > 0.2 * np.abs(rows.force).max()
-    )
-    kinds = {level: ("offset", "gain") if both else ("offset",) for level in used}
-    if both and "specimen" in kinds:
-        kinds["specimen"] = ("gain",)  # specimens differ in friction, not in the sensor's zero
-    return [(level, kind) for level in used for kind in kinds[level]]
-
-
-def _specimens_free(rows: Rows) -> bool:
-    """Return whether specimen scatter is estimable: replicates of a condition, or a law across conditions."""
-    return rows.groups.starts["specimen"].size - declare(rows).mu_parameter_count >= 2
+    size = np.abs(rows.force)
+    if not (rows.speed.min() < 0 < rows.speed.max() or np.ptp(size) > 0.2 * size.max()):
+        return [(level, "offset") for level in used]
+    # Specimens differ in friction, not in the sensor's zero.
+    pairs = [(level, kind) for level in used for kind in KINDS]
+    return [pair for pair in pairs if pair != ("specimen", "offset")]
 
 
 def _df(rows: Rows, component: Component) -> float:
-    order = list(LEVELS)
-    counts = [rows.groups.starts[level].size for level in order]
-    at = order.index(component.level)
-    above = [counts[k] for k in range(at + 1, len(order)) if counts[k] < counts[at]]
-    return float(counts[at] - (above[0] if above else 1))
+    counts = [rows.groups.starts[level].size for level in LEVELS]
+    own, *above = counts[LEVELS.index(component.level) :]
+    return float(own - next((count for count in above if count < own), 1))
 
 
 def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:

@@ -77,7 +77,7 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     conditions, scatter, variance = solve_conditions(steady)
     keys = condition_keys(steady, config)
     blocks = [slice(start, start + BLOCK) for start in range(0, len(conditions), BLOCK)]
-    found = [_table_rows(conditions[block], variance.of(block), scatter, config) for block in blocks]
+    found = [_table_rows(conditions[block], variance.at(block), scatter, config) for block in blocks]
     table = pd.concat(found, ignore_index=True).merge(
         keys, on="condition", how="left", validate="many_to_one"
     )
@@ -167,72 +167,54 @@ def _table_rows(
 ) -> pd.DataFrame:
     """Return the rows of table `steady_fit` for some conditions; this computes their intervals."""
     bound(conditions, variance.rise())
-    return pd.DataFrame(
-        [
-            {"condition": c.name, **row}
-            for k, c in enumerate(conditions)
-            for row in _rows(c, k, variance, scatter, config)
-        ]
-    )
+    rows = [
+        {"condition": c.name, **row}
+        for k, c in enumerate(conditions)
+        for row in _rows(c, variance.at(k), scatter, config)
+    ]
+    return pd.DataFrame(rows)
 
 
-def _rows(
-    condition: Condition, k: int, variance: UnitVariance, scatter: Scatter, config: Config
-) -> Iterator[dict]:
+def _rows(condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config) -> Iterator[dict]:
     unit_of = parameter_units(config.units, condition.has_load)
-    _, _, force, weight = condition.arrays
-    covariance, shift = linearised(condition.jacobian(), weight, condition.values, condition.names)
-    _, effects = linearised(condition.jacobian(), weight, condition.values, condition.names, condition.shifts)
-    covariance = covariance * variance.value[k] + effects @ effects.T
+    fitted = condition.jacobian(), condition.arrays[-1], condition.values, condition.names
+    covariance, shift = linearised(*fitted)
+    _, effects = linearised(*fitted, condition.shifts)
+    covariance = covariance * variance.value + effects @ effects.T
     # What is smaller is rounding.
     shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)
     judged = judge(condition)
     spelled = {name: name if condition.has_load else FORCES.get(name, name) for name in NAMES}
     for name in NAMES:
-        identified, reason = judged[name]
-        row = {"quantity": "steady", "parameter": spelled[name], "unit": unit_of[name]}
-        row |= {"identified": identified, "reason": reason}
+        row = dict(zip(("identified", "reason"), judged[name], strict=True))
         if name in condition.names:
             j = condition.names.index(name)
             low, high = (None, None) if condition.low is None else (condition.low[j], condition.high[j])
             open_below = name == "v_s" and low == 0.0
             if effects.any() and low is not None:
-                reach = stdtrit(variance.df[k], 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
+                reach = stdtrit(variance.df, 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
                 low, high = _widened(condition.values[j], low, high, reach)
             # At its limit: not known with error zero.
             stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0
-            se = None if stuck else _finite(np.sqrt(covariance[j, j]))
-            row |= {"value": condition.values[j], "se": se, "u_sys": abs(shift[j])}
-            row |= {"lo95": None if open_below else _finite(low), "hi95": _finite(high)}
-        yield table_row(**row)
-    residual = force - condition.model_force()
-    yield from _statistics(condition, k, variance, scatter, residual, config.units.unit("force"))
-    if np.isfinite(variance.value[k]):
-        for i, one in enumerate(condition.names):
-            for j, other in enumerate(condition.names[: i + 1]):
-                yield table_row(
-                    quantity="covariance",
-                    parameter=f"{spelled[other]},{spelled[one]}",
-                    value=_finite(covariance[i, j]),
-                    unit=_product(unit_of[other], unit_of[one]),
-                    identified=judged[one][0] and judged[other][0],
-                )
-    for j, name in enumerate(condition.names):
-        yield table_row(
-            quantity="sensor_shift",
-            parameter=spelled[name],
-            value=shift[j],
-            unit=unit_of[name],
-            identified=judged[name][0],
-        )
-        for number, moved in enumerate(effects[j], start=1):
+            row |= {"value": condition.values[j], "se": None if stuck else np.sqrt(covariance[j, j])}
+            row |= {"lo95": None if open_below else low, "hi95": high, "u_sys": abs(shift[j])}
+        yield table_row(quantity="steady", parameter=spelled[name], unit=unit_of[name], **row)
+    yield from _statistics(condition, variance, scatter, config)
+    for i, one in enumerate(condition.names if np.isfinite(variance.value) else ()):
+        for j, other in enumerate(condition.names[: i + 1]):
             yield table_row(
-                quantity="effect_shift",
-                parameter=f"{spelled[name]}:{number}",
-                value=moved,
-                unit=unit_of[name],
-                identified=judged[name][0],
+                quantity="covariance",
+                parameter=f"{spelled[other]},{spelled[one]}",
+                value=covariance[i, j],
+                unit=_product(unit_of[other], unit_of[one]),
+                identified=judged[one][0] and judged[other][0],
             )
+    for j, name in enumerate(condition.names):
+        row = {"unit": unit_of[name], "identified": judged[name][0]}
+        yield table_row(quantity="sensor_shift", parameter=spelled[name], value=shift[j], **row)
+        for number, moved in enumerate(effects[j], start=1):
+            parameter = f"{spelled[name]}:{number}"
+            yield table_row(quantity="effect_shift", parameter=parameter, value=moved, **row)
 
 
 def _widened(value: float, low: float, high: float, reach: float) -> tuple[float, float]:
@@ -240,58 +222,44 @@ def _widened(value: float, low: float, high: float, reach: float) -> tuple[float
     return max(value - float(np.hypot(value - low, reach)), 0.0), value + float(np.hypot(high - value, reach))
 
 
-def _statistics(condition, k, variance, scatter, residual, force_unit) -> Iterator[dict]:
-    repeated = scatter.df > 0
+def _statistics(
+    condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config
+) -> Iterator[dict]:
+    repeated, force_unit = scatter.df > 0, config.units.unit("force")
     no_repeats = "" if repeated else "no run was repeated: there is no pure error to compare with."
     ratio = condition.chi2 / condition.df if condition.df else None
     lack = no_repeats
     if repeated and condition.df == 0:
         lack = "as many parameters as runs: the fit cannot disagree with them."
-    elif repeated and variance.p[k] < SIGNIFICANT:
+    elif repeated and variance.p < SIGNIFICANT:
         lack = (
             "lack of fit: the runs disagree with the model by more than their repeats scatter (set-up "
             "scatter between runs, or something the model lacks); "
-            f"intervals are widened {np.sqrt(variance.value[k]):.2g} times."
+            f"intervals are widened {np.sqrt(variance.value):.2g} times."
         )
     offset = condition.offset()
     if offset:
-        lack = (
-            f"{lack} The two directions differ: offset of {offset:.3g} {force_unit}, in no declared model."
-        ).strip()
+        lack += f" The two directions differ: offset of {offset:.3g} {force_unit}, in no declared model."
     if condition.left_out:
-        lack = f"{lack} {condition.left_out} runs without load were left out of the fit.".strip()
+        lack += f" {condition.left_out} runs without load were left out of the fit."
+    own = no_repeats or ("own" if variance.own else "pooled")
+    speeds = max(len(values) for values in condition.levels.values())
+    residual = condition.arrays[2] - condition.model_force()
     for name, value, unit, reason in (
         ("chi2", condition.chi2 if repeated else None, "", no_repeats),
         ("df", condition.df, "", ""),
         ("reduced_chi2", ratio if repeated else None, "", no_repeats),
-        ("lack_of_fit_F", variance.f[k], "", no_repeats),
-        ("lack_of_fit_p", variance.p[k], "", lack),
-        (
-            "birge_ratio",
-            np.sqrt(variance.value[k]) if repeated else None,
-            "",
-            no_repeats or ("own" if variance.own[k] else "pooled"),
-        ),
-        ("error_df", variance.df[k], "", "degrees of freedom of the intervals' Student t"),
+        ("lack_of_fit_F", variance.f, "", no_repeats),
+        ("lack_of_fit_p", variance.p, "", lack.strip()),
+        ("birge_ratio", np.sqrt(variance.value) if repeated else None, "", own),
+        ("error_df", variance.df, "", "degrees of freedom of the intervals' Student t"),
         ("flat_p", condition.flat_p, "", "chance of this much Stribeck curve where mu_s = mu_c"),
         ("rmse_N", np.sqrt(np.mean(residual**2)), force_unit, ""),
         ("n_runs", len(condition.runs), "", ""),
         ("n_files", condition.runs["files"].sum(), "", ""),
-        (
-            "n_speeds",
-            max(len(values) for values in condition.levels.values()),
-            "",
-            "levels within one direction",
-        ),
+        ("n_speeds", speeds, "", "levels within one direction"),
     ):
-        yield table_row(
-            quantity="statistics",
-            parameter=name,
-            value=_finite(value),
-            unit=unit,
-            identified=True,
-            reason=reason,
-        )
+        yield table_row(quantity="statistics", parameter=name, value=value, unit=unit, reason=reason)
 
 
 def parameter_units(units: Units, has_load: bool) -> dict[str, str]:
@@ -309,23 +277,19 @@ def _product(one: str, other: str) -> str:
     return " ".join(f"({unit})" for unit in (one, other) if unit)
 
 
-def _finite(value) -> float | None:
-    return float(value) if value is not None and np.isfinite(value) else None
-
-
 def table_row(
-    *, quantity: str, parameter: str, unit: str, identified: bool, reason: str = "", **numbers
+    *, quantity: str, parameter: str, unit: str, identified: bool = True, reason: str = "", **numbers
 ) -> dict:
     """Return one row of a fit table; None and infinite ends become null.
 
     `numbers` are any of value, se, lo95, hi95 and u_sys.
     """
-    known = dict.fromkeys(NUMBERS) | numbers
+    known = {name: value for name, value in numbers.items() if value is not None and np.isfinite(value)}
     return {
         "model": "before",
         "quantity": quantity,
         "parameter": parameter,
-        **{name: np.nan if _finite(known[name]) is None else float(known[name]) for name in NUMBERS},
+        **{name: float(known.get(name, np.nan)) for name in NUMBERS},
         "unit": unit,
         "identified": bool(identified),
         "reason": reason,

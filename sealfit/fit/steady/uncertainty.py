@@ -154,8 +154,8 @@ class UnitVariance:
     pooled_p: float
     own: np.ndarray  # (conditions,) bool: whether the condition has its own ratio
 
-    def of(self, some: slice) -> UnitVariance:
-        """Return the factors of some conditions."""
+    def at(self, some: slice | int) -> UnitVariance:
+        """Return the factors of some conditions, or of one."""
         own = {name: getattr(self, name)[some] for name in ("value", "df", "f", "p", "own")}
         return replace(self, **own)
 
