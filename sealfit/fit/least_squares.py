@@ -11,9 +11,6 @@ from scipy.optimize.elementwise import find_minimum
 
 from sealfit.errors import FitError
 
-# ---------------------------------------------------------------- least squares
-# Nonlinear least squares by Levenberg-Marquardt, of one or many small problems at once, and its covariance.
-
 # Largest number of steps.
 STEPS = 2000
 # Relative change of the sum of squares that counts as rounding.
@@ -195,7 +192,6 @@ LEAST_DAMPING = 1e-15
 STEPS_OF_DERIVATIVE = 1e-3 * np.array([-2, -1, 0, 1, 2])
 
 
-# ---------------------------------------------------------------- the linear part
 def solve_kept(gram, moment, keep):
     """Return the coefficients of columns in `keep`, (..., p), others 0; gram (..., p, p) has unit diagonal.
 
@@ -271,7 +267,6 @@ def project(columns, y, nonnegative, refine: int = 2) -> tuple[np.ndarray, np.nd
     return c / np.where(norm > 0, norm, 1.0), np.einsum("...n,...n->...", rest, rest)
 
 
-# ---------------------------------------------------------------- one nonlinear parameter, many problems
 @dataclass(frozen=True)
 class BatchFit:
     """Optimum per problem; u is the argument of the basis, usually the nonlinear parameter's logarithm."""

@@ -9,9 +9,6 @@ import numpy as np
 
 from sealfit.errors import ParameterError
 
-# ---------------------------------------------------------------- aging
-# The aging law (Eq. 15), in its identifiable form and as printed.
-
 
 def _checked(days, b):
     days, b = np.asarray(days, float), np.asarray(b, float)

@@ -35,9 +35,9 @@ def test_two_numbers_per_condition_and_a_shared_one_are_those_of_the_whole_probl
     for condition, only in (speed_of or {}).items():
         speed[code == condition] = only
     load, decay = rng.choice([49.0, 98.0], code.size), np.exp(-((speed / v_s) ** 2))
-    columns = (load * decay, load * (1 - decay))
+    columns = load * np.stack([decay, 1 - decay])
     values = rng.normal(30.0, 1.0, code.size)
-    pairs, shared = pairs_and_shared(columns, code, speed, values)
+    pairs, shared, _ = pairs_and_shared(columns, code, speed, values)
     expected, expected_shared = _dense(columns, code, speed, values)
     npt.assert_allclose(pairs, expected, rtol=1e-9, atol=1e-12)
     npt.assert_allclose(shared, expected_shared, rtol=1e-9)

@@ -18,9 +18,6 @@ from sealfit.fit.joint.prior import covariance_of
 from sealfit.fit.joint.whitening import blockwise
 from sealfit.physics.aging_laws import LOSSES, Loss
 
-# ---------------------------------------------------------------- aged
-# Values of one quantity over aging time, temperature and compression: the data of a joint law.
-
 # Gas constant in kJ/(mol K).
 GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000
 # Smallest variance of a value. It keeps the weights of values without scatter finite.
@@ -185,8 +182,6 @@ class Spread:
 
 
 # ---------------------------------------------------------------- joint law
-# One law of aging for all temperatures and compressions of a rubber, and the evidence for its shape.
-#
 # .. math:: \mu(t, T, C) = \mu_0 - a\, k^{w}\, \varphi(k^{1-w}\, t), \quad
 #     \ln k = \frac{E}{R} \Big(\frac{1}{T_{ref}} - \frac{1}{T}\Big) + \kappa\, (C_{ref} - C)
 #

@@ -286,9 +286,6 @@ def _last(contains: Callable[[float], bool], inside: float, limit: float) -> flo
 
 
 # ---------------------------------------------------------------- lifetime answer
-# A request for a lifetime, and its answer as plain values.
-
-
 def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
     """Return the goal of a request.
 

@@ -13,9 +13,6 @@ from sealfit.ingest.segments import Pieces, median
 from sealfit.ingest.stored_parts import noise_from_bends
 from sealfit.physics import bristle_limit
 
-# ---------------------------------------------------------------- cells
-# Strokes in groups, averaged over cells of distance.
-
 # Largest number of cells of a group.
 MOST_CELLS = 200
 
@@ -99,8 +96,6 @@ def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 # ---------------------------------------------------------------- rises
-# The starts of the strokes of a condition, simulated with the bristle model.
-
 # Grid values of the stiffness. The length of the rise goes from a third of a step to the whole stroke.
 STIFFNESSES = 40
 # Grid values of the damping: tau as a share of the duration of the rise.

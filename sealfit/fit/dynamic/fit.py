@@ -20,9 +20,7 @@ from sealfit.fit.steady.fit import condition_keys, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 
-# ---------------------------------------------------------------- bristle rows
-# Rows of table `dynamic_fit` for sigma_0 and sigma_1, with the reason if one of them is not determined.
-
+# Reasons why sigma_0 or sigma_1 is not determined.
 NO_START = (
     "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
 )
@@ -105,8 +103,6 @@ def dynamic_units(config: Config) -> Mapping[str, str]:
 
 
 # ---------------------------------------------------------------- dynamic
-# The fit of all conditions.
-
 # Columns of table `traces` that are read.
 OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]
 

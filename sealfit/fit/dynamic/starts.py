@@ -14,10 +14,6 @@ from sealfit.fit.least_squares import levenberg_marquardt
 from sealfit.ingest.segments import median
 from sealfit.ingest.stored_parts import noise_from_bends, stroke_index, strokes_of
 
-# ---------------------------------------------------------------- ramps
-# The motion of a platform that starts along a ramp of speed with two parameters, fitted to many strokes
-# together.
-
 # Starting values of the length of a ramp, in time steps.
 RAMPS = np.geomspace(0.5, 200.0, 12)
 # The rows of every stroke are padded to a multiple of this, so that sums do not depend on the strokes fitted
@@ -180,8 +176,6 @@ def _lagging(since: np.ndarray, ramp: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 # ---------------------------------------------------------------- starts
-# The starts of strokes: from the first motion of the platform to steady sliding.
-
 # A platform is at rest below this share of the steady speed.
 STANDSTILL = 0.05
 # Largest standard deviation of the local speed, as a share of the steady speed.
@@ -209,12 +203,11 @@ class Sliding:
     @classmethod
     def of(cls, distance_mm: np.ndarray, force_N: np.ndarray) -> Sliding:
         """Return the line through samples, shape (n,) each."""
-        rows = len(force_N)
-        middle = float(np.add.reduce(distance_mm)) / rows
+        middle = float(distance_mm.mean())
         away = distance_mm - middle
         square = float(away @ away)
         slope = float(away @ force_N) / max(square, 1e-300)
-        return cls(float(np.add.reduce(force_N)) / rows, middle, slope, rows, math.sqrt(square))
+        return cls(float(force_N.mean()), middle, slope, len(force_N), math.sqrt(square))
 
 
 @dataclass(frozen=True)
@@ -278,16 +271,8 @@ def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
     for begin, end, row in zip(edges[:-1].tolist(), edges[1:].tolist(), own.tolist(), strict=True):
         part = slice(begin, end)
         if row >= 0 and sliding[part].any():
-            made.append(
-                Along(
-                    row,
-                    pace[row],
-                    time[part],
-                    sign[row] * along[part],
-                    sign[row] * force[part],
-                    sliding[part],
-                )
-            )
+            signed = sign[row] * along[part], sign[row] * force[part]
+            made.append(Along(row, pace[row], time[part], *signed, sliding[part]))
     return made
 
 
@@ -312,14 +297,9 @@ def whole_strokes(strokes: Sequence[Along]) -> list[Part]:
     for stroke in strokes:
         distance = np.maximum.accumulate(stroke.along_mm - stroke.along_mm[0])
         if len(distance) >= LEAST and distance[-1] > 0.0:
-            steady = stroke.steady
-            rows = int(np.count_nonzero(steady))
-            force, middle = (
-                float(np.add.reduce(values[steady])) / rows for values in (stroke.force_N, distance)
-            )
-            made.append(
-                Part(stroke.row, distance, stroke.force_N, Sliding(force, middle, 0.0, rows, math.inf))
-            )
+            force, middle = stroke.force_N[stroke.steady], distance[stroke.steady]
+            mean = Sliding(float(force.mean()), float(middle.mean()), 0.0, len(force), math.inf)
+            made.append(Part(stroke.row, distance, stroke.force_N, mean))
     return made
 
 

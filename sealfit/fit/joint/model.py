@@ -15,9 +15,6 @@ from sealfit.fit.joint.declared import QUANTITIES, Declared
 from sealfit.fit.joint.rows import ALONG, Rows
 from sealfit.fit.joint.tangent import Layout, Tangent, blocks_of
 
-# ---------------------------------------------------------------- terms
-# Effects bound to channels: their shapes at the rows, averaged over each row's bin, and their derivatives.
-
 # Gauss-Legendre nodes on [-1, 1] and weights that sum to 1: two for smooth shapes, four for narrow ones.
 TWO_NODES, FOUR_NODES = (
     tuple((float(x), float(w) / 2) for x, w in zip(*np.polynomial.legendre.leggauss(k), strict=True))
@@ -229,13 +226,11 @@ class Model:
 
     def at(self, vector: np.ndarray) -> Model:
         """Return the model with other fitted numbers, shape (size,)."""
-        theta, rest, values = vector[: self.theta.size], list(vector[self.theta.size :]), []
-        for term in self.terms:
-            count = len(term.effect.parameters)
-            numbers = zip(term.effect.parameters, rest[:count], strict=True)
-            values.append({p.name: float(x) for p, x in numbers})
-            rest = rest[count:]
-        return replace(self, theta=theta, values=tuple(values))
+        values = []
+        for number, term in enumerate(self.terms):
+            own = zip(term.effect.parameters, vector[self.term_slice(number)].tolist(), strict=True)
+            values.append({p.name: x for p, x in own})
+        return replace(self, theta=vector[: self.theta.size], values=tuple(values))
 
     def with_term(self, term: Term, values: Mapping[str, float]) -> Model:
         """Return the model with one more term."""
@@ -243,9 +238,8 @@ class Model:
 
     def without_term(self, number: int) -> Model:
         """Return the model without one of its terms."""
-        keep = [k for k in range(len(self.terms)) if k != number]
-        terms = tuple(self.terms[k] for k in keep)
-        return replace(self, terms=terms, values=tuple(self.values[k] for k in keep))
+        terms, values = (own[:number] + own[number + 1 :] for own in (self.terms, self.values))
+        return replace(self, terms=terms, values=values)
 
 
 def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, Tangent | None]:

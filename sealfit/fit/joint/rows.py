@@ -12,9 +12,6 @@ from scipy.sparse import csr_array
 from sealfit.ingest.quality import LEAST_KNOWN, NO_VALUE
 from sealfit.tables import BINS
 
-# ---------------------------------------------------------------- groups
-# Nested groups of rows: strokes in files, files in runs, runs in specimens.
-
 
 @dataclass(frozen=True, slots=True)
 class Groups:
@@ -118,8 +115,6 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
 
 
 # ---------------------------------------------------------------- rows
-# The `bins` table as sorted arrays.
-
 # Grouping levels, finest first. A row of `bins` is a mean of samples of a stroke.
 LEVELS = ("stroke", "file", "run", "specimen")
 # Channels that increase along a stroke, so that they vary within a bin.

@@ -88,11 +88,10 @@ def _per_condition(speed, load, size, condition, full: bool):
     solved, costs = [], []
     for v_s in grid:
         decay = np.exp(-((speed / v_s) ** 2)) if full else np.zeros_like(speed)
-        columns = (load * decay, load * (1 - decay))
-        pairs, sigma_2 = pairs_and_shared(columns, code, speed, size)
+        columns = load * np.stack([decay, 1 - decay])
+        pairs, sigma_2, _ = pairs_and_shared(columns, code, speed, size)
         pairs = np.maximum(pairs, 0.0)
-        first, second = pairs.T
-        residual = size - first[code] * columns[0] - second[code] * columns[1] - sigma_2 * speed
+        residual = size - (pairs[code].T * columns).sum(axis=0) - sigma_2 * speed
         costs.append(float(residual @ residual))
         solved.append((pairs, sigma_2, v_s))
     equal = np.flatnonzero(np.array(costs) <= min(costs) + EQUAL * float(size @ size))
@@ -102,8 +101,8 @@ def _per_condition(speed, load, size, condition, full: bool):
 
 
 def pairs_and_shared(
-    columns: tuple[np.ndarray, np.ndarray], code: np.ndarray, shared: np.ndarray, values: np.ndarray
-) -> tuple[np.ndarray, float]:
+    columns: np.ndarray, code: np.ndarray, shared: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, float, int]:
     """Return the least squares solution of two numbers per group and one, not below 0, that all groups share.
 
     Each group's two columns are orthonormalised and projected out, which leaves one equation for the shared
@@ -111,7 +110,7 @@ def pairs_and_shared(
 
     Parameters
     ----------
-    columns : tuple of ndarray, shape (n,) each
+    columns : ndarray, shape (2, n)
         Columns of the two numbers of each group.
     code : ndarray, shape (n,)
         Number of each value's group, from 0.
@@ -120,7 +119,10 @@ def pairs_and_shared(
 
     Returns
     -------
-    pairs, number : ndarray, shape (groups, 2), and float
+    pairs : ndarray, shape (groups, 2)
+    number : float
+    rank : int
+        That of the pairs' columns; with one value of both columns a pair is not distinguishable.
     """
     one, length = _unit(columns[0], code)
     along = np.bincount(code, one * columns[1])
@@ -135,8 +137,7 @@ def pairs_and_shared(
         """Return the coefficients on the groups' columns, shape (groups, 2), and the residual, shape (n,)."""
         inside = np.column_stack([np.bincount(code, one * column), np.bincount(code, two * column)])
         pairs = np.einsum("gji,gj->gi", right, np.einsum("gji,gj->gi", left, inside) * inverse)
-        first, second = pairs.T
-        return pairs, column - first[code] * columns[0] - second[code] * columns[1]
+        return pairs, column - (pairs[code].T * columns).sum(axis=0)
 
     of_shared, shared_left = projected(shared)
     of_values, values_left = projected(values)
@@ -146,7 +147,7 @@ def pairs_and_shared(
     else:
         number = float((of_values * of_shared).sum()) / (1.0 + float((of_shared**2).sum()))
     number = max(number, 0.0)
-    return of_values - number * of_shared, number
+    return of_values - number * of_shared, number, int((spread > least).sum())
 
 
 def _unit(column: np.ndarray, code: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -198,8 +198,6 @@ def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- scatter
-# Row noise, design effect and variance components of a residual.
-
 # Smallest row noise, as a share of the force. It is below the resolution of any sensor, and keeps the weights
 # of noise-free data finite.
 LEAST_NOISE = 1e-6

@@ -19,15 +19,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy import linalg
 from scipy.optimize import minimize_scalar
 from scipy.sparse import block_diag, csr_array
 from scipy.special import fdtrc
 
 from sealfit.fit.aging.series import PAIRS, steady_covariance, values_of
 from sealfit.fit.joint.declared import series_of_curve
+from sealfit.fit.joint.start import pairs_and_shared
 from sealfit.fit.least_squares import covariance_of, even_grid
-from sealfit.fit.steady.condition import FULL, Condition, stacked
+from sealfit.fit.steady.condition import FULL, Condition
 from sealfit.fit.steady.fit import FORCES, solve_conditions
 from sealfit.fit.steady.stribeck import search_limits
 from sealfit.fit.steady.uncertainty import UnitVariance, shifts_of
@@ -39,9 +39,6 @@ SHARED_P = 0.01
 PER_DECADE = 30
 # Largest relative standard error of a value that counts as determined.
 DETERMINED = 0.3
-# Singular values of a condition's two columns below this share of the largest count as zero. With one speed
-# mu_s and mu_c are not distinguishable.
-RANK = 1e-8
 
 
 @dataclass(frozen=True)
@@ -160,9 +157,11 @@ class _Curve:
 
     def __init__(self, own: Sequence[Condition], widened: np.ndarray) -> None:
         self.own = own
-        self.speed, self.load, self.force, weight = stacked(own)
-        self.root = np.sqrt(weight / widened[:, None])
-        grid = even_grid(*search_limits(self.speed.reshape(1, -1), weight.reshape(1, -1)), PER_DECADE)[0]
+        arrays = zip(*(c.arrays for c in own), strict=True)
+        self.speed, self.load, self.force, weight = (np.concatenate(parts) for parts in arrays)
+        self.code = np.repeat(np.arange(len(own)), [len(c.runs) for c in own])
+        self.root = np.sqrt(weight / widened[self.code])
+        grid = even_grid(*search_limits(self.speed[None], weight[None]), PER_DECADE)[0]
         rss = [self._solve(u)[0] for u in grid]
         best = int(np.argmin(rss))
         ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
@@ -171,25 +170,19 @@ class _Curve:
         )
         self.log_v_s = float(found.x) if found.fun <= rss[best] else float(grid[best])
         self.rss, self.levels, self.sigma_2, rank = self._solve(self.log_v_s)
-        self.df = int((weight > 0).sum()) - rank - 2
+        self.df = self.code.size - rank - 2
 
     def _columns(self, log_v_s: float) -> np.ndarray:
-        """Return the weighted columns of mu_s and mu_c, shape (conditions, runs, 2)."""
+        """Return the weighted columns of mu_s and mu_c, shape (2, runs)."""
         decay = np.exp(-((self.speed / np.exp(log_v_s)) ** 2))
-        return np.stack([decay, 1 - decay], axis=-1) * (self.load * self.root)[..., None]
+        return np.stack([decay, 1 - decay]) * self.load * self.root
 
     def _solve(self, log_v_s: float) -> tuple[float, np.ndarray, float, int]:
         """Return the sum of squares, mu_s and mu_c, (conditions, 2), sigma_2, and the rank of the levels."""
-        columns = self._columns(log_v_s)
-        inverse = np.linalg.pinv(columns, rcond=RANK)
-        both = np.stack([self.force * self.root, self.speed * self.root], axis=-1)  # F and |v|
-        fitted = inverse @ both
-        rest = both - columns @ fitted
-        size = float((rest[..., 1] ** 2).sum())
-        sigma_2 = max(float((rest[..., 0] * rest[..., 1]).sum()) / size, 0.0) if size > 0 else 0.0
-        residual = rest[..., 0] - sigma_2 * rest[..., 1]
-        rank = round(float(np.einsum("knp,kpn->", columns, inverse)))
-        return float((residual**2).sum()), fitted[..., 0] - sigma_2 * fitted[..., 1], sigma_2, rank
+        columns, speed, force = self._columns(log_v_s), self.speed * self.root, self.force * self.root
+        levels, sigma_2, rank = pairs_and_shared(columns, self.code, speed, force)
+        residual = force - (levels[self.code].T * columns).sum(axis=0) - sigma_2 * speed
+        return float(residual @ residual), levels, sigma_2, rank
 
     def names(self) -> Iterator[tuple[str, str]]:
         """Yield condition and quantity of every level, in the order of the tangent's columns."""
@@ -199,14 +192,15 @@ class _Curve:
 
     def tangent(self) -> np.ndarray:
         """Return weighted derivatives with respect to the levels, ln v_s and sigma_2 if not 0, (runs, p)."""
-        columns = self._columns(self.log_v_s)
+        runs = self.code.size
+        own = np.zeros((runs, *self.levels.shape))
+        own[np.arange(runs), self.code] = self._columns(self.log_v_s).T
         square = (self.speed / np.exp(self.log_v_s)) ** 2
-        bend = np.diff(self.levels[:, ::-1], axis=1) * self.load * np.exp(-square) * 2 * square * self.root
-        shared = [bend.ravel()] + ([(self.speed * self.root).ravel()] if self.sigma_2 > 0 else [])
-        there = (self.root > 0).ravel()
-        return np.column_stack([linalg.block_diag(*columns), *shared])[there]
+        rise = self.levels[self.code] @ [1.0, -1.0]
+        bend = rise * self.load * np.exp(-square) * 2 * square * self.root
+        shared = [bend] + ([self.speed * self.root] if self.sigma_2 > 0 else [])
+        return np.column_stack([own.reshape(runs, -1), *shared])
 
     def shifts(self) -> np.ndarray:
         """Return weighted changes of forces along the directions of the effects' uncertainty, (runs, k)."""
-        weighted = [c.shifts * root[: len(c.runs), None] for c, root in zip(self.own, self.root, strict=True)]
-        return np.concatenate(weighted)
+        return np.concatenate([c.shifts for c in self.own]) * self.root[:, None]
