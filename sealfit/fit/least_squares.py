@@ -91,12 +91,8 @@ def levenberg_marquardt(
             done = same & ~(shrinks & (step > 0)) & ((damping[todo] < DAMPING) | ~better)
             done |= (np.abs(trial - at) <= ROUNDING * np.abs(at)).all(axis=1)
             moved = todo[better]
-            x[moved], rest[moved], slope[moved], length[moved] = (
-                trial[better],
-                trial_rest[better],
-                trial_slope[better],
-                step[better],
-            )
+            x[moved], length[moved] = trial[better], step[better]
+            rest[moved], slope[moved] = trial_rest[better], trial_slope[better]
             rss[moved] -= gain[better]
             damping[todo] = np.where(better, damping[todo] / 10, np.maximum(damping[todo], 1e-12) * 10)
             todo = todo[~done & (damping[todo] < LARGEST_DAMPING)]
@@ -280,21 +276,14 @@ class BatchFit:
 class Separable:
     """Least-squares problems with one nonlinear parameter each.
 
-    Attributes
-    ----------
-    basis : callable
-        `basis(u, rows)` -> columns, shape (r, g, n, p), for the problems `rows`, shape (r,), at u, shape (r,
-        g).
-    y, weight : ndarray, shape (problems, n)
-        Measured values and 1/variance; weight 0 for padding.
-    nonnegative : sequence of bool, length p
-        Which coefficients are nonnegative.
+    `basis(u, rows)` returns the columns, shape (r, g, n, p), of the problems `rows`, shape (r,), at u, shape
+    (r, g).
     """
 
     basis: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    y: np.ndarray
-    weight: np.ndarray
-    nonnegative: Sequence[bool]
+    y: np.ndarray  # (problems, n) measured values
+    weight: np.ndarray  # (problems, n) 1/variance; 0 for padding
+    nonnegative: Sequence[bool]  # (p,) which coefficients are nonnegative
 
     def some(self, own: np.ndarray) -> Separable:
         """Return the problems with some numbers, shape (r,)."""
@@ -348,15 +337,12 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     def solved(u, problem):
         return profile(problems.some(problem.astype(int)), u[:, None], refine=2)
 
+    def rss_at(u, problem):
+        return solved(u, problem)[0][:, 0]
+
     bracket = tuple(grid[problem, k + step] for step in range(3))
     stops = {"xatol": CLOSE, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
-    valley = find_minimum(
-        lambda u, problem: solved(u, problem)[0][:, 0],
-        bracket,
-        args=(problem,),
-        tolerances=stops,
-        maxiter=MOST_STEPS,
-    ).x
+    valley = find_minimum(rss_at, bracket, args=(problem,), tolerances=stops, maxiter=MOST_STEPS).x
     start = np.column_stack([solved(valley, problem)[1][:, 0], valley])
     valley = _to_all_digits(problems.some(problem), start, grid[problem][:, [0, -1]])
     every = np.arange(len(problems.y))

@@ -89,7 +89,7 @@ def test_series_are_searched_on_their_own_rows_as_on_all(monkeypatch):
     assert 0 < moving.force.size < rows.force.size == moving.force.size + still.force.size
     assert set(moving.table["specimen_id"]).isdisjoint(still.table["specimen_id"])
     found = search_nonlinear(model, rows, SCATTER)
-    monkeypatch.setattr(joint_search, "_split_by_action", lambda model, rows, group: (rows, None))
+    monkeypatch.setattr(joint_search, "_split_by_action", lambda model, rows, group: (rows,))
     npt.assert_allclose(search_nonlinear(model, rows, SCATTER).vector(), found.vector(), rtol=1e-9)
 
 

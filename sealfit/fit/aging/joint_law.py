@@ -106,12 +106,11 @@ class Aged:
 
     def drivers(self) -> tuple[str, ...]:
         """Return the names of the coefficients in ln k of the variables that were varied."""
-        aged, found = self.days > 0, []
-        for name, column, _ in DRIVERS:
-            at = getattr(self, column)
-            if at is not None and np.unique(at[aged]).size > 1:
-                found.append(name)
-        return tuple(found)
+        at = {name: getattr(self, column) for name, column, _ in DRIVERS}
+        varied = {
+            name: own is not None and np.unique(own[self.days > 0]).size > 1 for name, own in at.items()
+        }
+        return tuple(name for name in at if varied[name])
 
     @cached_property
     def middle(self) -> dict[str, float]:

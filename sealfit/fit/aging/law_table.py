@@ -21,6 +21,7 @@ WIDE_B = 100.0
 SIGNIFICANT = 0.05
 
 LAW = ("mu_0", "a", "b", "c")
+ERROR_DF = "degrees of freedom of intervals of the law's values, all series together"
 NO_SCATTER = (
     "as many parameters as days: the interval excludes the scatter between specimens, which is not known."
 )
@@ -82,23 +83,20 @@ def law_rows(
     uncertainty too high. `df` are the degrees of freedom of mu_0's interval.
     """
     mu_0, a, u = x
-    unit, b, se = curve.unit, np.exp(u), np.sqrt(np.diag(covariance))
+    b, se = np.exp(u), np.sqrt(np.diag(covariance))
     to_c = np.array([0.0, -u, -a])
     with np.errstate(invalid="ignore"):
         se_c = np.sqrt(to_c @ covariance @ to_c)
     beside, t = "" if df > 0 else NO_SCATTER, t_of_95(df)
     move = np.where(np.abs(shift) > 1e-12 * np.abs(x), shift, 0.0)  # the rest is rounding
     judged = _judge(curve, a, b, ends)
-    limits = {"mu_0": (mu_0 - t * se[0], mu_0 + t * se[0]), "a": ends.a, "b": ends.b, "c": ends.c}
-    numbers = {
-        "mu_0": (mu_0, se[0], move[0], unit),
-        "a": (a, se[1], move[1], unit),
-        "b": (b, b * se[2], b * move[2], "d"),
-        "c": (-a * u, se_c, -u * move[1] - a * move[2], unit),
-    }
-    for name in LAW:
-        value, error, systematic, its_unit = numbers[name]
-        low, high = limits[name]
+    of_mu_0 = (mu_0 - t * se[0], mu_0 + t * se[0])
+    for name, value, error, systematic, (low, high) in (
+        ("mu_0", mu_0, se[0], move[0], of_mu_0),
+        ("a", a, se[1], move[1], ends.a),
+        ("b", b, b * se[2], b * move[2], ends.b),
+        ("c", -a * u, se_c, -u * move[1] - a * move[2], ends.c),
+    ):
         yield table_row(
             quantity=curve.quantity,
             parameter=name,
@@ -107,7 +105,7 @@ def law_rows(
             lo95=None if name == "b" and low == 0.0 else low,
             hi95=high,
             u_sys=abs(systematic),
-            unit=its_unit,
+            unit="d" if name == "b" else curve.unit,
             identified=judged[name][0],
             reason=" ".join(filter(None, (judged[name][1], beside))),
         ) | {"series": curve.series}
@@ -131,16 +129,12 @@ def _judge(curve: Curve, a: float, b: float, ends: CurveInterval) -> dict[str, t
         )
     else:
         why = ""
+        remark = ""
         if b < first and curve.unaged:
-            verdict["b"] = (
-                True,
-                f"below the first day tested ({first:g} d): it rests on the unaged rubber's value.",
-            )
+            remark = f"below the first day tested ({first:g} d): it rests on the unaged rubber's value."
         elif b > last:
-            verdict["b"] = (
-                True,
-                f"beyond the last day tested ({last:g} d): it rests on how little the loss bends.",
-            )
+            remark = f"beyond the last day tested ({last:g} d): it rests on how little the loss bends."
+        verdict["b"] = (True, remark)
     if why:
         verdict["b"] = (False, why)
         verdict["c"] = (False, f"c = -a ln b, and b is not determined: {why}")
@@ -152,17 +146,11 @@ def _judge(curve: Curve, a: float, b: float, ends: CurveInterval) -> dict[str, t
 def without_law(curve: Curve) -> Iterator[dict]:
     """Return the rows of a curve with too few days: no values, and a reason."""
     days = ", ".join(f"{day:g}" for day in ([0.0, *curve.days] if curve.unaged else curve.days)) or "none"
-    reason = (
-        f"the law needs {DAYS_FOR_LAW} distinct days where {curve.quantity} is determined; there are: {days}."
-    )
+    needs = f"the law needs {DAYS_FOR_LAW} distinct days where {curve.quantity} is determined"
+    row = {"quantity": curve.quantity, "identified": False, "reason": f"{needs}; there are: {days}."}
     for name in LAW:
-        yield table_row(
-            quantity=curve.quantity,
-            parameter=name,
-            unit="d" if name == "b" else curve.unit,
-            identified=False,
-            reason=reason,
-        ) | {"series": curve.series}
+        unit = "d" if name == "b" else curve.unit
+        yield table_row(parameter=name, unit=unit, **row) | {"series": curve.series}
 
 
 def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Iterator[dict]:
@@ -199,18 +187,8 @@ def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Itera
         ("chi2", chi2, "", f"against the covariance of the {known} alone"),
         ("df", own_df, "", "this series' share, mu_0 being shared"),
         ("lack_of_fit_p", p, "", reason),
-        (
-            "specimen_sd_pct",
-            100 * tau,
-            "%",
-            f"scatter beyond that of the {known}, all series together",
-        ),
-        (
-            "error_df",
-            quantity.level_df,
-            "",
-            "degrees of freedom of intervals of the law's values, all series together",
-        ),
+        ("specimen_sd_pct", 100 * tau, "%", f"scatter beyond that of the {known}, all series together"),
+        ("error_df", quantity.level_df, "", ERROR_DF),
         ("max_error_pct", 100 * np.abs(error).max(), "%", "largest error of the law over the days tested"),
         ("rmse", np.sqrt(np.mean((joint.model - values.value)[shown] ** 2)), curve.unit, ""),
         ("n_days", shown.sum(), "", "days tested, day 0 included"),

@@ -68,9 +68,8 @@ def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
     normal = normal + precision
     size = np.sqrt(np.diag(normal))
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # 0 for a parameter without effect
-    return (
-        scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
-    )
+    scale = np.outer(scale, scale)
+    return np.linalg.pinv(normal * scale, rcond=1e-12, hermitian=True) * scale
 
 
 def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
@@ -84,9 +83,7 @@ def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray)
         return 1.0
     tried = unit * 10.0**DECADES
     posterior = normal + np.diag(RIDGE * np.diag(normal)) + tried[:, None, None] * rough
-    solved = np.linalg.solve(posterior, np.broadcast_to(gradient[:, None], (tried.size, gradient.size, 1)))[
-        ..., 0
-    ]
+    solved = np.linalg.solve(posterior, gradient[:, None])[..., 0]
     rank = rough.shape[0] - 1
     cost = -(solved @ gradient) + np.linalg.slogdet(posterior)[1] - rank * np.log(tried)
     return float(tried[np.argmin(cost)])
@@ -127,9 +124,8 @@ def free_of_others(
     precision = precision_of(model)
     pull = (gradient - precision @ (model.vector() - centre_of(model)))[others]
     cross = normal[place][:, others]
-    by_others = np.linalg.lstsq(
-        (normal + precision)[np.ix_(others, others)], np.c_[cross.T, pull], rcond=1e-12
-    )[0]
+    square = (normal + precision)[np.ix_(others, others)]
+    by_others = np.linalg.lstsq(square, np.c_[cross.T, pull], rcond=1e-12)[0]
     own = normal[place, place] - cross @ by_others[:, :-1]
     own = (own + own.T) / 2
     return own, gradient[place] - cross @ by_others[:, -1] + own @ model.vector()[place]

@@ -232,20 +232,14 @@ class Rows:
 
     def subset(self, mask: np.ndarray) -> Rows:
         """Return the rows where `mask`, shape (n,), is true; conditions keep the numbers that models need."""
-        weight = self.weight[mask]
+        arrays = ("order", "force", "speed", "pace", "load", "days", "condition")
         part = replace(
             self,
             table=self.table[mask].reset_index(drop=True),
-            order=self.order[mask],
             groups=Groups.of({level: code[mask] for level, code in self.groups.codes.items()}),
-            force=self.force[mask],
-            speed=self.speed[mask],
-            pace=self.pace[mask],
-            load=self.load[mask],
-            days=self.days[mask],
-            condition=self.condition[mask],
-            weight=weight / weight.sum(),
+            weight=self.weight[mask] / self.weight[mask].sum(),
             filled={name: values[mask] for name, values in self.filled.items()},
+            **{name: getattr(self, name)[mask] for name in arrays},
         )
         for key, (at, values) in self.cache.items():
             if isinstance(key, str) or key[0] == "width":  # channels, and widths of all bins

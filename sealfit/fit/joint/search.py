@@ -72,14 +72,11 @@ def descend(
         scale = np.sqrt(np.diag(normal)[free])
         scaled = normal[np.ix_(free, free)] / np.outer(scale, scale)
         for _ in range(12):
-            move = np.zeros_like(vector)
-            move[free] = (
-                np.linalg.solve(scaled + (damping + 1e-12) * np.eye(scale.size), gradient[free] / scale)
-                / scale
-            )
+            move, damped = np.zeros_like(vector), scaled + (damping + 1e-12) * np.eye(scale.size)
+            move[free] = np.linalg.solve(damped, gradient[free] / scale) / scale
             trial = np.clip(vector + move, low, high)
             trial_model = model.at(trial)
-            trial_force, _none = evaluate(trial_model, rows, jacobian=False)
+            trial_force = evaluate(trial_model, rows, jacobian=False)[0]
             trial_residual = whitening((rows.force - trial_force)[:, None])[:, 0]
             trial_cost = cost_of(trial_residual, trial)
             if np.isfinite(trial_cost) and trial_cost <= cost:
@@ -91,9 +88,8 @@ def descend(
         vector, model, residual, cost = trial, trial_model, trial_residual, trial_cost
         damping /= 10
         slow_steps = slow_steps + 1 if gain < SLOW else 0
-        if slow_steps > 3 or (
-            gain < tolerance and damping < 1e-3
-        ):  # under heavy damping every step gains little
+        # Under heavy damping every step gains little.
+        if slow_steps > 3 or (gain < tolerance and damping < 1e-3):
             return model
         _, jacobian = evaluate(model, rows)
     return model
@@ -125,17 +121,13 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
     """
     low, high = bounds_of(model, rows)
     precision = np.diag(precision_of(model))[group]  # of the prior, which is centred at the present values
-    acted_on, others = _split_by_action(model, rows, group)
+    acted_on, *others = _split_by_action(model, rows, group)
     whitening = Whitening(scatter, acted_on.force, acted_on.groups)
-    constant = (
-        None if others is None else _equations(model, others, Whitening(scatter, others.force, others.groups))
-    )
+    constant = [_equations(model, own, Whitening(scatter, own.force, own.groups)) for own in others]
 
     def optimum(trial: Model) -> tuple[float, Model]:
-        equations = _equations(trial, acted_on, whitening)
-        if constant is not None:
-            equations = tuple(own + other for own, other in zip(equations, constant, strict=True))
-        return _linear_optimum(trial, equations, (low, high))
+        parts = zip(_equations(trial, acted_on, whitening), *constant, strict=True)
+        return _linear_optimum(trial, tuple(sum(own) for own in parts), (low, high))
 
     least_cost, best = optimum(model)
     for value in np.linspace(low[group[0]], high[group[0]], GRID_POINTS):
@@ -148,18 +140,16 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
     return model.at(np.clip(best.vector(), low, high))
 
 
-def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, Rows | None]:
-    """Return rows on which declared parameters act, and the others; all rows and None if one part is empty.
+def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, ...]:
+    """Return rows on which declared parameters act, and the others; all rows if one part is empty.
 
     Rows of one specimen are correlated and stay together.
     """
-    acts = np.any([np.isin(numbers, group) for numbers in model.declared.index.values()], axis=0)[
-        rows.condition
-    ]
+    conditions = np.any([np.isin(numbers, group) for numbers in model.declared.index.values()], axis=0)
     specimen = rows.codes("specimen")
-    acts = (np.bincount(specimen, acts) > 0)[specimen]
+    acts = (np.bincount(specimen, conditions[rows.condition]) > 0)[specimen]
     if acts.all() or not acts.any():
-        return rows, None
+        return (rows,)
     return rows.cache.once(("split", acts.tobytes()), lambda: (rows.subset(acts), rows.subset(~acts)))
 
 
@@ -241,9 +231,7 @@ def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
         "b_s": (np.log(first / 1000), np.log(last * 30)),
         "b_c": (np.log(first / 1000), np.log(last * 30)),
     }
-    low = [limits.get(p.quantity, (-np.inf, np.inf))[0] for p in model.declared.parameters]
-    high = [limits.get(p.quantity, (-np.inf, np.inf))[1] for p in model.declared.parameters]
-    for term in model.terms:
-        low += [p.bounds[0] for p in term.effect.parameters]
-        high += [p.bounds[1] for p in term.effect.parameters]
-    return np.array(low, dtype=float), np.array(high, dtype=float)
+    declared = [limits.get(p.quantity, (-np.inf, np.inf)) for p in model.declared.parameters]
+    added = [p.bounds for term in model.terms for p in term.effect.parameters]
+    low, high = np.array([*declared, *added], dtype=float).T
+    return low, high

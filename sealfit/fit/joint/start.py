@@ -27,8 +27,7 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
     theta = np.zeros(len(declared.parameters))
     number = {p: k for k, p in enumerate(declared.parameters)}
     speeds = np.abs(rows.groups.means(rows.speed, "stroke"))
-    at = rows.groups.starts["stroke"]
-    condition = rows.condition[at]
+    condition = rows.condition[rows.groups.starts["stroke"]]
     load = rows.groups.means(rows.load, "stroke")
     size = rows.groups.means(rows.force * np.sign(rows.speed), "stroke")
     series = sorted({p.owner for p in declared.parameters if p.quantity in ("v_s", "sigma_2")})
@@ -37,30 +36,24 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
     curved = declared.index["v_s"] >= 0
     solved: dict[bytes, tuple] = {}  # with `together`, series of one form share the solution
     for name in series:
-        k = number.get(JointParameter("sigma_2", name), number.get(JointParameter("v_s", name)))
-        full = JointParameter("v_s", name) in number
-        uses = (
-            curved if together and full else (declared.index["sigma_2"] == k) | (declared.index["v_s"] == k)
-        )
+        k, of_v_s = number[JointParameter("sigma_2", name)], number.get(JointParameter("v_s", name))
+        full = of_v_s is not None
+        uses = curved if together and full else declared.index["sigma_2"] == k
         if uses.tobytes() not in solved:
             mine = uses[condition]
-            solved[uses.tobytes()] = _per_condition(
-                speeds[mine], load[mine], size[mine], condition[mine], full
-            )
-        values, sigma_2, v_s = solved[uses.tobytes()]
+            strokes = speeds[mine], load[mine], size[mine], condition[mine]
+            solved[uses.tobytes()] = _per_condition(*strokes, full)
+        values, theta[k], v_s = solved[uses.tobytes()]
         for c, pair in values.items():
             level[c], chosen[c] = pair, True
-        theta[k if not full else number[JointParameter("sigma_2", name)]] = sigma_2
         if full:
-            theta[number[JointParameter("v_s", name)]] = np.log(v_s)
+            theta[of_v_s] = np.log(v_s)
     for c in np.flatnonzero(~chosen):
         mine = condition == c
         level[c] = np.mean(size[mine] / load[mine])
     days = rows.conditions["aging_days"].to_numpy()
     for column, end in ((0, "s"), (1, "c")):
-        index_0, index_a, index_b = (
-            declared.index[f"{q}_{end}" if q != "mu_0" else f"mu_0{end}"] for q in ("mu_0", "a", "b")
-        )
+        index_0, index_a, index_b = (declared.index[name + end] for name in ("mu_0", "a_", "b_"))
         for k in np.unique(index_0[(index_0 >= 0)]):
             mine = index_0 == k
             unaged = mine & (days == days[mine].min())

@@ -48,12 +48,8 @@ class Scatter:
     s0: float
     g: float
     components: tuple[Component, ...] = ()
-    design_effect: float = (
-        1.0  # factor on the variance of a stroke's mean, from correlation of neighbouring rows
-    )
-    shape: float = (
-        1.0  # further factor on the variance of patterns along the stroke, from differences between files
-    )
+    design_effect: float = 1.0  # factor on the variance of a stroke's mean, as rows are correlated
+    shape: float = 1.0  # further factor on that of patterns along the stroke, as files differ
 
     def estimates(self, level: str) -> bool:
         """Return whether the variance of a level was estimated separately; the estimate may be zero."""
@@ -141,24 +137,16 @@ class Whitening:
         about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])
         self.root = np.sqrt(scatter.shape)
         self.unit = 1 / (sd * self.root)
-        self.back = csr_array(
-            (
-                np.column_stack([mean, about]).ravel(),
-                (2 * code[:, None] + [0, 1]).ravel(),
-                2 * np.arange(n + 1),
-            ),
-            shape=(n, 2 * m),
-        )
+        columns = (2 * code[:, None] + [0, 1]).ravel()
+        parts = np.column_stack([mean, about]).ravel(), columns, 2 * np.arange(n + 1)
+        self.back = csr_array(parts, shape=(n, 2 * m))
         self.take = csr_array(self.back.T.multiply(1 / sd[None, :]))
-        self.between = Between(
-            np.tile([1.0, scatter.shape], m),
-            {
-                "offset": np.column_stack([size, np.zeros(m)]).ravel(),
-                "gain": np.column_stack([level, np.where(flat, 0.0, spread)]).ravel(),
-            },
-            groups.at(finest).repeated(2),
-            scatter.components,
-        )
+        loads = {
+            "offset": np.column_stack([size, np.zeros(m)]).ravel(),
+            "gain": np.column_stack([level, np.where(flat, 0.0, spread)]).ravel(),
+        }
+        variance, strokes = np.tile([1.0, scatter.shape], m), groups.at(finest).repeated(2)
+        self.between = Between(variance, loads, strokes, scatter.components)
         self.logdet = self.between.logdet + float(2 * np.log(sd).sum() + (n - 2 * m) * np.log(scatter.shape))
 
     def normal(self, tangent: Tangent, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

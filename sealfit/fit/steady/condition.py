@@ -26,6 +26,8 @@ from sealfit.physics import stribeck_force
 FULL, VISCOUS, CONSTANT = 4, 2, 1
 # Level of the test for a Stribeck curve.
 SIGNIFICANT = 0.05
+# Remark on a condition without a Stribeck curve whose directions differ.
+HIDDEN = "The offset between the two directions counts as scatter here and may hide a curve; see close-loop."
 # Parameters of each model.
 COLUMNS = {4: NAMES, 2: ("mu_c", "sigma_2"), 1: ("mu_c",)}
 
@@ -51,12 +53,8 @@ class Condition:
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """|v|, N (1 without load), F sgn v and weight of each run, shape (n,)."""
         load = self.runs["load"].to_numpy(float) if self.has_load else np.ones(len(self.runs))
-        return (
-            self.runs["speed"].to_numpy(float),
-            load,
-            self.runs["force"].to_numpy(float),
-            self.runs["weight"].values,
-        )
+        speed, force, weight = (self.runs[name].to_numpy(float) for name in ("speed", "force", "weight"))
+        return speed, load, force, weight
 
     @property
     def shifts(self) -> np.ndarray:
@@ -98,10 +96,8 @@ class Condition:
 
         The declared model has no offset, but it widens the intervals and can mask a Stribeck curve.
         """
-        rest, direction = (
-            self.runs["force"].to_numpy(float) - self.model_force(),
-            self.runs["direction"].to_numpy(),
-        )
+        rest = self.runs["force"].to_numpy(float) - self.model_force()
+        direction = self.runs["direction"].to_numpy()
         one, other = rest[direction > 0], rest[direction < 0]
         halves = self.runs["half"].dropna().to_numpy(float)
         if min(len(one), len(other)) >= 3:
@@ -168,9 +164,8 @@ def drop_flat_curve(condition: Condition, unit: float, df: float) -> None:
     _solve_linear(condition)
     if np.isfinite(unit) and unit > 0:
         columns = condition.columns()[:, : 2 if condition.values[1] > 0 else 1]
-        condition.flat_p = flat_p_value(
-            speed, columns, weight, condition.grid, (condition.chi2 - chi2) / unit, df
-        )
+        gain = (condition.chi2 - chi2) / unit
+        condition.flat_p = flat_p_value(speed, columns, weight, condition.grid, gain, df)
     if not condition.flat_p >= SIGNIFICANT:
         condition.model, condition.values, condition.chi2 = FULL, full, chi2
 
@@ -207,10 +202,8 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
         }
     zero = {name for name, value in zip(condition.names, condition.values, strict=True) if value == 0.0}
     if "sigma_2" in zero:
-        verdict["sigma_2"] = (
-            verdict["sigma_2"][0],
-            "at its physical limit 0: friction does not rise with speed here.",
-        )
+        at_zero = "at its physical limit 0: friction does not rise with speed here."
+        verdict["sigma_2"] = (verdict["sigma_2"][0], at_zero)
     for name in zero & {"mu_s", "mu_c"}:
         verdict[name] = (False, "at its physical limit 0: these runs show no friction that it could be.")
     against = int((condition.runs["force"] < 0).sum())
@@ -240,15 +233,7 @@ def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
         }
         verdict["mu_c"] = (True, "of the fit without Stribeck curve; mu_s = mu_c is not rejected.")
         if condition.offset():
-            hidden = (
-                "The offset between the two directions counts as scatter here and may hide a curve; "
-                "see close-loop."
-            )
-            verdict |= {
-                name: (ok, f"{why} {hidden}".strip())
-                for name, (ok, why) in verdict.items()
-                if name != "sigma_2"
-            }
+            verdict |= {name: (verdict[name][0], f"{verdict[name][1]} {HIDDEN}") for name in NAMES[:3]}
     elif condition.low is None:
         unknown = "as many parameters as runs and no repeats: nothing shows how far to trust it."
         verdict |= {name: (False, unknown) for name in NAMES}
