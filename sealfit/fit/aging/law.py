@@ -50,15 +50,8 @@ def search_limits(days) -> tuple[np.ndarray, np.ndarray]:
 def solve_law(days, value, weight) -> BatchFit:
     """Return the global weighted least-squares fit of the aging law to many separate curves.
 
-    Parameters
-    ----------
-    days, value, weight : ndarray, shape (curves, n)
-        Aging time in days, measured value, 1/variance (0 for padding).
-
-    Returns
-    -------
-    BatchFit
-        `u` is ln b; `coefficients` are mu_0 and a.
+    Days, values and weights, 1/variance or 0 for padding, have the shape (curves, n). In the result `u` is ln
+    b, and `coefficients` are mu_0 and a.
 
     Examples
     --------

@@ -186,13 +186,10 @@ class _Profile:
 
 def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high: End) -> CurveInterval:
     """Return the interval of a curve from a and its half-width at fixed values of ln b between the ends."""
-    around = {
-        name: [
-            float((factor * a - np.abs(factor) * half).min()),
-            float((factor * a + np.abs(factor) * half).max()),
-        ]
-        for name, factor in (("a", 1.0), ("c", -log_b))
-    }
+    around = {}
+    for name, factor in (("a", 1.0), ("c", -log_b)):
+        middle, reach = factor * a, np.abs(factor) * half
+        around[name] = [float((middle - reach).min()), float((middle + reach).max())]
     signs = [end for end, reached in ((1, around["a"][1] > 0), (0, around["a"][0] < 0)) if reached]
     for outer in signs:
         endless = np.inf if outer else -np.inf

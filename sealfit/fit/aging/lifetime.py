@@ -343,10 +343,11 @@ def answer(
         celsius, *ends = temperature_for(law, goal, years, compression_pct)
         tested = law.aged.temperature_C[law.aged.days > 0]
         low, high = float(tested.min()), float(tested.max())
-        found |= {"years": years, "temperature_C": _finite(celsius), "temperature_ci95": finite_ends(ends)}
-        found |= {"always": None if np.isfinite(celsius) else "longer" if celsius > 0 else "shorter"}
-        return {
-            **found,
+        return found | {
+            "years": years,
+            "temperature_C": _finite(celsius),
+            "temperature_ci95": finite_ends(ends),
+            "always": None if np.isfinite(celsius) else "longer" if celsius > 0 else "shorter",
             "extrapolated": not low <= celsius <= high,
             "tested_C": [low, high],
             "sought_C": list(SPAN_C),

@@ -67,19 +67,13 @@ def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
     """
     open_columns = [name for name in config.series_columns if name in steady_fit.columns]
     columns = [*AGING_FIT.names(), *open_columns]
-    if not config.aging or "aging_days" not in steady_fit.columns:
-        return _empty(columns, steady_fit)
-    rows: list[dict] = []
-    for rubber, own in steady_fit.groupby("rubber", sort=True):
-        rows += [{"rubber": rubber, **row} for row in _fit_rubber(own)]
+    has_aging = config.aging and "aging_days" in steady_fit.columns
+    rubbers = steady_fit.groupby("rubber", sort=True) if has_aging else ()
+    rows = [{"rubber": rubber, **row} for rubber, own in rubbers for row in _fit_rubber(own)]
     if not rows:
-        return _empty(columns, steady_fit)
+        return pd.DataFrame({name: steady_fit[name].iloc[:0] for name in columns})
     keys = steady_fit.groupby("series", sort=True)[open_columns].first().reset_index()
     return pd.DataFrame(rows).merge(keys, on="series", how="left", validate="many_to_one")[columns]
-
-
-def _empty(columns: list[str], like: pd.DataFrame) -> pd.DataFrame:
-    return pd.DataFrame({name: like[name].iloc[:0] for name in columns})
 
 
 # ---------------------------------------------------------------- one rubber

@@ -37,17 +37,9 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
     above sliding where the mean of all units is largest, `noise` its standard error in units of that of a
     sample, and `places` the number of positions; `F` is the sliding force.
 
-    Parameters
-    ----------
-    cells : Cells
-        Cells of the strokes at one condition, in groups of one commanded speed and direction.
-    file : ndarray of int, shape (strokes,)
-        Number of each stroke's file.
-
-    Returns
-    -------
-    dict of ndarray, shape (units,) each
-        By name; `group` is the number of the unit's group. Units with an unknown value are left out.
+    `cells` are those of the strokes at one condition, in groups of one commanded speed and direction; `file`,
+    shape (strokes,), is the number of each stroke's file. The results have the shape (units,); `group` is the
+    number of the unit's group. Units with an unknown value are left out.
     """
     of, count = cells.groups.of, cells.count
     each = np.arange(len(of))
@@ -87,23 +79,14 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: Config) -> pd.DataFrame:
-    """Return rows of table `dynamic_fit` for all break-aways of a campaign.
+    """Return rows of table `dynamic_fit` for all break-aways of a campaign, from the result of `peaks`.
 
     The scatter of repeats is pooled within a condition: for the force relative to it, for the ratio as the
     force above sliding over its noise, as other errors cancel in the ratio. The variance of the force
-    includes set-up scatter, which is common to the repeats of a run. There is a peak if the largest mean
-    exceeds the sliding force in a t-test at 1 % for all positions of all starts of the campaign (Bonferroni).
-    Else `reason` says so, without an interval.
-
-    Parameters
-    ----------
-    found : DataFrame
-        Result of `peaks`, with the condition, commanded speed and direction of each unit.
-    widened : (float, float)
-        Ratio of the variance of run means to that expected from repeats, and its degrees of freedom, from the
-        steady fit.
-    config : Config
-        Gives the units and the sensor's accuracy.
+    includes set-up scatter, which is common to the repeats of a run: `widened` is the ratio of the variance
+    of run means to that expected from repeats, and its degrees of freedom. There is a peak if the largest
+    mean exceeds the sliding force in a t-test at 1 % for all positions of all starts of the campaign
+    (Bonferroni). Else `reason` says so, without an interval.
     """
     logs = {name: np.log(found[name]) for name in (FORCE, RATIO, SLIDING)}
     shares = {

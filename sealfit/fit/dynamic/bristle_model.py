@@ -18,23 +18,11 @@ MOST_CELLS = 200
 
 
 class Cells:
-    """Cells of distance for groups of strokes.
+    """Cells of distance for groups of strokes; the strokes of a group are adjacent.
 
-    The cells of a group extend to the median distance of its strokes. Their number is the median number of
-    samples of a stroke, at most MOST_CELLS. Arrays are padded to the largest number of cells.
-
-    Attributes
-    ----------
-    parts : sequence of Part, length strokes
-        The strokes; those of a group are adjacent.
-    groups : Pieces
-        The strokes of each group.
-    count : ndarray of int, shape (groups,)
-        Number of cells of each group.
-    samples, reach_mm : ndarray, shape (groups,)
-        Median number of samples of a stroke, and median distance.
-    middle_mm : ndarray, shape (groups, cells)
-        Midpoint of each cell.
+    The cells of a group extend to the median distance of its strokes, `reach_mm`, shape (groups,). Their
+    number, `count`, is the median number of samples of a stroke, `samples`, at most MOST_CELLS. Arrays are
+    padded to the largest number of cells; `middle_mm`, shape (groups, cells), is the midpoint of each.
     """
 
     def __init__(self, parts: Sequence[Part], group: np.ndarray) -> None:

@@ -318,11 +318,11 @@ def _curve(condition: str, fitted: Known, steady: pd.DataFrame) -> Curve:
     for static, coulomb, factor in (("mu_s", "mu_c", load), ("F_s", "F_c", 1.0)):
         known = [fitted.get((condition, "steady", name)) for name in (static, coulomb, "v_s")]
         if None not in known:
-            own_unit = np.array([factor, factor, 1.0, 1.0])
+            unit = np.array([factor, factor, 1.0, 1.0])
             covariance = _covariance(condition, fitted, (static, coulomb, "v_s", "sigma_2"))
             df = int(fitted.get((condition, "statistics", "df"), 1))
-            covariance = covariance * np.outer(own_unit, own_unit)
-            return Curve(known[0] * factor, known[1] * factor, known[2], sigma_2, covariance, df)
+            parameters = unit * [*known, sigma_2]
+            return Curve(*parameters.tolist(), covariance * np.outer(unit, unit), df)
     flat = float(np.median(steady["size_N"] - sigma_2 * steady["speed_mm_s"].abs()))
     return Curve(flat, flat, np.inf, sigma_2)
 

@@ -64,14 +64,8 @@ def fit_ramps(
     A local speed is too noisy where the speed changes most; the two parameters of a ramp, beginning and
     length, use all samples. Position and final speed are linear and solved for exactly (variable projection:
     Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995). Beginning and length are fitted by
-    Levenberg-Marquardt from the best of a grid.
-
-    Parameters
-    ----------
-    times_s, alongs_mm : sequence of ndarray, shape (n,) each
-        Time and displacement of every stroke, positive along its motion.
-    paces_mm_s : sequence of float
-        Approximate final speed.
+    Levenberg-Marquardt from the best of a grid. Displacements are positive along the motion; `paces_mm_s` are
+    approximate final speeds.
     """
     made: list[Ramp | None] = [None] * len(times_s)
     of_length: dict[int, list[int]] = {}

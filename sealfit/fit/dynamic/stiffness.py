@@ -95,12 +95,7 @@ class Stiffness:
 def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     """Return sigma_0 and tau of the strokes of a condition; None without strokes.
 
-    Parameters
-    ----------
-    strokes : sequence of Stroke
-        All strokes that start at rest or at a reversal.
-    curve : Curve
-        Stribeck curve of the condition.
+    `strokes` are all that start at rest or at a reversal, and `curve` is the condition's Stribeck curve.
     """
     if not strokes:
         return None

@@ -198,14 +198,8 @@ def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
     """Return a fit with variance components, and row noise if wanted, re-estimated from its own residual.
 
     An effect that a model lacks inflates its variance components. Deviances distinguish models only if each
-    model has its own components; under inflated ones all models fit about equally well.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        A fit with other components. Its friction is kept, as fits to be compared share it.
-    noise : bool
-        Whether the row noise is re-estimated too. Fits to be compared share the row noise of the best fit.
+    model has its own components; under inflated ones all models fit about equally well. Fits to be compared
+    share the friction, which is kept, and the row noise of the best fit.
     """
     rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
     scatter = estimate(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)

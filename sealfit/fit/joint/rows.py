@@ -73,22 +73,12 @@ SPEED_AND_SIGN = r"( at \d[\d.e+-]*?)?[+-]?$"
 
 
 def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
-    """Return table `steady` with one row per record for runs with both directions at one speed.
+    """Return used rows of table `steady` with one row per record for runs with both directions at one speed.
 
     Other rows are unchanged. The magnitude of the force is averaged over the two directions, so that an
     offset between them cancels. Gain and set-up of a file are common to both directions, which are therefore
-    not independent.
-
-    Parameters
-    ----------
-    steady : DataFrame
-        Rows of table `steady` with `used` true.
-
-    Returns
-    -------
-    DataFrame
-        The same columns and `half_N`, half of the difference between the directions (NaN in other rows). In a
-        merged row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
+    not independent. `half_N`, half of the difference between the directions, is added (NaN in other rows). In
+    a merged row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
     """
     rows = steady.assign(half_N=np.nan)
     record = records(rows)

@@ -90,15 +90,9 @@ def solve_conditions(
 ) -> tuple[list[Condition], Scatter, UnitVariance]:
     """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
 
-    A Stribeck curve that does not differ significantly from a straight line is dropped.
-
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady`; rows with `used` false are left out.
-    fitted : DataFrame, optional
-        Table `steady_fit` of these rows. With repeats, which determine the weights, its estimates are used
-        and nothing is fitted again.
+    A Stribeck curve that does not differ significantly from a straight line is dropped. With repeats, which
+    determine the weights, the estimates of `fitted`, the table `steady_fit` of these rows, are used, and
+    nothing is fitted again.
 
     Raises
     ------

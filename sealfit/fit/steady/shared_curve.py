@@ -52,12 +52,7 @@ class Levels:
 def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     """Return mu_s and mu_c, with their covariance, at every aged condition and the unaged rubber.
 
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady`; rows with `used` false are left out.
-    steady_fit : DataFrame
-        Table `steady_fit` with `aging_days`: the separate fits, of which only identified values are used.
+    `steady_fit` has the separate fits, of which only identified values are used, with `aging_days`.
 
     Raises
     ------

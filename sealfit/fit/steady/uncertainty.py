@@ -49,10 +49,7 @@ NEEDED = (
 def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     """Return one row per condition, run and direction: mean of its files, each the mean of its strokes.
 
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady`; rows with `used` false are left out. The two directions of a file are merged.
+    Rows of table `steady` with `used` false are left out. The two directions of a file are merged.
 
     Returns
     -------
@@ -166,22 +163,13 @@ class UnitVariance:
 
 
 def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
-    """Return the factors on the variances stated by the weights.
+    """Return the factors on the variances stated by the weights, from chi-square of every condition.
 
     With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions, is tested against pure
     error. If its p-value is at most `POOLING_P`, the factor is the pooled ratio, at least 1, with the pooled
     degrees of freedom. Else it is 1 with `pure_df`. A condition whose ratio exceeds that at level `WORSE_P`
     gets its own ratio. Without repeats the weights are relative and the pooled ratio is the variance.
 
-    Parameters
-    ----------
-    chi2, df : ndarray, shape (conditions,)
-        Weighted sum of squares and degrees of freedom of every condition.
-    pure_df : float
-        Degrees of freedom of the repeats' scatter; 0 without repeats.
-
-    Notes
-    -----
     Birge 1932, Phys. Rev. 40, 207; Bancroft 1944, Ann. Math. Statist. 15(2), 190-204,
     doi:10.1214/aoms/1177731284.
     """
