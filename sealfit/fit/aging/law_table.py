@@ -74,28 +74,34 @@ def t_of_95(df: float) -> float:
     return float(stdtrit(df, 0.975) if df > 0 else ndtri(0.975))
 
 
-def law_rows(
-    curve: Curve, x: np.ndarray, covariance: np.ndarray, shift: np.ndarray, ends: CurveInterval, df: float
-) -> Iterator[dict]:
-    """Return the rows of mu_0, a, b and c.
+@dataclass(frozen=True)
+class Estimate:
+    """mu_0, a and ln b of one curve."""
 
-    `x`, shape (3,), are mu_0, a and ln b, and `shift` their change if the sensor reads one standard
-    uncertainty too high. `df` are the degrees of freedom of mu_0's interval.
-    """
-    mu_0, a, u = x
-    b, se = np.exp(u), np.sqrt(np.diag(covariance))
-    to_c = np.array([0.0, -u, -a])
-    with np.errstate(invalid="ignore"):
-        se_c = np.sqrt(to_c @ covariance @ to_c)
+    x: np.ndarray  # (3,)
+    covariance: np.ndarray  # (3, 3) of x
+    shift: np.ndarray  # (3,) change of x if the sensor reads one standard uncertainty too high
+
+    def error_of_c(self) -> float:
+        """Return the standard error of c = -a ln b."""
+        gradient = np.array([0.0, -self.x[2], -self.x[1]])
+        with np.errstate(invalid="ignore"):
+            return float(np.sqrt(gradient @ self.covariance @ gradient))
+
+
+def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, df: float) -> Iterator[dict]:
+    """Return the rows of mu_0, a, b and c; `df` are the degrees of freedom of mu_0's interval."""
+    mu_0, a, u = found.x
+    b, se = np.exp(u), np.sqrt(np.diag(found.covariance))
     beside, t = "" if df > 0 else NO_SCATTER, t_of_95(df)
-    move = np.where(np.abs(shift) > 1e-12 * np.abs(x), shift, 0.0)  # the rest is rounding
+    move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # the rest is rounding
     judged = _judge(curve, a, b, ends)
     of_mu_0 = (mu_0 - t * se[0], mu_0 + t * se[0])
     for name, value, error, systematic, (low, high) in (
         ("mu_0", mu_0, se[0], move[0], of_mu_0),
         ("a", a, se[1], move[1], ends.a),
         ("b", b, b * se[2], b * move[2], ends.b),
-        ("c", -a * u, se_c, -u * move[1] - a * move[2], ends.c),
+        ("c", -a * u, found.error_of_c(), -u * move[1] - a * move[2], ends.c),
     ):
         yield table_row(
             quantity=curve.quantity,

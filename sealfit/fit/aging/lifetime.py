@@ -49,25 +49,15 @@ class Goal:
 class Lifetime:
     """Days to a threshold, the 95 % interval, and the degree of extrapolation.
 
-    Attributes
-    ----------
-    days, low, high : float
-        Estimate and ends of the interval, inf if open; `days` is inf if the law does not reach the threshold,
-        0 if unaged rubber is beyond it.
-    threshold : float
-        Value at the end of life.
-    beyond : float
-        days over the longest test, in the time of the master curve if there is one. Above 1 is extrapolated.
-    outside : tuple of str
-        Variables outside of the tested range: "temperature", "compression".
+    `days` is inf if the law does not reach the threshold, 0 if unaged rubber is beyond it.
     """
 
     days: float
-    low: float
+    low: float  # ends of the interval in days, inf if open
     high: float
-    threshold: float
-    beyond: float
-    outside: tuple[str, ...]
+    threshold: float  # value at the end of life
+    beyond: float  # days over the longest test, in the time of the master curve; above 1 is extrapolated
+    outside: tuple[str, ...]  # variables outside of the tested range: "temperature", "compression"
 
     @property
     def extrapolated(self) -> bool:

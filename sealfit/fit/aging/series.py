@@ -16,6 +16,7 @@ from sealfit.fit.aging.law_profiles import curve_errors, curve_intervals
 from sealfit.fit.aging.law_table import (
     DAYS_FOR_LAW,
     Curve,
+    Estimate,
     OneQuantity,
     covariance_rows,
     law_rows,
@@ -235,10 +236,10 @@ def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: n
             yield from without_law(curve)
             continue
         one = quantities[curve.quantity]
-        estimate = x[curve.place], covariance[curve.place], shift[curve.place]
-        yield from law_rows(curve, *estimate, intervals[curve.place], one.level_df)
+        found = Estimate(x[curve.place], covariance[curve.place], shift[curve.place])
+        yield from law_rows(curve, found, intervals[curve.place], one.level_df)
         yield from statistics_rows(curve, joint, one)
-        yield from covariance_rows(curve, covariance[curve.place])
+        yield from covariance_rows(curve, found.covariance)
 
 
 # ---------------------------------------------------------------- curves

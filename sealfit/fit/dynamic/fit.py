@@ -192,7 +192,9 @@ def _asked(
 def _together(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return tables of conditions as one, in order of the conditions."""
     parts = [table for table in tables if len(table)]
-    return pd.concat(parts).sort_values("condition", kind="stable", ignore_index=True) if parts else tables[0]
+    if not parts:
+        return pd.DataFrame()
+    return pd.concat(parts).sort_values("condition", kind="stable", ignore_index=True)
 
 
 def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
@@ -225,7 +227,7 @@ def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
         made.append(_Grouped(whole, table).peaks() if whole else pd.DataFrame())
         for kept, one in zip(tables, made, strict=True):
             kept.append(one.assign(condition=name))
-    return [pd.concat(parts, ignore_index=True) for parts in tables]
+    return [_together(parts) for parts in tables]
 
 
 def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Along]:
