@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -16,7 +17,7 @@ from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.file_names import Listing
-from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, plan_parts, shaped
+from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, Part, Stroke, plan_parts, shaped
 from sealfit.ingest.quality import improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import (
     constant_strokes,
@@ -27,7 +28,6 @@ from sealfit.ingest.repeat_checks import (
 )
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.stored_parts import (
-    Made,
     agrees,
     common_columns,
     load_part,
@@ -49,7 +49,7 @@ def inputs_table(
     campaign: Path,
     marks: Fingerprints,
     plan: Sequence[np.ndarray],
-    parts: Sequence[Made],
+    parts: Sequence[Part],
     used: np.ndarray,
     faults: Sequence[Fault],
 ) -> tuple[pd.DataFrame, Fingerprints]:
@@ -63,7 +63,7 @@ def inputs_table(
         The files of the listing, as they were read.
     plan : sequence of ndarray
         The files of each part, by their numbers in the listing.
-    parts : sequence of Made
+    parts : sequence of Part
         The parts.
     used : ndarray of bool, shape (files,)
         Which files of the listing have a stroke that is used.
@@ -169,18 +169,20 @@ def ingest_campaign(
         plan = _plan(campaign, listing, marks)
         part.rows, part.of = len(listing), "files"
     make = partial(make_part, campaign=campaign, config=config, folder=place.folder)
-    reader = _Reader(make, [listing.take(rows) for rows in plan], workers, on_file)
+    read = partial(_read, make=make, workers=workers, on_file=on_file)
+    listings = [listing.take(rows) for rows in plan]
     with timed("reading trace files") as part:
-        parts = reader.parts(_known_parts(reader.listings, marks, place, config))
-        part.rows, part.of = reader.reread, "files"
+        made = _known_parts(listings, marks, place, config)
+        asked = {i: Asked(own) for i, own in enumerate(listings) if i not in made}
+        made |= read(asked)
+        part.rows, part.of = sum(len(one.refs) for one in asked.values()), "files"
+    parts = [made[i] for i in range(len(plan))]
     order = {file: i for i, file in enumerate(listing.files)}
     faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
-    strokes = (
-        strokes_of([stored_strokes(part, place.folder) for part in parts]).take(order).reset_index(drop=True)
-    )
-    files = files[order]
+    strokes = strokes_of([stored_strokes(part, place.folder) for part in parts])
+    strokes, files = strokes.take(order).reset_index(drop=True), files[order]
     parts = [replace(part, strokes=None) for part in parts]  # they are in one table now
     strokes, found = judged(strokes)
     faults += found
@@ -193,11 +195,16 @@ def ingest_campaign(
     faults += incomplete_columns(steady, config.series_columns if config.aging else ()) + improbable_loads(
         steady, config
     )
-    strokes = strokes.assign(used=_still_used(strokes, steady))
-    parts = reader.reestimated(parts, _ruled_out(plan, strokes, files))
+    used = strokes["used"].to_numpy(bool).copy()
+    used[used] = steady["used"].to_numpy(bool)
+    strokes = strokes.assign(used=used)
+    again = read(_asked_again(listings, parts, _ruled_out(listings, strokes)))
+    parts = [again.get(i, part) for i, part in enumerate(parts)]
     used = np.zeros(len(listing), bool)
     used[files[strokes["used"].to_numpy(bool)]] = True
-    inputs, marks = inputs_table(campaign, marks | reader.marks, plan, parts, used, faults)
+    for part in parts:
+        marks |= part.marks
+    inputs, marks = inputs_table(campaign, marks, plan, parts, used, faults)
     tables = {
         "inputs": inputs,
         "runs": shaped(strokes, RUNS, drop=(*STEADY_ONLY, *OF_SAMPLES)),
@@ -231,7 +238,7 @@ def _size(path: str) -> int:
 
 def _known_parts(
     listings: Sequence[Listing], marks: Fingerprints, place: Place, config: Config
-) -> dict[int, Made]:
+) -> dict[int, Part]:
     """Return the parts that are stored, by their numbers in the plan."""
     made, seen = {}, seen_by_parts(config)
     for i, listing in enumerate(listings if place.known else ()):
@@ -242,65 +249,43 @@ def _known_parts(
     return made
 
 
-@dataclass
-class _Reader:
-    """Reads the parts of a plan.
-
-    `make` reads one of them, `listings` are their files. `marks` are the files that were read, and `reread`
-    counts them.
-    """
-
-    make: Callable[[Asked], Made]
-    listings: Sequence[Listing]
-    workers: int
-    on_file: Callable[[int, int], None] | None
-    marks: Fingerprints = field(default_factory=dict)
-    reread: int = 0
-
-    def parts(self, known: Mapping[int, Made]) -> list[Made]:
-        """Return every part, by what its own files say; those that are known are not read."""
-        asked = {i: Asked(listing) for i, listing in enumerate(self.listings) if i not in known}
-        made = {**known, **self._read(asked)}
-        return [made[i] for i in range(len(self.listings))]
-
-    def reestimated(self, parts: Sequence[Made], unused: Sequence[frozenset]) -> list[Made]:
-        """Return the parts, made again if the whole campaign omits other strokes or has other columns."""
-        columns = common_columns(parts)
-        again = {
-            i: Asked(self.listings[i], out, columns if part.columns else None)
-            for i, (part, out) in enumerate(zip(parts, unused, strict=True))
-            if part.unused != out or not agrees(part, columns)
-        }
-        made = self._read(again)
-        return [made.get(i, part) for i, part in enumerate(parts)]
-
-    def _read(self, asked: Mapping[int, Asked]) -> dict[int, Made]:
-        """Return the parts; the largest are read first, so that at the end no process has much left alone."""
-        order = sorted(asked, key=lambda i: -len(asked[i].refs))
-        total, done, made = sum(len(part.refs) for part in asked.values()), 0, {}
-        results = run_map(self.make, [asked[i] for i in order], workers=self.workers, together=1)
-        for i, part in zip(order, results, strict=True):
-            made[i] = part
-            done += len(part.rows)
-            if self.on_file is not None:
-                self.on_file(done, total)
-            self.marks |= part.marks
-        self.reread += total
-        return made
+def _read(
+    asked: Mapping[int, Asked],
+    make: Callable[[Asked], Part],
+    workers: int,
+    on_file: Callable[[int, int], None] | None,
+) -> dict[int, Part]:
+    """Return the parts; the largest are read first, so that at the end no process has much left alone."""
+    order = sorted(asked, key=lambda i: -len(asked[i].refs))
+    total, done, made = sum(len(part.refs) for part in asked.values()), 0, {}
+    results = run_map(make, [asked[i] for i in order], workers=workers, together=1)
+    for i, part in zip(order, results, strict=True):
+        made[i] = part
+        done += len(part.rows)
+        if on_file is not None:
+            on_file(done, total)
+    return made
 
 
-def _ruled_out(plan: Sequence[np.ndarray], strokes: pd.DataFrame, files: np.ndarray) -> list[frozenset]:
+def _asked_again(
+    listings: Sequence[Listing], parts: Sequence[Part], unused: Sequence[frozenset[Stroke]]
+) -> dict[int, Asked]:
+    """Return the parts to make again: the whole campaign omits other strokes or has other columns."""
+    columns = common_columns(parts)
+    return {
+        i: Asked(listings[i], out, columns)
+        for i, (part, out) in enumerate(zip(parts, unused, strict=True))
+        if part.unused != out or not agrees(part, columns)
+    }
+
+
+def _ruled_out(listings: Sequence[Listing], strokes: pd.DataFrame) -> list[frozenset[Stroke]]:
     """Return the strokes of each part that are not used although their own file shows nothing wrong."""
-    part = np.empty(sum(len(rows) for rows in plan), int)
-    for i, rows in enumerate(plan):
-        part[rows] = i
-    out: list[set] = [set() for _ in plan]
-    gone = ~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)
-    for i, file, stroke in zip(
-        part[files[gone]], strokes["file"][gone], strokes["stroke"][gone].tolist(), strict=True
-    ):
-        out[i].add((file, stroke))
-    return [frozenset(strokes) for strokes in out]
+    gone = strokes[~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)]
+    of_file = defaultdict(list)
+    for file, stroke in zip(gone["file"], gone["stroke"].tolist(), strict=True):
+        of_file[file].append((file, stroke))
+    return [frozenset(stroke for file in own.files for stroke in of_file.get(file, ())) for own in listings]
 
 
 def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
@@ -310,28 +295,17 @@ def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
         return pd.DataFrame(
             {"file": pd.array([], "str"), "used": np.array([], bool), "by_itself": np.array([], bool)}
         )
-    table = joined(whole).to_pandas()
+    words = {column.name for part in whole for column in part.schema if column.type == pa.string()}
+    worded = [_worded(part, words) for part in whole]
+    table = pa.concat_tables(worded, promote_options="permissive").to_pandas()
     return table.assign(by_itself=table["used"])
-
-
-def joined(parts: Sequence[pa.Table]) -> pa.Table:
-    """Return all parts in one table; a column that holds words in one part holds words in all."""
-    words = {f.name for part in parts for f in part.schema if _is_text(f.type)}
-    return pa.concat_tables([_worded(part, words) for part in parts], promote_options="permissive")
-
-
-def _is_text(dtype: pa.DataType) -> bool:
-    return pa.types.is_string(dtype) or pa.types.is_large_string(dtype)
 
 
 def _worded(part: pa.Table, words: set[str]) -> pa.Table:
     for i, column in enumerate(part.schema):
         if column.name in words and column.type != pa.string():
-            values = part.column(i)
-            if not _is_text(column.type):
-                texts = values.to_pandas().map(str, na_action="ignore").astype(object)
-                values = pa.array(texts, pa.string(), from_pandas=True)
-            part = part.set_column(i, column.name, values.cast(pa.string()))
+            texts = part.column(i).to_pandas().map(str, na_action="ignore").astype(object)
+            part = part.set_column(i, column.name, pa.array(texts, pa.string(), from_pandas=True))
     return part
 
 
@@ -346,15 +320,9 @@ def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
     return strokes, faults
 
 
-def _still_used(strokes: pd.DataFrame, steady: pd.DataFrame) -> np.ndarray:
-    used = strokes["used"].to_numpy(bool).copy()
-    used[used] = steady["used"].to_numpy(bool)
-    return used
-
-
 def _stacked(tables: Sequence[pa.Table]) -> pd.DataFrame:
     spelled = [table.cast(spelled_out(table.schema)) for table in tables]
-    return joined(spelled).replace_schema_metadata().to_pandas()
+    return pa.concat_tables(spelled).replace_schema_metadata().to_pandas()
 
 
 def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:

@@ -17,56 +17,14 @@ import regex
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, ConfigError, Fault, shortened
-from sealfit.store.manifest import Fingerprint, fingerprint, fingerprint_of
+from sealfit.store.manifest import Fingerprint, fingerprint_of
 
 # ---------------------------------------------------------------- folder
-# Files of a campaign folder as bytes: never one outside it, each opened once for its text and its
-# fingerprint.
+# Files of a campaign folder as bytes, each opened once for its text and its fingerprint.
 
 _BLANK = b" \t\r\n\0"
 LINE_ENDS = b"\r\n\x1a"  # the last is DOS's end of a file
 MOST_CUT = 0.25  # Largest share of text files without a line end that are taken for cut: one of four.
-
-
-class Folder:
-    """A campaign folder; where its subfolders lie, links followed, is looked up once for all their files."""
-
-    def __init__(self, campaign: Path):
-        self.campaign = campaign
-        self._safe: dict[str, bool] = {}  # subfolder, and whether it lies inside
-
-    def inside(self, file: str) -> str | None:
-        """Return the path of `file` if it lies inside the campaign folder, links followed; otherwise None."""
-        folder, _, name = file.rpartition("/")
-        path = os.path.join(self.campaign, file)
-        odd = name in ("", ".", "..") or file.startswith("/") or any(mark in file for mark in "\0\\:")
-        if odd or not self._safe_folder(folder):
-            return path if inside(self.campaign, file) is not None else None
-        try:
-            linked = stat.S_ISLNK(os.lstat(path).st_mode)
-        except OSError:  # not there: said by who opens it
-            return path
-        return path if not linked or inside(self.campaign, file) is not None else None
-
-    def _safe_folder(self, folder: str) -> bool:
-        if folder not in self._safe:
-            self._safe[folder] = not folder or inside(self.campaign, folder) is not None
-        return self._safe[folder]
-
-    def read(self, file: str) -> tuple[bytes, Fingerprint]:
-        """Return the file's bytes, and the fingerprint of these very bytes.
-
-        Raises
-        ------
-        BadFile
-            As `read_bytes`.
-        """
-        raw, status = _read(self.inside(file), file)
-        return raw, fingerprint_of(raw, status)
-
-    def fingerprint(self, file: str) -> Fingerprint:
-        """Return the fingerprint of a file that could not be read as a trace."""
-        return fingerprint(self.campaign / file)
 
 
 def inside(campaign: Path, file: str) -> Path | None:
@@ -82,6 +40,12 @@ def inside(campaign: Path, file: str) -> Path | None:
     return path if resolved != root and resolved.is_relative_to(root) else None
 
 
+def read_marked(campaign: Path, file: str) -> tuple[bytes, Fingerprint]:
+    """Return the file's bytes, and the fingerprint of these very bytes; raises as `read_bytes`."""
+    raw, status = _read(campaign, file)
+    return raw, fingerprint_of(raw, status)
+
+
 def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
     """Return the file's bytes, or with `head` its first ones.
 
@@ -90,7 +54,7 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
     BadFile
         If it is missing, outside the campaign, no file, not readable or empty.
     """
-    return _read(Folder(campaign).inside(file), file, HEAD_BYTES if head else None)[0]
+    return _read(campaign, file, HEAD_BYTES if head else None)[0]
 
 
 def cut_files(campaign: Path, texts: Sequence[str]) -> frozenset[str]:
@@ -121,17 +85,15 @@ def whole_lines(text: bytes, file: str) -> tuple[bytes, Fault]:
     reason = "the last line has no line end, which most files here have: it may be cut within a number."
     line = text.count(b"\n", 0, end) + 1
     fix = "Copy the file again; if it is whole, end its last line."
-    fault = Fault(
-        "cut_file", reason, file=file, line=line, severity="warning", action="row left out", fix=fix
-    )
-    return text[:end], fault
+    place = {"file": file, "line": line, "severity": "warning", "action": "row left out"}
+    return text[:end], Fault("cut_file", reason, fix=fix, **place)
 
 
-def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, os.stat_result]:
+def _read(campaign: Path, file: str, size: int | None = None) -> tuple[bytes, os.stat_result]:
+    path = inside(campaign, file)
     if path is None:
-        raise _bad_path(
-            file, "path_outside", "lies outside the campaign folder.", "Copy it into the folder of runs.csv."
-        )
+        fix = "Copy it into the folder of runs.csv."
+        raise bad_file(file, "path_outside", "lies outside the campaign folder.", fix)
     try:
         # A pipe would be waited for forever, unless it is opened without waiting.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -140,43 +102,40 @@ def _read(path: str | None, file: str, size: int | None = None) -> tuple[bytes, 
     try:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
-            raise _bad_path(file, "unreadable_file", "is not a file.", "Check the path.")
+            raise bad_file(file, "unreadable_file", "is not a file.", "Check the path.")
         raw = os.read(handle, status.st_size + 1 if size is None else size)
         # Short where it is the whole file; a network's file system, or a file above 2 GB, may give it piece
         # by piece.
         while size is None and len(raw) != status.st_size and (more := os.read(handle, 1 << 24)):
             raw += more
     except OSError as error:
-        raise _bad_path(
-            file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights."
-        ) from error
+        raise _not_readable(file, error) from error
     finally:
         os.close(handle)
-    if not _without_mark(raw[:64]).strip(_BLANK) and not _without_mark(raw).strip(_BLANK):
-        raise _bad_path(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
+    marks = [len(mark) for mark, _ in _BOMS if raw.startswith(mark)]
+    if not raw[max(marks, default=0) :].strip(_BLANK):
+        raise bad_file(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
     return raw, status
 
 
-def _without_mark(raw: bytes) -> bytes:
-    """Return the bytes without a byte-order mark."""
-    return raw[max((len(mark) for mark, _ in _BOMS if raw.startswith(mark)), default=0) :]
-
-
-def _not_opened(path: str, file: str, error: OSError) -> BadFile:
-    if isinstance(error, FileNotFoundError) and os.path.islink(path):
-        fix = "Copy the file itself into the campaign."
-        return _bad_path(
-            file, "missing_file", f"is a link to '{os.readlink(path)}', which does not exist.", fix
-        )
+def _not_opened(path: Path, file: str, error: OSError) -> BadFile:
+    if isinstance(error, FileNotFoundError) and path.is_symlink():
+        reason = f"is a link to '{path.readlink()}', which does not exist."
+        return bad_file(file, "missing_file", reason, "Copy the file itself into the campaign.")
     if isinstance(error, FileNotFoundError):
-        return _bad_path(file, "missing_file", "does not exist.", _similar(Path(path)))
+        return bad_file(file, "missing_file", "does not exist.", _similar(path))
     if os.path.exists(path) and not os.path.isfile(path):  # a folder, where folders cannot be opened
-        return _bad_path(file, "unreadable_file", "is not a file.", "Check the path.")
-    return _bad_path(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.")
+        return bad_file(file, "unreadable_file", "is not a file.", "Check the path.")
+    return _not_readable(file, error)
 
 
-def _bad_path(file: str, check: str, reason: str, fix: str) -> BadFile:
-    return BadFile(Fault(check, reason, file=file, action="file left out", fix=fix))
+def _not_readable(file: str, error: OSError) -> BadFile:
+    return bad_file(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.")
+
+
+def bad_file(file: str, check: str, reason: str, fix: str, **place) -> BadFile:
+    """Return the error of a file that is left out."""
+    return BadFile(Fault(check, reason, file=file, action="file left out", fix=fix, **place))
 
 
 def _similar(path: Path) -> str:
@@ -186,9 +145,8 @@ def _similar(path: Path) -> str:
             if other.name.lower() == path.name.lower():
                 return f"There is '{other.name}': the case of letters matters."
     except OSError:
-        return (
-            f"There is no folder '{path.parent.name}' either; paths are relative to the folder of runs.csv."
-        )
+        above = path.parent.name
+        return f"There is no folder '{above}' either; paths are relative to the folder of runs.csv."
     return "Paths are relative to the folder of runs.csv."
 
 
@@ -267,18 +225,18 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
                 text = raw.decode("latin-1")
             elif not isinstance(error, UnicodeDecodeError):  # UTF-16 or UTF-32 without its mark
                 reason = f"is not {encoding}: there is no byte-order mark."
-                raise _bad(file, "wrong_encoding", reason, 'Set encoding = "auto".') from error
+                raise bad_file(file, "wrong_encoding", reason, 'Set encoding = "auto".') from error
             else:
                 line = raw[: error.start].count(b"\n") + 1
                 reason = f"is not {encoding}: byte {error.start} cannot be read."
                 fix = "Export it again." if automatic else 'Set encoding = "auto".'
-                raise _bad(file, "wrong_encoding", reason, fix, line) from error
+                raise bad_file(file, "wrong_encoding", reason, fix, line=line) from error
         raw = text.encode("utf-8", "replace").removeprefix(codecs.BOM_UTF8)
     if raw.translate(None, _CONTROL) != raw:
         place = next(i for i, byte in enumerate(raw) if byte in _CONTROL)
         line = raw[:place].count(b"\n") + 1
         reason = f"is not text: byte {raw[place]:#04x} stands in it."
-        raise _bad(file, "binary_file", reason, "Export the trace as text (CSV).", line)
+        raise bad_file(file, "binary_file", reason, "Export the trace as text (CSV).", line=line)
     if b"\r" in raw:
         raw = raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return raw
@@ -288,7 +246,7 @@ def _refuse_packed(raw: bytes, file: str) -> None:
     for magic, what in _PACKED.items():
         if raw.startswith(magic):
             fix = "Export it as CSV, or give the file the ending of its format."
-            raise _bad(file, "binary_file", f"is {what}, not text.", fix)
+            raise bad_file(file, "binary_file", f"is {what}, not text.", fix)
 
 
 def refuse_marked_up(text: bytes, file: str) -> None:
@@ -296,7 +254,7 @@ def refuse_marked_up(text: bytes, file: str) -> None:
     begin = text[:256].lstrip().lower()
     for mark, what in _MARKED_UP.items():
         if begin.startswith(mark):
-            raise _bad(file, "no_table", f"is {what}, not a table.", "Export the trace as CSV.")
+            raise bad_file(file, "no_table", f"is {what}, not a table.", "Export the trace as CSV.")
 
 
 def _is_plain(raw: bytes) -> bool:
@@ -317,23 +275,18 @@ def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
     """
     lines = text[:HEAD_BYTES].decode("utf-8", "ignore").split("\n")
     count = _header_lines(lines, settings, file)
-    start = 0
-    for _ in range(count):
-        end = text.find(b"\n", start)
-        if end < 0:
-            start = len(text)
-            break
-        start = end + 1
+    parts = text.split(b"\n", count)
+    start = len(text) - len(parts[count]) if len(parts) > count else len(text)
     header = tuple(lines[:count])
     if settings.names == "none":
         return Layout(header, (), None, start, count + 1)
     back = settings.names_line or (2 if settings.units_row else 1)
     if back > count:
         reason = f"has a header of {count} lines, and its names should stand {back} lines before the data."
-        raise _bad(file, "header_not_found", reason, "Check header_lines and names_line in the rig config.")
-    names = tuple(
-        name.strip() for name in split_line(without_strays(header[-back], settings), settings.delimiter)
-    )
+        fix = "Check header_lines and names_line in the rig config."
+        raise bad_file(file, "header_not_found", reason, fix)
+    cells = split_line(without_strays(header[-back], settings), settings.delimiter)
+    names = tuple(name.strip() for name in cells)
     return Layout(header, names, count - back + 1, start, count + 1)
 
 
@@ -410,10 +363,6 @@ def as_number(cell: str, decimal: str = ".") -> float | None:
         return None
 
 
-def _bad(file: str, check: str, reason: str, fix: str, line: int | None = None) -> BadFile:
-    return BadFile(Fault(check, reason, file=file, line=line, action="file left out", fix=fix))
-
-
 def _guess(raw: bytes) -> str:
     """Return "utf-16-le" or "-be" if every other byte is zero, as in UTF-16 of Latin text; else "utf-8"."""
     sample = raw[:4096]
@@ -438,9 +387,8 @@ def _header_lines(lines: list[str], settings: TraceFormat, file: str) -> int:
             if found_by(settings.header_ends_at, line):
                 return number
         reason = f"no line matches header_ends_at = {settings.header_ends_at!r}."
-        raise _bad(
-            file, "header_not_found", reason, "Check header_ends_at in the rig config against the file."
-        )
+        fix = "Check header_ends_at in the rig config against the file."
+        raise bad_file(file, "header_not_found", reason, fix)
     if settings.header_lines is not None:
         return settings.header_lines
     if settings.names == "none":

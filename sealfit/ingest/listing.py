@@ -19,7 +19,7 @@ from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, Fault, nearest, printable
 from sealfit.ingest.categorical import Columns, mapped
 from sealfit.ingest.columns import suggestion
-from sealfit.ingest.files import Folder, as_number, split_line
+from sealfit.ingest.files import as_number, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
 from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.store.paths import runs_tables
@@ -102,8 +102,7 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
         count = sum(1 for _ in campaign.rglob("*.csv"))
         fix = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
         raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", fix, file=RUNS_CSV)
-    folder = Folder(campaign)
-    outside = {file for file in entries.files if folder.inside(file) is None}
+    outside = {file for file in entries.files if inside(campaign, file) is None}
     faults = faults + _paths(campaign, entries, outside) + _unlisted(campaign, entries, outside, config)
     return entries, cells, faults
 

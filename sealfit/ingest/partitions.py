@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,11 @@ from sealfit.errors import Fault
 from sealfit.ingest.averages import bin_table, mean_traces
 from sealfit.ingest.categorical import condition_columns, keys_of
 from sealfit.ingest.file_names import Listing
-from sealfit.ingest.files import Folder, as_number
+from sealfit.ingest.files import as_number
 from sealfit.ingest.segments import median
 from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_strokes
-from sealfit.store.manifest import Fingerprint
+from sealfit.store import parquet
+from sealfit.store.manifest import Fingerprints
 from sealfit.store.parquet import as_dictionary, to_arrow
 from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
 
@@ -143,6 +144,7 @@ def _cut(name: str, weight: float) -> bool:
 SAMPLED = ("traces", "traces_mean", "bins")  # tables that are made, and stored, part by part
 
 Stroke = tuple[str, int]  # file, and number of the stroke in it
+Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it
 
 
 @dataclass(frozen=True)
@@ -155,62 +157,69 @@ class Asked:
 
     refs: Listing
     unused: frozenset[Stroke] = frozenset()
-    columns: Mapping[str, Mapping[str, str]] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class FileFound:
-    """What is kept of a file once its samples are in the tables."""
-
-    file: str
-    mark: Fingerprint
-    rows: int
-    strokes: int
+    columns: Columns | None = None
 
 
 @dataclass(frozen=True)
 class Part:
     """What one part gives.
 
-    `strokes` has a row per stroke with everything that is known of it, the keys included, and `used` by what
-    the file itself shows; `tables` are those of `SAMPLED` that have rows, without the strokes that are not
-    used or were asked to be left out; their words are dictionaries.
+    Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found`
+    the strokes; `marks` are the fingerprints of those that were read now. `strokes` has a row per stroke with
+    everything that is known of it, the keys included, and `used` by what the file itself shows; it is None
+    where they are left on the disk, and once they are let go. `tables` are those of `SAMPLED` that have rows,
+    without the strokes that are not used or were asked to be left out, their words as dictionaries; or they
+    are on the disk, in `stored`: files by their names below OUT, with their sizes in bytes. `columns` are
+    those that the samples gave, `unused` and `wanted` what was asked for (`Asked`).
     """
 
-    files: tuple[FileFound, ...]
+    marks: Fingerprints
+    rows: Sequence[int]
+    found: Sequence[int]
     faults: tuple[Fault, ...]
-    strokes: pa.Table
-    tables: dict[str, pa.Table]
+    strokes: pa.Table | None
+    unused: frozenset[Stroke]
+    wanted: Columns | None
+    columns: Columns
+    tables: Mapping[str, pa.Table] = field(default_factory=dict)
+    stored: Mapping[str, int] = field(default_factory=dict)
 
 
 def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
-    """Return the strokes and the tables of one part.
-
-    Parameters
-    ----------
-    asked : Asked
-        Which files.
-    campaign : Path
-        Campaign folder.
-    config : Config
-        The rig.
-    """
-    files = read_strokes(asked.refs, Folder(campaign), config)
+    """Return the strokes and the tables of one part of a campaign, both in memory."""
+    files = read_strokes(asked.refs, campaign, config)
     strokes = stroke_columns(files, config)
     known = pa.table({name: _array(values) for name, values in strokes.items()})
-    found = tuple(FileFound(made.file, made.mark, made.rows, len(made.strokes)) for made in files)
-    faults = tuple(fault for made in files for fault in made.faults)
-    if not known.num_rows:
-        return Part(found, faults, known, {})
-    each = zip(strokes["used"], strokes["file"], strokes["stroke"], strict=True)
-    strokes["used"] = [used and (file, stroke) not in asked.unused for used, file, stroke in each]
-    samples = sample_columns(files, strokes)
-    tables = {"traces": _traces(samples, strokes, config)}
-    if samples["sliding"].any():
-        tables["traces_mean"] = _mean_traces(samples, strokes, config)
-    if samples["steady"].any():
-        tables["bins"] = _bins(samples, strokes, config)
-    return Part(found, faults, known, tables)
+    tables: dict[str, pa.Table] = {}
+    if known.num_rows:
+        each = zip(strokes["used"], strokes["file"], strokes["stroke"], strict=True)
+        strokes["used"] = [used and (file, stroke) not in asked.unused for used, file, stroke in each]
+        samples = sample_columns(files, strokes)
+        tables["traces"] = _traces(samples, strokes, config)
+        if samples["sliding"].any():
+            tables["traces_mean"] = _mean_traces(samples, strokes, config)
+        if samples["steady"].any():
+            tables["bins"] = _bins(samples, strokes, config)
+    columns = {
+        name: {column.name: str(column.type) for column in parquet.spelled_out(table.schema)}
+        for name, table in tables.items()
+    }
+    if asked.columns is not None:
+        tables = {
+            name: parquet.with_columns(table, asked.columns[name], config.units)
+            for name, table in tables.items()
+        }
+    return Part(
+        marks={made.file: made.mark for made in files},
+        rows=[made.rows for made in files],
+        found=[len(made.strokes) for made in files],
+        faults=tuple(fault for made in files for fault in made.faults),
+        strokes=known,
+        unused=asked.unused,
+        wanted=asked.columns,
+        columns=columns,
+        tables=tables,
+    )
 
 
 def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, list]:

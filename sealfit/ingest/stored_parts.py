@@ -9,7 +9,7 @@ import os
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,9 @@ from sealfit import __version__
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.file_names import Listing
-from sealfit.ingest.partitions import SAMPLED, Asked, read_part
+from sealfit.ingest.partitions import SAMPLED, Asked, Columns, Part, read_part
 from sealfit.ingest.segments import median
 from sealfit.store import parquet
-from sealfit.store.manifest import Fingerprint
 from sealfit.store.staged_writes import PARQUET, disk, file_size, sync
 
 # ---------------------------------------------------------------- trace access
@@ -135,33 +134,8 @@ ARROW = ".arrow"
 FORMAT = 5  # of a part's files; those of another one are made again
 _ABOUT = b"part"
 
-Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each column, as Arrow spells it
 
-
-@dataclass(frozen=True)
-class Made:
-    """One part as the campaign needs it.
-
-    Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found`
-    the strokes; `marks` are the fingerprints of those that were read now. `strokes` is None where they are
-    left on the disk (`stored_strokes`), and once they are let go. `unused` and `wanted` are what was asked
-    for (`part.Asked`); `columns` are those of its tables; the tables themselves are in `tables`, or on the
-    disk in `stored`: files by their names below OUT, with their sizes in bytes.
-    """
-
-    marks: Mapping[str, Fingerprint]
-    rows: Sequence[int]
-    found: Sequence[int]
-    faults: tuple[Fault, ...]
-    strokes: pa.Table | None
-    unused: frozenset
-    wanted: Columns | None
-    columns: Columns
-    tables: Mapping[str, pa.Table]
-    stored: Mapping[str, int]
-
-
-def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None) -> Made:
+def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None) -> Part:
     """Read a part and store it below `folder`, or keep its tables in memory where there is none.
 
     Raises
@@ -170,35 +144,21 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         If the disk is full or refuses.
     """
     part = read_part(asked, campaign, config)
-    marks = {found.file: found.mark for found in part.files}
-    rows, count = [found.rows for found in part.files], [found.strokes for found in part.files]
-    tables = part.tables
     if folder is None:
-        return Made(
-            marks, rows, count, part.faults, part.strokes, asked.unused, asked.columns, {}, tables, {}
-        )
-    columns = {
-        name: {f.name: str(f.type) for f in parquet.spelled_out(table.schema)}
-        for name, table in tables.items()
-    }
-    if asked.columns is not None:
-        tables = {
-            name: parquet.with_columns(table, asked.columns[name], config.units)
-            for name, table in tables.items()
-        }
-    hashes = [found.mark.sha256 for found in part.files]
+        return part
+    hashes = [part.marks[file].sha256 for file in asked.refs.files]
     name = _file_name(part_key(asked.refs, hashes, seen_by_parts(config)), asked)
     with disk(folder.parent), _whole_files(folder) as write:
         stored = {
             (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow)
-            for of, table in tables.items()
+            for of, table in part.tables.items()
         }
         about = {
             "unused": sorted(asked.unused),
             "wanted": asked.columns,
-            "columns": columns,
-            "rows": rows,
-            "found": count,
+            "columns": part.columns,
+            "rows": part.rows,
+            "found": part.found,
             "faults": [fault.as_dict() for fault in part.faults],
             "stored": stored,
         }
@@ -207,10 +167,10 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         stored[file] = write(file, part.strokes.replace_schema_metadata(metadata), parquet.write_ipc)
     # Its strokes are not sent: whoever asked finds them on the disk, and need not hold them while other parts
     # are read.
-    return Made(marks, rows, count, part.faults, None, asked.unused, asked.columns, columns, {}, stored)
+    return replace(part, strokes=None, tables={}, stored=stored)
 
 
-def stored_strokes(part: Made, folder: Path | None) -> pa.Table:
+def stored_strokes(part: Part, folder: Path | None) -> pa.Table:
     """Return the strokes of a part, from the disk if they lie there: in `folder`, in which it was made."""
     if part.strokes is not None:
         return part.strokes
@@ -264,18 +224,17 @@ def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
     return {name.split("-", 1)[0]: path for name, path in whole.items()}
 
 
-def load_part(path: Path) -> Made:
+def load_part(path: Path) -> Part:
     """Return a part that was stored before, without its tables."""
     strokes = parquet.read_ipc(path)
     about = json.loads(strokes.schema.metadata[_ABOUT])
-    unused = frozenset((file, stroke) for file, stroke in about["unused"])
-    stored = {**about["stored"], f"{PARTS}/{path.name}": path.stat().st_size}
-    faults = tuple(Fault(**fault) for fault in about["faults"])
-    given = ({}, about["rows"], about["found"], faults, strokes, unused, about["wanted"])
-    return Made(*given, about["columns"], {}, stored)
+    about["unused"] = frozenset((file, stroke) for file, stroke in about["unused"])
+    about["faults"] = tuple(Fault(**fault) for fault in about["faults"])
+    about["stored"][f"{PARTS}/{path.name}"] = path.stat().st_size
+    return Part(marks={}, strokes=strokes, **about)
 
 
-def common_columns(parts: Sequence[Made]) -> Columns:
+def common_columns(parts: Sequence[Part]) -> Columns:
     """Return the columns of each table over all parts; numbers beside words are words.
 
     Tables of one folder must agree: a reader takes the columns of the first file for those of all.
@@ -290,7 +249,7 @@ def common_columns(parts: Sequence[Made]) -> Columns:
     return common
 
 
-def agrees(part: Made, columns: Columns) -> bool:
+def agrees(part: Part, columns: Columns) -> bool:
     """Whether the stored tables of a part have these columns, in this order."""
     has = {table: (part.wanted or part.columns)[table] for table in part.columns}
     return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())

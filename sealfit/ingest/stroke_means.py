@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from sealfit.config import Config
 from sealfit.errors import BadFile, Fault
 from sealfit.ingest.averages import standard_error
 from sealfit.ingest.file_names import TraceRef
-from sealfit.ingest.files import Folder
+from sealfit.ingest.files import read_marked
 from sealfit.ingest.quality import (
     equal_neighbours,
     load_faults,
@@ -24,7 +25,7 @@ from sealfit.ingest.reader import Trace, read_traces
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, speed_factor
 from sealfit.ingest.window import acceleration
-from sealfit.store.manifest import Fingerprint
+from sealfit.store.manifest import Fingerprint, fingerprint
 
 OWN_SPEED = "speed_file_mm_s"  # what the reader calls a speed column of the trace itself
 ALONG = "speed_bin_mm_s"  # the speed at a sample, of which bins have the mean
@@ -43,32 +44,22 @@ class FileStrokes:
     samples: Mapping[str, np.ndarray] | None = None
 
 
-def read_strokes(refs: Sequence[TraceRef], folder: Folder, config: Config) -> list[FileStrokes]:
-    """Return the strokes of trace files; without strokes where a file must be left out, and why.
-
-    Parameters
-    ----------
-    refs : sequence of TraceRef
-        The files, and what is known of each as a whole.
-    folder : Folder
-        The campaign's.
-    config : Config
-        The rig.
-    """
+def read_strokes(refs: Sequence[TraceRef], campaign: Path, config: Config) -> list[FileStrokes]:
+    """Return the strokes of trace files; without strokes where a file must be left out, and why."""
     made: dict[str, FileStrokes] = {}
-    opened: list[tuple[TraceRef, Fingerprint, bytes]] = []
+    opened: list[tuple[TraceRef, bytes]] = []
+    marks: dict[str, Fingerprint] = {}
     for ref in refs:
         try:
-            raw, mark = folder.read(ref.file)
-            opened.append((ref, mark, raw))
+            raw, marks[ref.file] = read_marked(campaign, ref.file)
+            opened.append((ref, raw))
         except BadFile as error:
-            made[ref.file] = FileStrokes(ref.file, folder.fingerprint(ref.file), 0, error.faults)
-    traces = read_traces([(ref, raw) for ref, _, raw in opened], config)
-    for (ref, mark, _), trace in zip(opened, traces, strict=True):
+            made[ref.file] = FileStrokes(ref.file, fingerprint(campaign / ref.file), 0, error.faults)
+    for (ref, _), trace in zip(opened, read_traces(opened, config), strict=True):
         if isinstance(trace, BadFile):
-            made[ref.file] = FileStrokes(ref.file, mark, 0, trace.faults)
+            made[ref.file] = FileStrokes(ref.file, marks[ref.file], 0, trace.faults)
         else:
-            made[ref.file] = _file_strokes(trace, mark, config)
+            made[ref.file] = _file_strokes(trace, marks[ref.file], config)
     return [made[ref.file] for ref in refs]
 
 

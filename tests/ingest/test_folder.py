@@ -3,17 +3,16 @@ import os
 import pytest
 
 from sealfit.errors import BadFile
-from sealfit.ingest.files import Folder
-from sealfit.store.manifest import Fingerprint, fingerprint
+from sealfit.ingest.files import read_marked
+from sealfit.store.manifest import fingerprint
 
 
 def test_bytes_come_with_the_fingerprint_of_the_file(tmp_path):
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "a.csv").write_bytes(b"1,2,3\n")
-    raw, mark = Folder(tmp_path).read("sub/a.csv")
+    raw, mark = read_marked(tmp_path, "sub/a.csv")
     assert raw == b"1,2,3\n"
     assert mark == fingerprint(tmp_path / "sub" / "a.csv")
-    assert Folder(tmp_path).fingerprint("sub/b.csv") == Fingerprint()
 
 
 def test_links_are_followed_and_none_leads_outside(tmp_path):
@@ -26,21 +25,20 @@ def test_links_are_followed_and_none_leads_outside(tmp_path):
     (campaign / "real" / "file.csv").symlink_to(campaign / "real" / "a.csv")
     (campaign / "real" / "leak.csv").symlink_to(outside / "a.csv")
     (campaign / "loop").symlink_to(campaign / "loop")
-    folder = Folder(campaign)
     for file in ("real/a.csv", "linked/a.csv", "real/file.csv", "linked/file.csv", "real/../real/a.csv"):
-        assert folder.read(file)[0] == b"real"
+        assert read_marked(campaign, file)[0] == b"real"
     away = ("away/a.csv", "real/leak.csv", "linked/leak.csv", "real/../../other/a.csv", "loop", "loop/a.csv")
     for file in (*away, "", "/a.csv", "C:/a.csv", "C:\\a.csv"):
         with pytest.raises(BadFile, match="outside the campaign"):
-            folder.read(file)
+            read_marked(campaign, file)
 
 
 def test_folders_and_closed_files_are_named(tmp_path):
     (tmp_path / "a.csv").mkdir()
     with pytest.raises(BadFile, match="is not a file"):
-        Folder(tmp_path).read("a.csv")
+        read_marked(tmp_path, "a.csv")
     (tmp_path / "b.csv").write_text("1")
     (tmp_path / "b.csv").chmod(0)
     if not os.access(tmp_path / "b.csv", os.R_OK):  # root may read everything
         with pytest.raises(BadFile, match="cannot be read"):
-            Folder(tmp_path).read("b.csv")
+            read_marked(tmp_path, "b.csv")

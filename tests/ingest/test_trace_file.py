@@ -4,7 +4,6 @@ import pytest
 from trace_helpers import config
 
 from sealfit.ingest.file_names import TraceRef
-from sealfit.ingest.files import Folder
 from sealfit.ingest.stroke_means import read_strokes
 
 
@@ -62,7 +61,7 @@ def refs(tmp_path):
 
 
 def test_files_read_together_give_what_each_gives_alone(tmp_path, refs):
-    found = read_strokes(refs, Folder(tmp_path), config())
+    found = read_strokes(refs, tmp_path, config())
     assert {fault.check for made in found for fault in made.faults} >= {
         "spike",
         "stuck",
@@ -70,7 +69,7 @@ def test_files_read_together_give_what_each_gives_alone(tmp_path, refs):
         "empty_file",
     }
     for ref, made in zip(refs, found, strict=True):
-        (alone,) = read_strokes([ref], Folder(tmp_path), config())
+        (alone,) = read_strokes([ref], tmp_path, config())
         assert (made.file, made.mark, made.rows, made.faults) == (
             alone.file,
             alone.mark,
