@@ -52,6 +52,10 @@ class Fault:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
+# Severity and action of findings that leave nothing out, and of a stroke that is left out: fields of `Fault`.
+KEPT = {"severity": "warning", "action": "kept"}
+NOTED = {"severity": "info", "action": "kept"}
+STROKE_OUT = {"severity": "error", "action": "stroke left out"}
 LONGEST_VALUE = 80  # characters of a cell that a message shows
 LONGEST_PATH = 400  # and of the path of a file
 

@@ -19,7 +19,7 @@ from sealfit.draft.files_found import Found
 from sealfit.draft.name_parts import Names, Part
 from sealfit.draft.runs_table import RunsTable
 from sealfit.errors import ConfigError
-from sealfit.ingest.file_names import name_parts
+from sealfit.ingest.file_names import channels_of, name_parts
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import RUNS_CSV, natural
 from sealfit.units import Units, conversion
@@ -67,7 +67,7 @@ def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, 
     found = {}
     for file in files:
         try:
-            found[file] = dict(name_parts(file, settings, conversions).channels)
+            found[file] = channels_of(name_parts(file, settings, conversions))
         except ConfigError:
             found[file] = {}
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 
 from sealfit.config import TraceFormat
-from sealfit.errors import BadFile, Fault
-from sealfit.ingest.files import Layout, as_number, split_line, without_strays
+from sealfit.errors import Fault
+from sealfit.ingest.files import Layout, as_number, bad_file, split_line, without_strays
 
 # ---------------------------------------------------------------- rows
 # Rows of a trace on their way to a clean table: what is no measurement, or out of time, is named and left
@@ -45,25 +45,27 @@ def clean(rows: Rows, names: list[str], file: str) -> tuple[Rows, int, list[Faul
             continue
         wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
         finite &= ~(wrong | overload)
-        faults += _row_faults(
-            "not_finite", "the computed value is not a finite number.", name, rows, wrong, file
-        )
-        faults += _row_faults("overload", "is an instrument's mark for overload.", name, rows, overload, file)
+        faults += _row_faults("not_finite", name, rows, wrong, file)
+        faults += _row_faults("overload", name, rows, overload, file)
     good = rows.where(finite)
     back = _out_of_order(good.columns["time_s"])
-    if not back.any():
-        return good, int((~finite).sum()), faults
-    faults += _row_faults("time_order", "time repeats or runs backwards.", "time_s", good, back, file)
+    faults += _row_faults("time_order", "time_s", good, back, file)
     return good.where(~back), int((~finite).sum() + back.sum()), faults
 
 
-def _row_faults(check: str, reason: str, name: str, rows: Rows, wrong: np.ndarray, file: str) -> list[Fault]:
+_ROW_FAULTS = {  # check: (reason, fix)
+    "not_finite": ("the computed value is not a finite number.", "Check [trace.compute]."),
+    "overload": ("is an instrument's mark for overload.", "Check the sensor's range."),
+    "time_order": (
+        "time repeats or runs backwards.",
+        "Check the recorder's clock, or delete the line.",
+    ),
+}
+
+
+def _row_faults(check: str, name: str, rows: Rows, wrong: np.ndarray, file: str) -> list[Fault]:
     place = {"file": file, "column": name, "action": "row left out"}
-    fix = {
-        "time_order": "Check the recorder's clock, or delete the line.",
-        "not_finite": "Check [trace.compute].",
-        "overload": "Check the sensor's range.",
-    }[check]
+    reason, fix = _ROW_FAULTS[check]
 
     def make(i: int) -> Fault:
         value = float(rows.columns[name][i])
@@ -139,13 +141,8 @@ class ColumnOfFile:
 
     def fault(self, row: int, check: str, reason: str, **more) -> Fault:
         """Return a fault of the cell in a row, which is left out."""
-        place = {
-            "file": self.file,
-            "line": int(self.line[row]),
-            "column": self.name,
-            "action": "row left out",
-        }
-        return Fault(check, reason, **place, **more)
+        line, action = int(self.line[row]), "row left out"
+        return Fault(check, reason, file=self.file, line=line, column=self.name, action=action, **more)
 
     def not_a_number(self, row: int, cell: str) -> Fault:
         """Return the fault of a cell that holds text; the fix is another decimal mark where that would do."""
@@ -175,9 +172,8 @@ def body_of(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> by
     """
     body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
     if not body.strip(b"\n \t,;"):
-        place = {"file": file, "action": "file left out"}
         reason = "has a header but no data." if len(layout.names) > 1 else "holds no table of numbers."
-        raise BadFile(Fault("no_rows", reason, fix="Export it again.", **place))
+        raise bad_file(file, "no_rows", reason, "Export it again.")
     return body
 
 
@@ -236,7 +232,7 @@ def array_cells(
     for i, values in enumerate(columns):
         if values.dtype.kind == "M":
             values = _seconds(values) if i in numeric else _iso(values)
-        numbers = values if values.dtype.kind == "f" else _numbers(values, settings.decimal)
+        numbers = values if values.dtype.kind == "f" else numbers_of(values, settings.decimal)
         if i in numeric:
             wrong = np.flatnonzero(~np.isfinite(numbers))
             bad[wrong] = True
@@ -248,10 +244,6 @@ def array_cells(
         plain = i in numeric or not any(cell is not None for cell in values[np.isnan(numbers)])
         made[i] = numbers if plain or values.dtype.kind == "f" else values
     return Cells(made, line, bad, tuple(faults))
-
-
-def _numbers(texts: np.ndarray, decimal: str) -> np.ndarray:
-    return np.array([_float(cell, decimal) for cell in texts], dtype=float)
 
 
 def _seconds(times: np.ndarray) -> np.ndarray:
@@ -347,28 +339,25 @@ def _patient(
     faults: list[Fault] = []
     for i, name in numeric.items():
         cells = [row[i] if i < len(row) else None for row in rows]
-        values = np.array([_float(cell, settings.decimal) for cell in cells], dtype=float)
-        wrong = ~np.isfinite(values)
+        columns[i] = numbers_of(cells, settings.decimal)
+        wrong = ~np.isfinite(columns[i])
         bad |= wrong
         column = ColumnOfFile(file, name, line, settings.decimal)
         faults += _cell_faults(column, np.flatnonzero(wrong), cells, rows)
-        columns[i] = values
     beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows], dtype=bool)
     faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width, file)
     bad |= beyond
-    for i in range(width):
-        if i not in columns:
-            columns[i] = np.array(
-                [(row[i].strip() or None) if i < len(row) else None for row in rows], dtype=object
-            )
-            if all(cell is None or as_number(cell, settings.decimal) is not None for cell in columns[i]):
-                columns[i] = np.array([_float(cell, settings.decimal) for cell in columns[i]])
+    for i in set(range(width)) - columns.keys():
+        cells = [(row[i].strip() or None) if i < len(row) else None for row in rows]
+        words = any(cell is not None and as_number(cell, settings.decimal) is None for cell in cells)
+        columns[i] = np.array(cells, dtype=object) if words else numbers_of(cells, settings.decimal)
     return Cells(columns, line, bad, tuple(faults))
 
 
-def _float(cell: str | None, decimal: str) -> float:
-    number = as_number(cell, decimal) if cell is not None else None
-    return np.nan if number is None else number
+def numbers_of(cells: Iterable[str | None], decimal: str) -> np.ndarray:
+    """Return the numbers in cells of text, shape (n,); NaN where one holds none, or is None."""
+    found = (None if cell is None else as_number(cell, decimal) for cell in cells)
+    return np.array([np.nan if number is None else number for number in found], dtype=float)
 
 
 def _cell_faults(
@@ -382,27 +371,23 @@ def _cell_faults(
         if cell is None:
             reason = f"the line ends after {len(rows[i])} cells."
             return column.fault(i, "too_few_cells", reason, fix="Complete or delete the line.")
-        if not cell.strip():
-            return column.fault(
-                i, "empty_cell", "the cell is empty.", value="", fix="Fill it or delete the line."
-            )
-        if as_number(cell, column.decimal) is not None:
-            fix = "Delete the line."
-            return column.fault(i, "not_finite", "is not a finite number.", value=cell.strip(), fix=fix)
-        if remark := _remark(cell):
-            reason = f"a remark stands beside the number: {remark!r}."
+        value = cell.strip()
+        check, reason, fix = "not_a_number", "is not a number.", ""
+        if not value:
+            check, reason, fix = "empty_cell", "the cell is empty.", "Fill it or delete the line."
+        elif as_number(value, column.decimal) is not None:
+            check, reason, fix = "not_finite", "is not a finite number.", "Delete the line."
+        elif remark := _remark(cell):
+            check, reason = "remark", f"a remark stands beside the number: {remark!r}."
             fix = "Put the right number alone in the cell."
-            return column.fault(i, "remark", reason, value=cell.strip(), fix=fix)
-        if i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in cell):
-            fix = (
-                "If this is a row of units, set units_row = true in the rig config; "
-                "otherwise delete the line."
-            )
-            return column.fault(i, "not_a_number", "is not a number.", value=cell.strip(), fix=fix)
-        if _CLOCK.fullmatch(cell.strip()):
+        elif i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in value):
+            fix = "If this is a row of units, set units_row = true in the rig config; "
+            fix += "otherwise delete the line."
+        elif _CLOCK.fullmatch(value):
             fix = "Export the time as seconds, not as time of day."
-            return column.fault(i, "not_a_number", "is not a number.", value=cell.strip(), fix=fix)
-        return column.not_a_number(i, cell)
+        else:
+            return column.not_a_number(i, cell)
+        return column.fault(i, check, reason, value=value, fix=fix)
 
     return listed(at, make, column.rest)
 
@@ -424,18 +409,21 @@ def decimal_fix(cell: str, decimal: str) -> str:
 
 
 def _beyond_faults(at, rows, line, width, file) -> list[Fault]:
+    place = {"file": file, "action": "row left out"}
+
     def make(i: int) -> Fault:
         value = " ".join(cell.strip() for cell in rows[i][width:] if cell.strip())
-        words = f"a remark stands beside the numbers: {value!r}." if as_number(value) is None else ""
-        reason = words or f"the line has {len(rows[i])} cells where {width} are named."
         fix = "Move it to a column with a name of its own, or delete the line."
-        if not words and len(rows[i]) == 2 * width:
-            fix = "Decimal commas between commas? Export with another separator, or with decimal points."
-        check = "remark" if words else "too_many_cells"
-        return Fault(check, reason, file=file, line=int(line[i]), value=value, action="row left out", fix=fix)
+        if as_number(value) is None:
+            check, reason = "remark", f"a remark stands beside the numbers: {value!r}."
+        else:
+            check, reason = "too_many_cells", f"the line has {len(rows[i])} cells where {width} are named."
+            if len(rows[i]) == 2 * width:
+                fix = "Decimal commas between commas? Export with another separator, or with decimal points."
+        return Fault(check, reason, line=int(line[i]), value=value, fix=fix, **place)
 
     def rest(count: int) -> Fault:
         reason = f"and {count} more lines with cells beyond the last named column."
-        return Fault("too_many_cells", reason, file=file, value=float(count), action="row left out")
+        return Fault("too_many_cells", reason, value=float(count), **place)
 
     return listed(at, make, rest)

@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 
 from sealfit.config import Config, TraceFormat
-from sealfit.errors import BadFile, Fault, nearest, shortened
-from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, listed
+from sealfit.errors import KEPT, NOTED, BadFile, Fault, nearest, shortened
+from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, listed, numbers_of
 from sealfit.ingest.expression import parse
-from sealfit.ingest.files import Layout, as_number, split_line
+from sealfit.ingest.files import Layout, as_number, bad_file, split_line
 from sealfit.tables import BINS, RUNS
 
 # ---------------------------------------------------------------- columns
 # From a file's columns to ours: which position holds what, and what the other columns are called.
 
 LONGEST_LIST = 400  # characters of the names of columns that a message lists
+NO_COLUMN = "there is no such column."
 SLOTS = ("time_s", "displacement_mm", "force_N", "load_N")  # always numbers
 # Columns that our tables make themselves: a channel of that name in a trace file gets another, `stroke_file`.
 RESERVED = ({column.name for schema in (BINS, RUNS) for column in schema.columns} | {"line", "steady"}) - set(
@@ -54,17 +56,10 @@ def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict
         if len(positions) == 1:
             found[positions[0]] = ours
         elif positions:
+            reason = f"stands {len(positions)} times in the header."
             fix = "Rename one, or name the column by its position in the rig config."
-            faults.append(
-                _fault(
-                    "duplicate_column",
-                    f"stands {len(positions)} times in the header.",
-                    layout,
-                    file,
-                    theirs,
-                    fix,
-                )
-            )
+            place = {"line": layout.names_line, "column": theirs}
+            faults += bad_file(file, "duplicate_column", reason, fix, **place).faults
         elif ours not in settings.optional:
             faults.append(_missing(theirs, layout, width, settings, file))
     if faults:
@@ -105,48 +100,40 @@ def suggestion(name: str, known: Sequence[str]) -> str:
 def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
     """Raise `BadFile` if, after everything is computed, a slot that every trace needs is not there."""
     missing = [name for name in SLOTS[:3] if name not in table]
+    fix = "Name it under [trace.columns], compute it under [trace.compute], "
+    fix += "or integrate it from a speed column."
     if missing:
-        fix = (
-            "Name it under [trace.columns], compute it under [trace.compute], "
-            "or integrate it from a speed column."
-        )
-        raise BadFile(
-            *(
-                _fault("missing_column", "there is no such column.", layout, file, name, fix)
-                for name in missing
-            )
-        )
+        raise BadFile(*(missing_column(name, layout, file, fix) for name in missing))
+
+
+def missing_column(column: str | int, layout: Layout, file: str, fix: str, reason: str = NO_COLUMN) -> Fault:
+    """Return the fault of a file that lacks a column, and is left out."""
+    place = {"line": layout.names_line, "column": str(column)}
+    return bad_file(file, "missing_column", reason, fix, **place).fault
 
 
 def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceFormat, file: str) -> Fault:
     if isinstance(theirs, int):
         reason = f"there is no column {theirs}: the lines have {width}."
         fix = "Check delimiter and positions in the rig config."
-        return _fault("missing_column", reason, layout, file, theirs, fix)
-    fix = (
-        suggestion(theirs, layout.names) if layout.names else "Columns without names go by position, from 1."
-    )
+        return missing_column(theirs, layout, file, fix, reason)
+    fix = "Columns without names go by position, from 1."
+    if layout.names:
+        fix = suggestion(theirs, layout.names)
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
         for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), ("|", '"|"'), (" ", '"whitespace"')):
             if len(split_line(line, "tab" if mark == "\t" else mark)) >= 2 and mark != settings.delimiter:
                 fix = f"The header looks separated otherwise: set delimiter = {word} in the rig config."
                 break
-    return _fault("missing_column", "there is no such column.", layout, file, theirs, fix)
-
-
-def _fault(check: str, reason: str, layout: Layout, file: str, column: str | int, fix: str) -> Fault:
-    return Fault(
-        check, reason, file=file, line=layout.names_line, column=str(column), action="file left out", fix=fix
-    )
+    return missing_column(theirs, layout, file, fix)
 
 
 # ---------------------------------------------------------------- channels
 # Further columns of a trace file: which are channels of numbers, which are labels, and which are neither.
 
-MAX_LABELS = (
-    20  # a text column with more different values, most of them used once, is a clock or a serial number
-)
+# A text column with more different values, most of them used once, is a clock or a serial number.
+MAX_LABELS = 20
 
 
 def channel_columns(
@@ -173,13 +160,12 @@ def channel_columns(
     for name, values in columns.items():
         if name in SLOTS:
             continue
-        numbers, texts = (
-            (values, None) if values.dtype.kind == "f" else (_numbers(values, config.trace.decimal), values)
-        )
-        if texts is not None:
-            full = np.array([cell is not None for cell in texts])
+        numbers = values
+        if values.dtype.kind != "f":
+            full = np.array([cell is not None for cell in values])
+            numbers = numbers_of(values, config.trace.decimal)
             if np.isfinite(numbers).sum() <= 0.5 * full.sum():
-                found = _label_faults(name, texts, full, line, file)
+                found = _label_faults(name, values, full, line, file)
                 faults += found
                 if found:
                     del kept[name]
@@ -188,68 +174,49 @@ def channel_columns(
         missing = good & ~(np.abs(numbers) < OVERLOAD)
         share = missing.sum() / max(good.sum(), 1)
         if share == 1:
-            faults.append(_left_out(name, "the column is empty", "info", file))
+            faults.append(_left_out(name, "the column is empty", "", file, NOTED))
             del kept[name]
         elif share > config.quality.max_bad_rows:
-            faults.append(
-                _left_out(name, f"{missing.sum()} of {good.sum()} cells hold no number", "warning", file)
-            )
+            reason = f"{missing.sum()} of {good.sum()} cells hold no number"
+            fix = "Fill it, or list it under trace.optional and leave it out of the export."
+            faults.append(_left_out(name, reason, fix, file, KEPT))
             del kept[name]
         elif share:
             drop |= missing
             column = ColumnOfFile(file, name, line, config.trace.decimal)
-            faults += _cell_faults(column, np.flatnonzero(missing), numbers, texts)
+            faults += _cell_faults(column, np.flatnonzero(missing), values)
     return kept, drop, faults
-
-
-def _numbers(texts: np.ndarray, decimal: str) -> np.ndarray:
-    found = [None if cell is None else as_number(cell, decimal) for cell in texts]
-    return np.array([np.nan if number is None else number for number in found])
 
 
 def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarray, file: str) -> list[Fault]:
     """Return why a text column is no label; nothing if it is one."""
     if full.sum() < 0.5 * len(full):
+        place = {"file": file, "column": name, **NOTED}
 
         def make(i: int) -> Fault:
-            place = {"line": int(line[i]), "column": name, "value": texts[i]}
-            return Fault(
-                "remark", "a remark; the row is kept.", file=file, severity="info", action="kept", **place
-            )
+            return Fault("remark", "a remark; the row is kept.", line=int(line[i]), value=texts[i], **place)
 
         def rest(count: int) -> Fault:
-            return Fault(
-                "remark", f"and {count} more remarks.", file=file, column=name, severity="info", action="kept"
-            )
+            return Fault("remark", f"and {count} more remarks.", **place)
 
         return listed(np.flatnonzero(full), make, rest)
     labels = len(set(texts[full]))
     if labels > MAX_LABELS and labels > 0.5 * full.sum():
-        return [_left_out(name, f"{labels} different texts are too many for labels", "info", file)]
+        return [_left_out(name, f"{labels} different texts are too many for labels", "", file, NOTED)]
     return []
 
 
-def _left_out(name: str, reason: str, severity: str, file: str) -> Fault:
-    fix = (
-        "Fill it, or list it under trace.optional and leave it out of the export."
-        if severity == "warning"
-        else ""
-    )
+def _left_out(name: str, reason: str, fix: str, file: str, done: Mapping[str, str]) -> Fault:
     reason = f"{reason}; the column is not used."
-    return Fault(
-        "channel_left_out", reason, file=file, column=name, severity=severity, action="kept", fix=fix
-    )
+    return Fault("channel_left_out", reason, file=file, column=name, fix=fix, **done)
 
 
-def _cell_faults(
-    column: ColumnOfFile, at: np.ndarray, numbers: np.ndarray, texts: np.ndarray | None
-) -> list[Fault]:
+def _cell_faults(column: ColumnOfFile, at: np.ndarray, cells: np.ndarray) -> list[Fault]:
     def make(i: int) -> Fault:
-        cell = None if texts is None else texts[i]
-        if cell is not None and as_number(cell, column.decimal) is None:
+        cell = cells[i]
+        if isinstance(cell, str) and as_number(cell, column.decimal) is None:
             return column.not_a_number(i, cell)
-        # As text: JSON has no inf.
-        value = cell if cell is not None else "" if np.isnan(numbers[i]) else str(numbers[i])
+        value = "" if pd.isna(cell) else str(cell)  # as text: JSON has no inf
         reason = "is not a measured number." if value != "" else "the cell holds no number."
         return column.fault(i, "not_finite", reason, value=value, fix="Fill it or delete the line.")
 

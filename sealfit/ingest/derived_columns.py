@@ -26,7 +26,7 @@ from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
-from sealfit.ingest.listing import Entries, Entry
+from sealfit.ingest.listing import Entry
 from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- run values
@@ -81,7 +81,7 @@ def _is_word(cell: float | str) -> bool:
     return math.isnan(_number(cell))
 
 
-def with_computed(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
+def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
     """Return the columns with the config's constants and computed columns, and faults of the computed ones.
 
     A constant stands where a file has no value. Helpers, columns whose name begins with "_", are left out.
@@ -115,7 +115,7 @@ def with_computed(entries: Entries, columns: Columns, config: Config) -> tuple[C
             for i in np.flatnonzero(wrong).tolist()
         ]
         known_here = np.where(whole, values, math.nan).tolist()
-        columns[name] = [_of_its_kind(name, value) if math.isfinite(value) else None for value in known_here]
+        columns[name] = [of_its_kind(name, value) if math.isfinite(value) else None for value in known_here]
     return {name: column for name, column in columns.items() if not name.startswith("_")}, faults
 
 
@@ -129,14 +129,14 @@ def _as_array(column: Column) -> np.ndarray:
     return np.array([("" if words else math.nan) if value is None else value for value in column])
 
 
-def _of_its_kind(name: str, value: float) -> float | str:
+def of_its_kind(name: str, value: float) -> float | str:
     """Return a computed number as its column holds it: an integer for repeats or strokes, text for a name."""
     if name in COUNTS and value == int(value):
         return int(value)
     return f"{value:g}" if name in TEXT_COLUMNS else value
 
 
-def to_values(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
+def to_values(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
     """Return the columns as numbers or as labels, and faults of cells that are neither.
 
     A column of numbers is one whose name says so, one of the config's condition columns or a channel where
@@ -150,7 +150,7 @@ def to_values(entries: Entries, columns: Columns, config: Config) -> tuple[Colum
     return made, faults
 
 
-def _column(name: str, cells: Column, entries: Entries, config: Config) -> tuple[Column, list[Fault]]:
+def _column(name: str, cells: Column, entries: list[Entry], config: Config) -> tuple[Column, list[Fault]]:
     labels = mapped(cells, _text)
     if name in TEXT_COLUMNS:
         return labels, []
@@ -200,10 +200,18 @@ def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Col
     }
 
 
+def empty_cells(entries: list[Entry], name: str, rows: np.ndarray) -> list[Fault]:
+    """Return the faults of files, by their numbers, that lack a value in a condition column."""
+    fix = "Fill it: it is one of the config's condition columns."
+    return [
+        entries[i].fault("empty_cell", "the cell is empty.", name, value="", fix=fix) for i in rows.tolist()
+    ]
+
+
 ABSOLUTE_ZERO_C = -273.15
 
 
-def out_of_range(entries: Entries, columns: Columns) -> list[Fault]:
+def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
     """Return faults of impossible values: negative days, no load, no speed, below absolute zero."""
     rules = (
         ("aging_days", lambda value: value < 0, "is below 0 days.", "Days count from 0, unaged."),
@@ -399,7 +407,7 @@ def add_repeats(columns: Columns) -> Columns:
     return {**columns, "repeat": put(given, numbers)}
 
 
-def disagreements(entries: Entries, columns: Columns, conditions: list[str]) -> list[Fault]:
+def disagreements(entries: list[Entry], columns: Columns, conditions: list[str]) -> list[Fault]:
     """Return faults of runs: a repeat stands twice or differs from its run in condition, speed or load."""
     none = [None] * len(entries)
     run, repeat, specimen = (columns[name] for name in ("run_id", "repeat", "specimen_id"))

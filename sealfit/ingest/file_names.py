@@ -75,30 +75,14 @@ TEXT_COLUMNS = ("run_id", "specimen_id", "started_at")  # "007" is a name here, 
 _FIELD = re.compile(r"\{([^{}]*)\}")
 
 
-@dataclass(frozen=True, slots=True)
-class NameParts:
-    """What a name says; `matched` is False where the pattern does not match it. Helpers begin with `_`."""
-
-    matched: bool
-    values: Mapping[str, float | str]
-
-    @property
-    def channels(self) -> dict[str, float | str]:
-        """The values that are channels: all but the helpers."""
-        return {name: value for name, value in self.values.items() if not name.startswith("_")}
-
-
-SAYS_NOTHING = NameParts(True, {})
+Named = Mapping[str, float | str]  # what a name says; helpers begin with `_`
 SAME_UNITS: Mapping[str, Conversion] = {}
 
 
-def names_speak(settings: Files) -> bool:
-    """Whether names of files say anything under the config's `files`."""
-    return bool(settings.name_pattern is not None or settings.compute or settings.columns)
-
-
-def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion] = SAME_UNITS) -> NameParts:
-    """Return what the relative path `file` says under the config's `files`.
+def name_parts(
+    file: str, settings: Files, conversions: Mapping[str, Conversion] = SAME_UNITS
+) -> Named | None:
+    """Return what the relative path `file` says under the config's `files`; None if it does not match.
 
     Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the
     map has one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty
@@ -113,17 +97,15 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
     --------
     >>> rig = Files(name_pattern=r"(?P<_sign>n?)(?P<_rpm>\\d+)\\.csv", values={"_sign": {"": 1, "n": -1}},
     ...             compute={"speed_mm_s": "_sign * _rpm"}, columns={"run_id": "{_rpm} rpm"})
-    >>> name_parts("n120.csv", rig).channels
+    >>> channels_of(name_parts("n120.csv", rig))
     {'speed_mm_s': -120.0, 'run_id': '120 rpm'}
     """
-    if not names_speak(settings):
-        return SAYS_NOTHING
     texts: dict[str, str] = {}
     values: dict[str, float | str] = {}
     if settings.name_pattern is not None:
         match = found_by(settings.name_pattern, file, whole=True)
         if match is None:
-            return NameParts(False, {})
+            return None
         for name, text in match.groupdict(default="").items():
             mapped = settings.values.get(name, {}).get(text)
             if mapped is None:
@@ -141,9 +123,12 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
         texts[name] = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
         values[name] = texts[name] if name in TEXT_COLUMNS else _value(texts[name])
         _convert(name, texts, values, conversions)
-    return NameParts(
-        True, {name: value for name, value in values.items() if value != "" or name.startswith("_")}
-    )
+    return {name: value for name, value in values.items() if value != "" or name.startswith("_")}
+
+
+def channels_of(named: Named | None) -> dict[str, float | str]:
+    """Return what a name says without the helpers; nothing where it does not match."""
+    return {name: value for name, value in (named or {}).items() if not name.startswith("_")}
 
 
 # A group or a choice of which nothing is there yet.

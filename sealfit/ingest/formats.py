@@ -21,8 +21,9 @@ from types import ModuleType
 import numpy as np
 
 from sealfit.config import TraceFormat
-from sealfit.errors import BadFile, CampaignError, Fault, SealfitError
+from sealfit.errors import NOTED, CampaignError, Fault, SealfitError
 from sealfit.ingest.columns import suggestion
+from sealfit.ingest.files import bad_file
 
 # ---------------------------------------------------------------- kinds
 # Which files are of which kind, and the library that reads them.
@@ -98,12 +99,7 @@ def damage_named(file: str, kind: str) -> Iterator[None]:
     except Exception as error:
         said = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
         fix = "It is damaged or of another format: export it again, or set trace.format in the rig config."
-        raise bad(file, "damaged_file", f"cannot be read as {CALLED[kind]} ({said}).", fix) from error
-
-
-def bad(file: str, check: str, reason: str, fix: str, **place) -> BadFile:
-    """Return the error of a file that is left out."""
-    return BadFile(Fault(check, reason, file=file, action="file left out", fix=fix, **place))
+        raise bad_file(file, "damaged_file", f"cannot be read as {CALLED[kind]} ({said}).", fix) from error
 
 
 # ---------------------------------------------------------------- arrays
@@ -137,12 +133,11 @@ def read_arrays(raw: bytes, file: str, settings: TraceFormat, *, head: bool = Fa
     with damage_named(file, kind):
         found = _READERS[kind](raw, file, settings, head)
     if not head and not max((len(column) for column in found.columns), default=0):
-        raise bad(file, "no_rows", "holds no column of data.", "Export it again.")
+        raise bad_file(file, "no_rows", "holds no column of data.", "Export it again.")
     return found
 
 
-def header_line(name: str, value: object) -> str:
-    """Return a named value as a line of a header."""
+def _header_line(name: str, value: object) -> str:
     return f"{name}\t{value_text(value)}"
 
 
@@ -206,9 +201,9 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
         )
         if name in needed:
             fix = "Export all channels at one rate." if column is not None else "Export it as numbers."
-            raise bad(file, "column_shape", f"{reason}.", fix, column=name)
-        place = {"file": file, "column": name, "severity": "info", "action": "kept"}
-        faults.append(Fault("channel_left_out", f"{reason}; the column is not used.", **place))
+            raise bad_file(file, "column_shape", f"{reason}.", fix, column=name)
+        reason = f"{reason}; the column is not used."
+        faults.append(Fault("channel_left_out", reason, file=file, column=name, **NOTED))
     return Arrays(tuple(header), tuple(kept), tuple(kept.values()), tuple(faults))
 
 
@@ -232,12 +227,12 @@ def _chosen(
     """
     wanted = getattr(settings, key)
     if not options:
-        raise bad(file, "no_rows", "holds no column of data.", "Export it again.")
+        raise bad_file(file, "no_rows", "holds no column of data.", "Export it again.")
     if wanted is not None:
         if wanted in options:
             return wanted
         fix = suggestion(wanted, list(options)).replace("columns are", f"{key}s are")
-        raise bad(file, "missing_table", f"holds no {key} '{wanted}' (trace.{key}) with data.", fix)
+        raise bad_file(file, "missing_table", f"holds no {key} '{wanted}' (trace.{key}) with data.", fix)
     names = {
         name
         for ours, name in settings.their_columns.items()
@@ -248,7 +243,7 @@ def _chosen(
         return [*fitting, *options][0]
     named = ", ".join(repr(option) for option in options)
     fix = f'Choose one in the rig config: {key} = "..." under [trace].'
-    raise bad(file, "several_tables", f"holds several {key}s with data: {named}.", fix)
+    raise bad_file(file, "several_tables", f"holds several {key}s with data: {named}.", fix)
 
 
 # ---------------------------------------------------------------- TDMS
@@ -260,23 +255,19 @@ def _tdms(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     read = nptdms.TdmsFile.read_metadata if head else nptdms.TdmsFile.read
     tdms = read(io.BytesIO(raw))
     if tdms.file_status.incomplete_final_segment:
-        raise bad(
-            file,
-            "damaged_file",
-            "is cut off: its last segment is not complete.",
-            "Copy it again from the rig.",
-        )
+        reason = "is cut off: its last segment is not complete."
+        raise bad_file(file, "damaged_file", reason, "Copy it again from the rig.")
     groups = {
         group.name: group for group in tdms.groups() if any(len(channel) for channel in group.channels())
     }
     time_name = settings.their_columns.get("time_s")
     names = {name: [channel.name for channel in group.channels()] for name, group in groups.items()}
     group = groups[_chosen(names, "group", settings, file, derived=time_name)]
-    header = [header_line(name, value) for name, value in tdms.properties.items()]
-    header += [header_line(f"{group.name}/{name}", value) for name, value in group.properties.items()]
+    header = [_header_line(name, value) for name, value in tdms.properties.items()]
+    header += [_header_line(f"{group.name}/{name}", value) for name, value in group.properties.items()]
     for channel in group.channels():
         header += [
-            header_line(f"{group.name}/{channel.name}/{k}", value) for k, value in channel.properties.items()
+            _header_line(f"{group.name}/{channel.name}/{k}", value) for k, value in channel.properties.items()
         ]
     if head:
         return Arrays(tuple(header))
@@ -312,7 +303,7 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
 
         loaded = loadmat(io.BytesIO(raw), simplify_cells=True)
         variables = {name: value for name, value in loaded.items() if not name.startswith("__")}
-    header = [header_line(name, value) for name, value in _scalars(variables)]
+    header = [_header_line(name, value) for name, value in _scalars(variables)]
     if head:
         return Arrays(tuple(header))
     tables = _tables(variables)
@@ -320,7 +311,7 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
         fix = (
             "Save the columns as vectors, as a matrix or as a struct: s = table2struct(T, 'ToScalar', true)."
         )
-        raise bad(file, "no_rows", "holds no vectors, matrix or struct of numbers.", fix)
+        raise bad_file(file, "no_rows", "holds no vectors, matrix or struct of numbers.", fix)
     options = {name: table if isinstance(table, dict) else () for name, table in tables.items()}
     name = _chosen(options, "variable", settings, file)
     table = tables[name]
@@ -330,7 +321,7 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
         reason = (
             f"variable '{name}' has {table.shape[0]} rows and {table.shape[1]} columns; samples are rows."
         )
-        raise bad(file, "column_shape", reason, "Save its transpose.")
+        raise bad_file(file, "column_shape", reason, "Save its transpose.")
     return Arrays(tuple(header), (), tuple(table.T.astype(float)))
 
 
@@ -399,13 +390,13 @@ def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays
     about = {
         k.decode(): v.decode("utf-8", "replace") for k, v in (opened.schema_arrow.metadata or {}).items()
     }
-    header = [header_line(name, text) for name, text in about.items() if name.encode() not in _OF_WRITERS]
+    header = [_header_line(name, text) for name, text in about.items() if name.encode() not in _OF_WRITERS]
     if head:
         return Arrays(tuple(header))
     table = opened.read(use_threads=False)
     names = [name for name in table.column_names if not name.startswith("__index_level_")]
     if len(set(names)) < len(names):
-        raise bad(file, "duplicate_column", "has two columns of one name.", "Rename one.")
+        raise bad_file(file, "duplicate_column", "has two columns of one name.", "Rename one.")
     return _arrays(header, {name: _from_arrow(table.column(name)) for name in names}, settings, file)
 
 
@@ -415,12 +406,8 @@ def _from_arrow(column) -> np.ndarray:
     kind = column.type
     if pa.types.is_dictionary(kind):
         column, kind = column.cast(kind.value_type), kind.value_type
-    if (
-        pa.types.is_decimal(kind)
-        or pa.types.is_null(kind)
-        or pa.types.is_boolean(kind)
-        or pa.types.is_integer(kind)
-    ):
+    numeric = (pa.types.is_decimal, pa.types.is_null, pa.types.is_boolean, pa.types.is_integer)
+    if any(holds(kind) for holds in numeric):
         return column.cast(pa.float64(), safe=False).to_numpy()
     if pa.types.is_date(kind):
         column = column.cast(pa.timestamp("s"))

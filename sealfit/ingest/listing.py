@@ -6,14 +6,12 @@ import csv
 import io
 import os
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path, PurePosixPath
-
-import numpy as np
 
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, Fault, nearest, printable
@@ -56,28 +54,7 @@ class Entry:
         return Fault(check, reason, column=column, **place, **rest)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Entries(Sequence[Entry]):
-    """The trace files of a campaign in order, and the line of each in the table of runs, if there is one."""
-
-    files: list[str]
-    lines: list[int] | None = None
-    table: str = RUNS_CSV
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def __getitem__(self, i: int) -> Entry:
-        return Entry(self.files[i], None if self.lines is None else self.lines[i], self.table)
-
-    def take(self, files: np.ndarray) -> Entries:
-        """Return some of the files, by their numbers."""
-        chosen = files.tolist()
-        lines = None if self.lines is None else [self.lines[i] for i in chosen]
-        return Entries([self.files[i] for i in chosen], lines, self.table)
-
-
-def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list[Fault]]:
+def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, list[Fault]]:
     """Return the trace files of a campaign in order, what runs.csv says of them, and what was found amiss.
 
     Cells are text, those that say that there is nothing left out; errors stop the run.
@@ -102,7 +79,7 @@ def list_entries(campaign: Path, config: Config) -> tuple[Entries, Columns, list
         count = sum(1 for _ in campaign.rglob("*.csv"))
         fix = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
         raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", fix, file=RUNS_CSV)
-    outside = {file for file in entries.files if inside(campaign, file) is None}
+    outside = {entry.file for entry in entries if inside(campaign, entry.file) is None}
     faults = faults + _paths(campaign, entries, outside) + _unlisted(campaign, entries, outside, config)
     return entries, cells, faults
 
@@ -131,12 +108,13 @@ def _runs_table(campaign: Path, config: Config) -> str | None:
     return found[0] if found else None
 
 
-def _read_runs(campaign: Path, config: Config, table: str) -> tuple[Entries, Columns, list[Fault]]:
+def _read_runs(campaign: Path, config: Config, table: str) -> tuple[list[Entry], Columns, list[Fault]]:
     lines, columns, faults = read_table(campaign, table, config, needed="file")
     files = [_posix(campaign, file) for file in columns.pop("file", [])]
     if not files and not any(fault.severity == "error" for fault in faults):
         raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
-    return Entries(files, lines, table), columns, faults
+    entries = [Entry(file, line, table) for file, line in zip(files, lines, strict=False)]
+    return entries, columns, faults
 
 
 def read_table(
@@ -278,7 +256,7 @@ def _posix(campaign: Path, file: str) -> str:
     return os.path.normpath(file) if file else file
 
 
-def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
+def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
     glob = config.files.glob
     if PurePosixPath(glob).is_absolute() or ".." in PurePosixPath(glob).parts or not glob:
         raise _stop(
@@ -301,8 +279,8 @@ def _by_glob(campaign: Path, config: Config) -> tuple[Entries, list[Fault]]:
             reason = f"excluded by files.exclude = {pattern!r}."
             faults.append(Fault("excluded", reason, file=file, severity="info", action="file left out"))
         else:
-            kept.append(file)
-    return Entries(kept), faults
+            kept.append(Entry(file))
+    return kept, faults
 
 
 def _nearest_file(campaign: Path, glob: str) -> str:
@@ -312,11 +290,10 @@ def _nearest_file(campaign: Path, glob: str) -> str:
     return f"The nearest file is '{close[0]}'." if close else "There is no file in it: check the folder."
 
 
-def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
+def _paths(campaign: Path, entries: list[Entry], outside: set[str]) -> list[Fault]:
     """Return faults of the listed paths: outside the campaign, listed twice, or none of them there."""
     faults, lines = [], {}
-    fine = not outside and len(set(entries.files)) == len(entries)
-    for entry in () if fine else entries:
+    for entry in entries:
         if entry.file in outside:
             reason = "the trace file lies outside the campaign folder."
             fix = "Copy it into the folder of runs.csv and write its path relative to it."
@@ -327,24 +304,24 @@ def _paths(campaign: Path, entries: Entries, outside: set[str]) -> list[Fault]:
                 entry.fault("duplicate_file", reason, "file", value=entry.file, fix="Delete one line.")
             )
         lines.setdefault(entry.file, entry.line)
-    if entries and not faults and not any(os.path.isfile(campaign / file) for file in entries.files):
+    if entries and not faults and not any((campaign / entry.file).is_file() for entry in entries):
         reason = f"none of the {len(entries)} trace files listed exists."
         fix = "Paths are relative to the folder of runs.csv."
         faults.append(entries[0].fault("missing_file", reason, "file", value=entries[0].file, fix=fix))
     return faults
 
 
-def _unlisted(campaign: Path, entries: Entries, outside: set[str], config: Config) -> list[Fault]:
+def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: Config) -> list[Fault]:
     """Return files that runs.csv omits: beside the traces and of the same ending, or matched by the glob."""
-    if not entries or entries.lines is None:
+    if not entries or entries[0].line is None:
         return []
-    listed = set(entries.files)
+    table, listed = entries[0].table, {entry.file for entry in entries}
     there = files_beside(campaign, listed - outside)
     if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
         found = (p for p in campaign.glob(config.files.glob) if p.is_file())
         there |= {p.relative_to(campaign).as_posix() for p in found}
-    files = there - listed - {entries.table}
-    reason, fix = f"is not in {entries.table}.", "Add it to runs.csv if it is a trace."
+    files = there - listed - {table}
+    reason, fix = f"is not in {table}.", "Add it to runs.csv if it is a trace."
     place = {"severity": "info", "action": "file left out", "fix": fix}
     return [
         Fault("not_listed", reason, file=f, **place) if _is_utf8(f) else _odd_name(f, "info")

@@ -15,13 +15,14 @@ from sealfit.ingest.cells import LISTED
 from sealfit.ingest.columns import suggestion
 from sealfit.ingest.derived_columns import (
     NUMBERS,
+    empty_cells,
     in_our_units,
     out_of_range,
     to_values,
     with_computed,
     with_day_0,
 )
-from sealfit.ingest.listing import Entries, read_table
+from sealfit.ingest.listing import Entry, read_table
 from sealfit.store.manifest import BATCH
 
 DAYS = "aging_days"
@@ -58,7 +59,7 @@ def read_properties(
     lines, columns, faults = read_table(path.parent, table, config, needed=None)
     if not lines and not faults:
         raise _stop(table, "no_rows", "has a header but no rows.", "Write one row per specimen.")
-    entries = Entries([table] * len(lines), lines, table)
+    entries = [Entry(table, line, table) for line in lines]
     columns = with_day_0(in_our_units(columns, config.conversions("runs")), _of_table(config, columns))
     words = {name: columns.pop(name) for name in {*LABELS, batch} if name in columns}
     columns, found = to_values(entries, columns, config)
@@ -124,14 +125,12 @@ def _properties(table: str, columns: Columns, config: Config, named: Sequence[st
     raise _stop(table, "missing_column", reason, f"Name it, or several: --property {numbers[0]}.", line=1)
 
 
-def _lacking(entries: Entries, columns: Columns, config: Config) -> list[Fault]:
+def _lacking(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:
     """Return faults of aged specimens without a value in a condition column."""
     aged = ~where(columns[DAYS], lambda value: value == 0)
     faults = []
     for name in config.condition:
-        for i in np.flatnonzero(aged & ~known(columns[name])).tolist():
-            fix = "Fill it: it is one of the config's condition columns."
-            faults.append(entries[i].fault("empty_cell", "the cell is empty.", name, value="", fix=fix))
+        faults += empty_cells(entries, name, np.flatnonzero(aged & ~known(columns[name])))
     return faults
 
 
@@ -155,7 +154,7 @@ def _rows(
     )
 
 
-def _left_out(entries: Entries, rows: pd.DataFrame) -> list[Fault]:
+def _left_out(entries: list[Entry], rows: pd.DataFrame) -> list[Fault]:
     """Return a finding for every property that some rows have no value of: how many, and in which lines."""
     faults = []
     for name, lines in rows.groupby("quantity", sort=False)["line"]:
@@ -164,7 +163,7 @@ def _left_out(entries: Entries, rows: pd.DataFrame) -> list[Fault]:
         )
         reason = f"{len(lines)} rows have no value and are left out: {listed}."
         place = {
-            "file": entries.table,
+            "file": entries[0].table,
             "line": int(lines.iloc[0]),
             "column": name,
             "value": float(len(lines)),

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config, Quality
-from sealfit.errors import ConfigError, Fault
+from sealfit.errors import KEPT, NOTED, STROKE_OUT, ConfigError, Fault
 from sealfit.ingest.strokes import Stroke
 from sealfit.ingest.trace_checks import resolution
 from sealfit.tables import QUALITY, STEADY
@@ -39,10 +39,10 @@ COARSE = 0.6
 FEW_LEVELS = 5
 NEXT_LEVELS = 30
 BY_CHANCE = 1e-4  # that so many samples lie at the extreme; few strokes come so far that it is asked
-STILL_RISING = (
-    0.01  # share of the force that may be missing where a stroke ends: more, and it was never steady
-)
+# Share of the force that may be missing where a stroke ends: more, and it was never steady.
+STILL_RISING = 0.01
 FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "fix": ""}
+MEASURE_AGAIN = "Check the cable and the logger, and measure again."
 
 
 def stroke_faults(
@@ -57,39 +57,25 @@ def stroke_faults(
     time_s, force_N, line : ndarray, shape (n,)
         The whole trace, and the line in the file of each of its rows.
     """
-    unsettled = [] if stroke.settles else [_unsettled(stroke)]
+    found = [] if stroke.settles else [_unsettled(stroke)]
     if stroke.short is not None:
-        return [
-            *unsettled,
-            Fault(
-                "too_short",
-                f"{stroke.short}.",
-                value=float(len(stroke.rows)),
-                action="stroke left out",
-                fix="Slide further or sample faster; "
-                "or set strokes.min_samples and min_steady_share in the config.",
-            ),
-        ]
+        fix = "Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config."
+        samples = float(len(stroke.rows))
+        return [*found, Fault("too_short", f"{stroke.short}.", value=samples, fix=fix, **STROKE_OUT)]
     whole, steady = slice(stroke.start, stroke.stop), stroke.rows
-    force_N, steady_line = force_N[steady], line[steady]
-    return [
-        *unsettled,
-        *_gaps(time_s[whole], line[whole], settings),
-        *(_saturated(force_N, steady_line, settings) or _stuck(force_N, steady_line, settings)),
-    ]
+    found += _gaps(time_s[whole], line[whole], settings)
+    force_N, line = force_N[steady], line[steady]
+    return found + (_saturated(force_N, line, settings) or _stuck(force_N, line, settings))
 
 
 def _unsettled(stroke: Stroke) -> Fault:
-    return Fault(
-        "no_plateau",
+    reason = (
         "the speed never settles: where it is highest it still changes by more than the tolerance. "
-        "Its steady force is a mean over these speeds; bins have a speed each.",
-        column="displacement_mm",
-        value=float(stroke.speed_mm_s),
-        severity="warning",
-        action="kept",
-        fix="Drive at a constant speed; lower strokes.speed_tolerance where steps of the speed are smaller.",
+        "Its steady force is a mean over these speeds; bins have a speed each."
     )
+    fix = "Drive at a constant speed; lower strokes.speed_tolerance where steps of the speed are smaller."
+    speed = float(stroke.speed_mm_s)
+    return Fault("no_plateau", reason, column="displacement_mm", value=speed, fix=fix, **KEPT)
 
 
 def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
@@ -104,18 +90,12 @@ def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
     """
     if not abs(left_N) > STILL_RISING * abs(force_N):
         return []
-    return [
-        Fault(
-            "never_steady",
-            f"the stroke ends before its friction is steady: {abs(left_N):.3g} of {abs(force_N):.4g} {unit} "
-            "are still to come. Its steady force is extrapolated by the bristle model.",
-            column="force_N",
-            value=abs(left_N),
-            severity="info",
-            action="kept",
-            fix="Slide further at this speed: five times the rise's length to 63 %, better eleven times.",
-        )
-    ]
+    reason = (
+        f"the stroke ends before its friction is steady: {abs(left_N):.3g} of {abs(force_N):.4g} {unit} "
+        "are still to come. Its steady force is extrapolated by the bristle model."
+    )
+    fix = "Slide further at this speed: five times the rise's length to 63 %, better eleven times."
+    return [Fault("never_steady", reason, column="force_N", value=abs(left_N), fix=fix, **NOTED)]
 
 
 def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:
@@ -125,20 +105,15 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
     if not gaps.any():
         return []
     hidden = float((steps[gaps] - usual).sum() / (time_s[-1] - time_s[0]))
-    widest, count, out = int(np.argmax(steps)), int(gaps.sum()), hidden > settings.max_gap_share
-    return [
-        Fault(
-            "gaps",
-            f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; "
-            f"the longest, after this line, is {steps[widest]:.3g} where {usual:.3g} is usual.",
-            line=int(line[widest]),
-            column="time_s",
-            value=hidden,
-            severity="error" if out else "warning",
-            action="stroke left out" if out else "kept",
-            fix="Look for lost packets or a full buffer in the logger.",
-        )
-    ]
+    widest, count = int(np.argmax(steps)), int(gaps.sum())
+    reason = (
+        f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; "
+        f"the longest, after this line, is {steps[widest]:.3g} where {usual:.3g} is usual."
+    )
+    place = {"line": int(line[widest]), "column": "time_s", "value": hidden}
+    fix = "Look for lost packets or a full buffer in the logger."
+    done = STROKE_OUT if hidden > settings.max_gap_share else KEPT
+    return [Fault("gaps", reason, fix=fix, **place, **done)]
 
 
 def equal_neighbours(force_N: np.ndarray) -> float:
@@ -152,26 +127,20 @@ def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list
     top = size == size.max()
     others = force_N[~top]
     share = float(top.mean())
-    if (
-        share < settings.saturated_share
-        or top.sum() < 5
-        or len(others) < 20
-        or len(np.unique(others)) < FEW_LEVELS
-    ):
+    if share < settings.saturated_share or top.sum() < 5 or len(others) < 20:
         return []
     at_next_level = np.count_nonzero(np.abs(others) == np.abs(others).max())
-    if not _shows_noise(force_N, ~top, FINE) or top.sum() <= 2 * at_next_level:
-        return []  # few levels altogether: the sensor is coarse, not at its end
-    if not _piled_up(size):
+    # Few levels altogether: the sensor is coarse, not at its end.
+    coarse = len(np.unique(others)) < FEW_LEVELS or top.sum() <= 2 * at_next_level
+    if coarse or not _shows_noise(force_N, ~top, FINE) or not _piled_up(size):
         return []
     value = float(force_N[np.argmax(size)])
     reason = (
         f"{share:.0%} of the steady samples lie exactly at the extreme {value:g}: "
         "the end of the sensor's range."
     )
-    return [
-        _broken("saturated", reason, line[np.argmax(top)], value, "Use a larger range and measure again.")
-    ]
+    fix = "Use a larger range and measure again."
+    return [_broken("saturated", reason, line[np.argmax(top)], value, fix)]
 
 
 def _piled_up(size_N: np.ndarray) -> bool:
@@ -208,14 +177,11 @@ def _stuck(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fau
     reason = (
         f"{count} samples in a row are exactly {value:g} while the platform moves; elsewhere they change."
     )
-    return [
-        _broken("stuck", reason, line[first], value, "Check the cable and the logger, and measure again.")
-    ]
+    return [_broken("stuck", reason, line[first], value, MEASURE_AGAIN)]
 
 
 def _broken(check: str, reason: str, line: int, value: float, fix: str) -> Fault:
-    place = {"line": int(line), "column": "force_N", "value": value}
-    return Fault(check, reason, severity="error", action="stroke left out", fix=fix, **place)
+    return Fault(check, reason, line=int(line), column="force_N", value=value, fix=fix, **STROKE_OUT)
 
 
 def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
@@ -249,34 +215,18 @@ def speed_column_faults(measured: float, column: float, config: Config) -> list[
     if not abs(abs(column) - abs(measured)) > config.quality.speed_disagreement * abs(measured):
         return []
     unit = config.units.unit("speed")
-    return [
-        Fault(
-            "speed_disagreement",
-            f"the speed column says {column:.4g} {unit}, displacement over time {measured:.4g} {unit}.",
-            column="speed_mm_s",
-            value=float(column),
-            severity="warning",
-            action="kept",
-            fix="Check the units of both columns; displacement over time is used.",
-        )
-    ]
+    reason = f"the speed column says {column:.4g} {unit}, displacement over time {measured:.4g} {unit}."
+    fix = "Check the units of both columns; displacement over time is used."
+    return [Fault("speed_disagreement", reason, column="speed_mm_s", value=float(column), fix=fix, **KEPT)]
 
 
 def load_faults(measured: float, declared: float, unit: str) -> list[Fault]:
     """Return where the load measured along the trace differs from the declared one by more than a tenth."""
     if not abs(measured - declared) > LOAD_TOLERANCE * abs(declared):
         return []
-    return [
-        Fault(
-            "load",
-            f"measured {measured:.4g} {unit}, declared {declared:.4g} {unit}.",
-            column="load_N",
-            value=float(measured),
-            severity="warning",
-            action="kept",
-            fix="The measured load is used; check runs.csv.",
-        )
-    ]
+    reason = f"measured {measured:.4g} {unit}, declared {declared:.4g} {unit}."
+    fix = "The measured load is used; check runs.csv."
+    return [Fault("load", reason, column="load_N", value=float(measured), fix=fix, **KEPT)]
 
 
 def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
@@ -305,10 +255,9 @@ def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
             reason = (
                 f"the friction force is {middle:.2g} times the load "
                 f"in {wrong.sum()} of {len(mu)} conditions; "
+                f"coefficients of friction are {MU_RANGE[0]:g} to {MU_RANGE[1]:g}."
             )
-            reason += f"coefficients of friction are {MU_RANGE[0]:g} to {MU_RANGE[1]:g}."
-            place = {"column": "load_N", "value": middle, "severity": "warning", "action": "kept"}
-            faults.append(Fault("improbable_load", reason, fix=fix, **place))
+            faults.append(Fault("improbable_load", reason, column="load_N", value=middle, fix=fix, **KEPT))
     return faults
 
 
@@ -322,24 +271,15 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
     files : sequence of str
         Every trace file of the campaign, in order.
     """
+    told = {fault.file for fault in faults}
+    rows = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in faults]
+    rows += [{**FINE_FILE, "file": file} for file in files if file not in told]
     place = {file: i for i, file in enumerate(files)}
-    ordered = sorted(
-        faults, key=lambda fault: (place.get(fault.file or "", -1), fault.stroke or 0, fault.line or 0)
+    rows.sort(key=lambda row: (place.get(row["file"], -1), row.get("stroke") or 0, row.get("line") or 0))
+    kinds = {name: "Int64" if name in ("stroke", "line") else "str" for name in QUALITY.names()}
+    return pd.DataFrame(
+        {name: pd.array([row.get(name) for row in rows], kind) for name, kind in kinds.items()}
     )
-    told = np.array([place.get(fault.file or "", -1) for fault in ordered], int)
-    silent = np.flatnonzero(~np.isin(np.arange(len(files)), told))
-    order = np.argsort(np.concatenate([told, silent]), kind="stable")
-    finding = np.minimum(order, len(ordered))  # that of a file without any stands after all others
-    found = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in ordered]
-    columns = {}
-    for name in QUALITY.names():
-        if name == "file":
-            names = [*(row["file"] for row in found), *(files[i] for i in silent.tolist())]
-            columns[name] = pd.array([names[i] for i in order.tolist()], "str")
-        else:
-            kind = "Int64" if name in ("stroke", "line") else "str"
-            columns[name] = pd.array([*(row[name] for row in found), FINE_FILE.get(name)], kind).take(finding)
-    return pd.DataFrame(columns)
 
 
 def _as_text(value: str | float | None) -> str | None:
@@ -349,9 +289,8 @@ def _as_text(value: str | float | None) -> str | None:
 # ---------------------------------------------------------------- incomplete
 # Columns of the campaign that some of its files have no value of.
 
-LEAST_KNOWN = (
-    0.8  # share of the files that have a value, from which the search for effects still looks at a column
-)
+# Share of the files that have a value, from which the search for effects still looks at a column.
+LEAST_KNOWN = 0.8
 NO_VALUE = "(no value)"  # level of a category in files without one
 CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 
@@ -375,25 +314,20 @@ def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) ->
             continue
         missing = used["file"][used[name].isna() & (aged if name in aged_only else True)].nunique()
         if 0 < missing < files:
-            reason = (
-                f"{missing} of {files} files have no value: "
-                f"{_what_follows(name, used[name], missing / files)}."
-            )
+            follows = _what_follows(name, used[name], missing / files)
+            reason = f"{missing} of {files} files have no value: {follows}."
             fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."
-            place = {"column": name, "value": float(missing), "severity": "warning", "action": "kept"}
-            faults.append(Fault("incomplete_column", reason, fix=fix, **place))
+            value = float(missing)
+            faults.append(Fault("incomplete_column", reason, column=name, value=value, fix=fix, **KEPT))
     return faults
 
 
 def _what_follows(name: str, column: pd.Series, share: float) -> str:
     if name == "load_N":
         return "the loop fits forces in place of coefficients"
-    if name in CALENDAR or (_is_number(column) and share > 1 - LEAST_KNOWN):
+    numeric = pd.api.types.is_numeric_dtype(column)
+    if name in CALENDAR or (numeric and share > 1 - LEAST_KNOWN):
         return "the search for effects leaves the column out"
-    if _is_number(column):
+    if numeric:
         return "the search for effects takes them at the mean of their run, else of all files"
     return f"they are a level of their own, {NO_VALUE}"
-
-
-def _is_number(column: pd.Series) -> bool:
-    return pd.api.types.is_numeric_dtype(column)

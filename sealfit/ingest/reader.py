@@ -13,13 +13,23 @@ import pandas as pd
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, ConfigError, Fault
 from sealfit.ingest.cells import Cells, Rows, array_cells, body_of, clean, read_cells, width_of
-from sealfit.ingest.columns import RESERVED, SLOTS, beside, channel_columns, locate, numeric_names, required
-from sealfit.ingest.expression import evaluate, parse
+from sealfit.ingest.columns import (
+    RESERVED,
+    SLOTS,
+    beside,
+    channel_columns,
+    locate,
+    missing_column,
+    numeric_names,
+    required,
+)
+from sealfit.ingest.expression import Expression, evaluate, parse
 from sealfit.ingest.file_names import TraceRef, name_parts
 from sealfit.ingest.files import (
     HEAD_BYTES,
     Layout,
     as_utf8,
+    bad_file,
     find_layout,
     header_fields,
     read_bytes,
@@ -99,20 +109,21 @@ def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list
     config : Config
         How the files are written.
     """
-    opened: list[_Opened | BadFile] = []
+    found: list[Trace | BadFile | _Opened] = []
     alike: dict[tuple, list[int]] = {}
     for i, (ref, raw) in enumerate(files):
         try:
-            opened.append(_Opened.of(raw, ref, config.trace))
-            alike.setdefault(opened[i].alike, []).append(i)
+            one = _open(raw, ref, config.trace)
+            found.append(one)
+            key = one.layout, one.width, one.settings.delimiter, bool(one.arrays)
+            alike.setdefault(key, []).append(i)
         except BadFile as error:
-            opened.append(error)
-    found: list[Trace | BadFile] = list(opened)
+            found.append(error)
     for members in alike.values():
-        made = _cells([files[i][0].file for i in members], [opened[i] for i in members])
+        made = _cells([files[i][0].file for i in members], [found[i] for i in members])
         for i, cells in zip(members, made, strict=True):
             try:
-                found[i] = _trace(cells, opened[i], files[i][0], config)
+                found[i] = _trace(cells, found[i], files[i][0], config)
             except BadFile as error:
                 found[i] = error
     return found
@@ -133,37 +144,31 @@ class _Opened:
     ours: Mapping[int, str]
     numeric: Mapping[int, str]
     settings: TraceFormat
-    arrays: tuple[np.ndarray, ...] = ()
-    faults: tuple[Fault, ...] = ()
+    arrays: tuple[np.ndarray, ...]
+    faults: tuple[Fault, ...]
 
-    @classmethod
-    def of(cls, raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Opened:
-        file, faults = ref.file, ()
-        if kind_of(file, settings) in OF_ARRAYS:
-            found = read_arrays(raw, file, settings)
-            layout, body, width = Layout(found.header, found.names, None, 0, 1), b"", len(found.columns)
-            arrays, faults = found.columns, found.faults
-        else:
-            text, layout, settings = _text(raw, file, settings)
-            if ref.cut:
-                text, fault = whole_lines(text, file)
-                faults = (fault,)
-            body = body_of(text, layout, settings, file)
-            width = width_of(body, settings.delimiter)
-            _refuse_narrow(layout, width, settings, file)
-            arrays = ()
-        try:
-            ours = locate(layout, len(layout.names) or width, settings, file)
-        except BadFile as error:
-            raise _names_below(error, layout, body, settings) from None
-        must = numeric_names(settings)
-        numeric = {i: name for i, name in ours.items() if name in must}
-        return cls(layout, body, width, ours, numeric, settings, arrays, faults)
 
-    @property
-    def alike(self) -> tuple:
-        """Files for which this is equal are parsed in one go."""
-        return self.layout, self.width, self.settings.delimiter, bool(self.arrays)
+def _open(raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Opened:
+    file, arrays, faults = ref.file, (), ()
+    if kind_of(file, settings) in OF_ARRAYS:
+        found = read_arrays(raw, file, settings)
+        arrays, faults = found.columns, found.faults
+        layout, body, width = Layout(found.header, found.names, None, 0, 1), b"", len(arrays)
+    else:
+        text, layout, settings = _text(raw, file, settings)
+        if ref.cut:
+            text, fault = whole_lines(text, file)
+            faults = (fault,)
+        body = body_of(text, layout, settings, file)
+        width = width_of(body, settings.delimiter)
+        _refuse_narrow(layout, width, settings, file)
+    try:
+        ours = locate(layout, len(layout.names) or width, settings, file)
+    except BadFile as error:
+        raise _names_below(error, layout, body, settings) from None
+    must = numeric_names(settings)
+    numeric = {i: name for i, name in ours.items() if name in must}
+    return _Opened(layout, body, width, ours, numeric, settings, arrays, faults)
 
 
 def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat, file: str) -> None:
@@ -175,8 +180,7 @@ def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat, file: str)
     if by_name and len(layout.names) > 1 and 1 < width < named:
         reason = f"the header names {named} columns, and the first line of data has {width} cells."
         fix = "Complete the header or the data: no cell can be told to be that of a name."
-        fault = _bad_file("too_few_cells", reason, file, fix)
-        raise BadFile(replace(fault, line=layout.first_line))
+        raise bad_file(file, "too_few_cells", reason, fix, line=layout.first_line)
 
 
 def _names_below(error: BadFile, layout: Layout, body: bytes, settings: TraceFormat) -> BadFile:
@@ -236,33 +240,31 @@ def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | 
 
 def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the cells of a file make; raises as `read_trace`."""
-    settings, file, layout, ours = config.trace, ref.file, opened.layout, opened.ours
-    rows = Rows({name: cells.columns[i] for i, name in ours.items() if i in cells.columns}, cells.line)
+    settings, file, layout = config.trace, ref.file, opened.layout
+    columns = {name: cells.columns[i] for i, name in opened.ours.items() if i in cells.columns}
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None:
-        named = name_parts(file, config.files, config.conversions("names")).values
-        known = {**ref.channels, **named, **header_fields(layout.header, config)}
-    faults = [*opened.faults, *cells.faults]
+        named = name_parts(file, config.files, config.conversions("names")) or {}
+        known = {**ref.channels, **named, **header_fields(layout.header, config), **settings.constants}
     good = ~cells.bad
     first = settings.drop_first_rows
     counted = max(len(good) - first, 1)
-    columns, dropped, found = channel_columns(rows.columns, good, rows.line, config, file)
-    faults += found
+    columns, dropped, found = channel_columns(columns, good, cells.line, config, file)
+    faults = [*opened.faults, *cells.faults, *found]
     columns = _in_our_units(columns, config, layout, file)
     good &= ~dropped
     bad = len(good[first:]) - int(np.count_nonzero(good[first:]))
     good[:first] = False
-    rows, wrong, found = _derive(Rows(columns, rows.line).where(good), known, settings, layout, file)
+    rows, wrong, found = _derive(Rows(columns, cells.line).where(good), known, settings, layout, file)
     faults += found
-    bad += wrong
-    faults += _too_many(bad, counted, faults, config, file)
+    _refuse_too_many(bad + wrong, counted, faults, config, file)
     if settings.keep is not None:
-        rows = rows.where(_kept(rows, known, settings, file))
+        keep = _evaluate(parse(settings.keep, condition=True), {**known, **rows.columns}, file)
+        rows = rows.where(np.broadcast_to(keep, rows.line.shape))
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
-        raise BadFile(
-            *faults, _bad_file("no_rows", reason, file, "Check drop_first_rows, keep and the export.")
-        )
+        fix = "Check drop_first_rows, keep and the export."
+        raise BadFile(*faults, bad_file(file, "no_rows", reason, fix).fault)
     if fault := speed_fault(ref, rows.columns["time_s"], rows.columns["displacement_mm"], config):
         faults.append(fault)
         if fault.action == "file left out":
@@ -277,9 +279,9 @@ def _in_our_units(
     changed = {name: convert for name, convert in config.conversions("trace").items() if name in columns}
     for name in changed:
         if columns[name].dtype.kind != "f":
+            reason = "has a unit in the rig config and holds no numbers."
             fix = "Take its unit out of [trace.columns], or export numbers."
-            fault = _bad_file("not_a_number", "has a unit in the rig config and holds no numbers.", file, fix)
-            raise BadFile(replace(fault, column=name, line=layout.names_line))
+            raise bad_file(file, "not_a_number", reason, fix, column=name, line=layout.names_line)
     return columns | {name: convert(columns[name]) for name, convert in changed.items()}
 
 
@@ -290,33 +292,23 @@ def _derive(
     speed = settings.integrate_displacement
     compute = {name: parse(text) for name, text in settings.compute.items()}
     later = _after_integral(compute) if speed else []
-    rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known, settings, file)
-    if speed:
-        # The integral needs its time and speed clean first: one bad row would shift every displacement after
-        # it.
-        if speed not in rows.columns or "time_s" not in rows.columns:
-            missing = speed if speed not in rows.columns else "time_s"
-            raise BadFile(_missing(missing, layout, file))
-        rows, bad, faults = clean(rows, ["time_s", speed, "force_N"], file)
-        rows = Rows({**rows.columns, "displacement_mm": _integral(rows, speed, settings)}, rows.line)
-        rows = _computed(rows, {name: compute[name] for name in later}, known, settings, file)
+    rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known, file)
+    if not speed:
         required(rows.columns, layout, file)
-        return rows, bad, faults
+        return clean(rows, list(SLOTS), file)
+    # The integral needs its time and speed clean first: one bad row would shift every displacement after it.
+    for name in (speed, "time_s"):
+        if name not in rows.columns:
+            fix = "Name it under [trace.columns], or compute it under [trace.compute]."
+            raise BadFile(missing_column(name, layout, file, fix))
+    rows, bad, faults = clean(rows, ["time_s", speed, "force_N"], file)
+    rows = Rows({**rows.columns, "displacement_mm": _integral(rows, speed, settings)}, rows.line)
+    rows = _computed(rows, {name: compute[name] for name in later}, known, file)
     required(rows.columns, layout, file)
-    rows, bad, faults = clean(rows, list(SLOTS), file)
     return rows, bad, faults
 
 
-def _missing(name: str, layout: Layout, file: str) -> Fault:
-    fix = "Name it under [trace.columns], or compute it under [trace.compute]."
-    return replace(
-        _bad_file("missing_column", "there is no such column.", file, fix),
-        column=name,
-        line=layout.names_line,
-    )
-
-
-def _after_integral(compute: Mapping[str, object]) -> list[str]:
+def _after_integral(compute: Mapping[str, Expression]) -> list[str]:
     """Return the computed columns that need the displacement, directly or through another one."""
     later: list[str] = []
     for name, expression in compute.items():
@@ -325,47 +317,36 @@ def _after_integral(compute: Mapping[str, object]) -> list[str]:
     return later
 
 
-def _computed(
-    rows: Rows, compute: Mapping, known: Mapping[str, object], settings: TraceFormat, file: str
-) -> Rows:
+def _computed(rows: Rows, compute: Mapping[str, Expression], known: Mapping[str, object], file: str) -> Rows:
     columns = dict(rows.columns)
     for name, expression in compute.items():
-        value = _evaluate(expression, {**known, **settings.constants, **columns}, file)
+        value = _evaluate(expression, {**known, **columns}, file)
         columns[name] = np.broadcast_to(value, rows.line.shape).astype(float)
     return Rows(columns, rows.line)
 
 
-def _evaluate(expression, values: Mapping[str, object], file: str) -> np.ndarray:
+def _evaluate(expression: Expression, values: Mapping[str, object], file: str) -> np.ndarray:
     try:
         return evaluate(expression, values)
     except ConfigError as error:
-        raise BadFile(
-            replace(_bad_file("expression", error.message, file, error.fix), column=error.column)
-        ) from error
-
-
-def _kept(rows: Rows, known: Mapping[str, object], settings: TraceFormat, file: str) -> np.ndarray:
-    values = {**known, **settings.constants, **rows.columns}
-    return np.broadcast_to(_evaluate(parse(settings.keep, condition=True), values, file), rows.line.shape)
+        raise bad_file(file, "expression", error.message, error.fix, column=error.column) from error
 
 
 def _integral(rows: Rows, speed: str, settings: TraceFormat) -> np.ndarray:
     """Return the displacement by the trapezoid rule, starting at 0; a speed per minute is divided by 60."""
-    time_s, v = (
-        rows.columns["time_s"],
-        rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0),
-    )
-    return np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(time_s))]) if len(v) else v
+    v = rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
+    steps = 0.5 * (v[1:] + v[:-1]) * np.diff(rows.columns["time_s"])
+    return np.concatenate([[0.0], np.cumsum(steps)]) if len(v) else v
 
 
-def _too_many(bad: int, counted: int, faults: list[Fault], config: Config, file: str) -> list[Fault]:
+def _refuse_too_many(bad: int, counted: int, faults: list[Fault], config: Config, file: str) -> None:
     """Raise `BadFile` if more rows are bad than the config allows."""
-    if bad <= config.quality.max_bad_rows * counted:
-        return []
-    fixes = Counter(fault.fix for fault in faults if fault.action == "row left out" and fault.fix)
-    fix = fixes.most_common(1)[0][0] if fixes else ""
-    reason = f"{bad} of {counted} rows are bad, more than {100 * config.quality.max_bad_rows:g} %."
-    raise BadFile(*faults, replace(_bad_file("too_many_bad_rows", reason, file, fix), value=float(bad)))
+    if bad > config.quality.max_bad_rows * counted:
+        fixes = Counter(fault.fix for fault in faults if fault.action == "row left out" and fault.fix)
+        fix = fixes.most_common(1)[0][0] if fixes else ""
+        reason = f"{bad} of {counted} rows are bad, more than {100 * config.quality.max_bad_rows:g} %."
+        too_many = bad_file(file, "too_many_bad_rows", reason, fix, value=float(bad))
+        raise BadFile(*faults, too_many.fault)
 
 
 def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
@@ -383,7 +364,3 @@ def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str,
             continue
         columns[beside(name, RESERVED.union(columns, ref.channels))] = values
     return columns
-
-
-def _bad_file(check: str, reason: str, file: str, fix: str) -> Fault:
-    return Fault(check, reason, file=file, action="file left out", fix=fix)

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.errors import Fault
-from sealfit.ingest.quality import FINE
+from sealfit.errors import KEPT, NOTED, STROKE_OUT, Fault
+from sealfit.ingest.quality import FINE, MEASURE_AGAIN
 from sealfit.ingest.scatter import Layout, ScatterFit, fit_scatter, repeat_means
 
 # ---------------------------------------------------------------- outlying
@@ -226,68 +226,40 @@ def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     if not against.any():
         return keep, []
     found = []
-    group = strokes.groupby(["direction", "run"], sort=False).ngroup().to_numpy()
-    runs, ways = _Leaving(force, used, group), _Leaving(force, used, strokes["direction"].to_numpy() > 0)
+    of_run, of_way = strokes.groupby(["direction", "run"]).indices, strokes.groupby("direction").indices
+    sorted_force = {key: np.sort(force[rows[used[rows]]]) for key, rows in (*of_run.items(), *of_way.items())}
     for i in np.flatnonzero(against):
-        usual = runs.median(i) if runs.others(i) >= 2 else ways.median(i)
+        row = strokes.iloc[i]
+        peers = sorted_force[row["direction"], row["run"]]
+        usual = _median_without(peers if len(peers) > 2 else sorted_force[row["direction"]], force[i])
         wrong = usual > 0.0 and force[i] < AGAINST * usual
         keep[i] = not wrong
-        found.append(_against(strokes.iloc[i], force[i], bool(wrong)))
+        found.append(_against(row, force[i], bool(wrong)))
     return keep, found
 
 
-class _Leaving:
-    """Medians of the used values of a group, one of them left out."""
-
-    def __init__(self, values: np.ndarray, used: np.ndarray, group: np.ndarray):
-        order = np.lexsort((values, group))
-        self.values, self.group = values, group
-        order = order[used[order]]
-        self.sorted, of = values[order], group[order]
-        names, first, count = np.unique(of, return_index=True, return_counts=True)
-        self.span = {
-            name: (a, a + n)
-            for name, a, n in zip(names.tolist(), first.tolist(), count.tolist(), strict=True)
-        }
-
-    def others(self, i: int) -> int:
-        """Return how many others are in the group of the used row `i`."""
-        first, last = self.span[self.group[i]]
-        return last - first - 1
-
-    def median(self, i: int) -> float:
-        """Return the median of the others in the group of the used row `i`; nan without any."""
-        first, last = self.span[self.group[i]]
-        own = first + int(np.searchsorted(self.sorted[first:last], self.values[i]))
-        n = last - first - 1
-        if n == 0:
-            return float("nan")
-        middle = [first + (n - 1) // 2, first + n // 2]
-        return float(np.mean([self.sorted[k + (k >= own)] for k in middle]))
+def _median_without(ordered: np.ndarray, value: float) -> float:
+    """Return the median of sorted values without one of them; nan without any others."""
+    n = len(ordered) - 1
+    if n == 0:
+        return math.nan
+    own = ordered.searchsorted(value)
+    return float(np.mean([ordered[k + (k >= own)] for k in ((n - 1) // 2, n // 2)]))
 
 
 def _against(row: pd.Series, force_N: float, wrong: bool) -> Fault:
-    fix = (
-        "Look for a turned sensor or a turned sign in this file."
-        if wrong
-        else "If the rig counts force the other way round, change its sign in the config: compute.force_N."
-    )
-    return Fault(
-        "reversed",
-        "the mean force has the direction of the motion"
-        + (
-            ", unlike in the other strokes."
-            if wrong
-            else ": an offset larger than the friction, or the sign convention."
-        ),
-        file=row["file"],
-        stroke=int(row["stroke"]) if row["several"] else None,
-        column="force_N",
-        value=float(force_N),
-        severity="error" if wrong else "warning",
-        action="stroke left out" if wrong else "kept",
-        fix=fix,
-    )
+    done, why = KEPT, ": an offset larger than the friction, or the sign convention."
+    fix = "If the rig counts force the other way round, change its sign in the config: compute.force_N."
+    if wrong:
+        done, why = STROKE_OUT, ", unlike in the other strokes."
+        fix = "Look for a turned sensor or a turned sign in this file."
+    reason = f"the mean force has the direction of the motion{why}"
+    return Fault("reversed", reason, **_place(row), column="force_N", value=float(force_N), fix=fix, **done)
+
+
+def _place(row: pd.Series) -> dict[str, object]:
+    """Return where a stroke is, as fields of `Fault`."""
+    return {"file": row["file"], "stroke": int(row["stroke"]) if row["several"] else None}
 
 
 def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
@@ -318,23 +290,15 @@ def _constant(row: pd.Series, dead: bool) -> Fault:
     fix = "Use a finer range if the sensor has one."
     if dead:
         check, reason = "stuck", "unlike in other strokes."
-        fix = "Check the cable and the logger, and measure again."
+        fix = MEASURE_AGAIN
     if row["force_N"] == 0.0:
         reason = "so it was not measured."
     if dead and row["extreme"]:
         check = "saturated"
         fix = f"The sensor may be at the end of its range: use a larger one. {fix}"
-    return Fault(
-        check,
-        f"the force is {row['force_N']:g} all along the steady window, {reason}",
-        file=row["file"],
-        stroke=int(row["stroke"]) if row["several"] else None,
-        column="force_N",
-        value=float(row["force_N"]),
-        severity="error" if dead else "info",
-        action="stroke left out" if dead else "kept",
-        fix=fix,
-    )
+    value, done = float(row["force_N"]), STROKE_OUT if dead else NOTED
+    reason = f"the force is {value:g} all along the steady window, {reason}"
+    return Fault(check, reason, **_place(row), column="force_N", value=value, fix=fix, **done)
 
 
 def copied_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
@@ -358,14 +322,9 @@ def copied_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
 
 
 def _copied(row: pd.Series, first: str) -> Fault:
-    return Fault(
-        "copy",
-        f"holds the samples of {first}: a copy is no second measurement.",
-        file=row["file"],
-        stroke=int(row["stroke"]) if row["several"] else None,
-        action="stroke left out",
-        fix="Export the right test, or take the file out of the campaign.",
-    )
+    reason = f"holds the samples of {first}: a copy is no second measurement."
+    fix = "Export the right test, or take the file out of the campaign."
+    return Fault("copy", reason, **_place(row), fix=fix, **STROKE_OUT)
 
 
 def turned_sign(strokes: pd.DataFrame) -> list[Fault]:
@@ -407,19 +366,11 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
         out = config.quality.drop_outliers and not row.alone
         outlier[rows] = True
         dropped[rows] |= out
-        found.append(
-            Fault(
-                "outlier",
-                _disagreement(row, config.units.unit("force")),
-                file=row.file,
-                column="force_N",
-                value=float(row.force_N),
-                severity="warning",
-                action="file left out" if out else "kept",
-                fix="Look into the notes of that test; "
-                "quality.drop_outliers in the config leaves such repeats out.",
-            )
-        )
+        reason = _disagreement(row, config.units.unit("force"))
+        fix = "Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out."
+        place = {"file": row.file, "column": "force_N", "value": float(row.force_N), "severity": "warning"}
+        action = "file left out" if out else "kept"
+        found.append(Fault("outlier", reason, action=action, fix=fix, **place))
     return steady.assign(outlier=outlier, used=steady["used"].to_numpy(bool) & ~dropped), found
 
 

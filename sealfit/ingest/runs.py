@@ -8,8 +8,8 @@ not given.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,27 +36,31 @@ from sealfit.ingest.derived_columns import (
     as_set,
     condition_keys,
     disagreements,
+    empty_cells,
     in_our_units,
+    of_its_kind,
     out_of_range,
     to_values,
     with_computed,
     with_day_0,
 )
 from sealfit.ingest.file_names import (
-    TEXT_COLUMNS,
     Listing,
     TraceRef,
+    channels_of,
     matched_part,
     name_parts,
-    names_speak,
     unmatched,
 )
-from sealfit.ingest.files import cut_files
+from sealfit.ingest.files import bad_file, cut_files
 from sealfit.ingest.formats import kind_of, require_libraries
-from sealfit.ingest.listing import Entries, list_entries
+from sealfit.ingest.listing import Entry, list_entries
 from sealfit.ingest.reader import read_header, read_trace
 from sealfit.ingest.start_times import add_order, join_date_and_time
 from sealfit.ingest.trace_checks import measured_speed, speed_factor
+
+# Columns that are taken from a constant column of a trace where nothing else gives them.
+FROM_TRACES = ("run_id", "repeat", "specimen_id", "started_at", "speed_mm_s")
 
 
 def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
@@ -83,7 +87,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
         _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
     if not entries:
         raise CampaignError([*faults, _nothing_left()])
-    require_libraries(entries.files, config.trace)
+    require_libraries([entry.file for entry in entries], config.trace)
     kept, named, found = _named(entries, config)
     faults += found
     entries, cells = _kept(kept, entries, cells)
@@ -95,14 +99,13 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     faults += found
     columns, found = with_computed(entries, columns, config)
     faults += found
-    needed = _Needed.of(config)
-    columns, measured, left_out, found = _from_traces(campaign, entries, columns, config, needed)
-    kept = np.flatnonzero([i not in left_out for i in range(len(entries))])
-    if not len(kept):
+    columns, measured, left_out, found = _from_traces(campaign, entries, columns, config)
+    kept = [i for i in range(len(entries)) if i not in left_out]
+    if not kept:
         raise CampaignError([*faults, *found, _nothing_left()])
     entries, columns = _kept(kept, entries, columns)
-    columns, measured = in_order(columns), [measured[i] for i in kept.tolist()]
-    faults += found + _missing(entries, columns, needed) + out_of_range(entries, columns)
+    columns, measured = in_order(columns), [measured[i] for i in kept]
+    faults += found + _missing(entries, columns, config) + out_of_range(entries, columns)
     columns, found = add_order(entries, columns, config)
     faults += found
     _stop_at_errors(faults)
@@ -113,14 +116,13 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     columns = add_repeats(add_specimens(columns, conditions))
     faults += disagreements(entries, columns, conditions)
     _stop_at_errors(faults)
-    cut = cut_files(campaign, [file for file in entries.files if kind_of(file, config.trace) == "csv"])
-    return Listing(entries.files, _set_speed(columns), conditions, cut), faults
+    files = [entry.file for entry in entries]
+    cut = cut_files(campaign, [file for file in files if kind_of(file, config.trace) == "csv"])
+    return Listing(files, _set_speed(columns), conditions, cut), faults
 
 
-def _kept(files: np.ndarray, entries: Entries, columns: Columns) -> tuple[Entries, Columns]:
-    if len(files) == len(entries):
-        return entries, columns
-    return entries.take(files), taken(columns, files.tolist())
+def _kept(files: list[int], entries: list[Entry], columns: Columns) -> tuple[list[Entry], Columns]:
+    return [entries[i] for i in files], taken(columns, files)
 
 
 def _nothing_left() -> Fault:
@@ -146,35 +148,23 @@ def _stop_at_errors(faults: Sequence[Fault]) -> None:
 def _config_faults(config: Config) -> list[Fault]:
     """Return what is wrong with the config by itself, before any file is opened."""
     settings, faults = config.trace, []
+    encoding, delimiter = settings.encoding, settings.delimiter
 
     def add(column: str, value: str, reason: str, fix: str) -> None:
-        faults.append(
-            Fault("config", reason, file=f"config '{config.name}'", column=column, value=value, fix=fix)
-        )
+        place = {"file": f"config '{config.name}'", "column": column, "value": value}
+        faults.append(Fault("config", reason, fix=fix, **place))
 
-    if not _is_encoding(settings.encoding):
-        add("trace.encoding", settings.encoding, "is not an encoding.", "Use auto, utf-8, latin-1 or utf-16.")
-    if not _is_delimiter(settings.delimiter):
-        add(
-            "trace.delimiter",
-            settings.delimiter,
-            "is not a delimiter.",
-            "Use one character, 'tab' or 'whitespace'.",
-        )
-    if settings.delimiter == settings.decimal:
-        add(
-            "trace.delimiter",
-            settings.delimiter,
-            "is the decimal mark too.",
-            "Set trace.delimiter or trace.decimal.",
-        )
+    if not _is_encoding(encoding):
+        add("trace.encoding", encoding, "is not an encoding.", "Use auto, utf-8, latin-1 or utf-16.")
+    if not _is_delimiter(delimiter):
+        fix = "Use one character, 'tab' or 'whitespace'."
+        add("trace.delimiter", delimiter, "is not a delimiter.", fix)
+    if delimiter == settings.decimal:
+        fix = "Set trace.delimiter or trace.decimal."
+        add("trace.delimiter", delimiter, "is the decimal mark too.", fix)
     for name in sorted({"file", "speed_mm_s"} & set(config.condition)):
-        add(
-            "condition",
-            name,
-            "cannot be a condition column: it differs within a condition.",
-            "Take it out of condition.",
-        )
+        reason = "cannot be a condition column: it differs within a condition."
+        add("condition", name, reason, "Take it out of condition.")
     named = {ours: theirs for ours, theirs in settings.their_columns.items() if isinstance(theirs, str)}
     for ours, theirs in named.items() if settings.names == "none" else ():
         fix = "Give its position, counted from 1, or names = 'header'."
@@ -203,91 +193,73 @@ def _is_delimiter(text: str) -> bool:
     return len(text) == 1 and text not in '"\n\r ' and not text.isalnum()
 
 
-def _named(entries: Entries, config: Config) -> tuple[np.ndarray, Columns, list[Fault]]:
+def _named(entries: list[Entry], config: Config) -> tuple[list[int], Columns, list[Fault]]:
     """Return which files to keep, by their numbers, what their names say, and findings.
 
     A file found by the glob whose name says nothing is left out.
     """
-    if not names_speak(config.files):
-        return np.arange(len(entries)), {}, []
     kept, parts, faults = [], [], []
     for i, entry in enumerate(entries):
         try:
             named = name_parts(entry.file, config.files, config.conversions("names"))
         except ConfigError as error:
-            raise CampaignError(
-                [entry.fault("file_name", error.message, error.column, fix=error.fix)]
-            ) from error
-        if not named.matched:
-            listed = entry.line is not None
+            fault = entry.fault("file_name", error.message, error.column, fix=error.fix)
+            raise CampaignError([fault]) from error
+        listed = entry.line is not None
+        if named is None:
             reason, fix = unmatched(entry.file, config.files.name_pattern)
             place = {"severity": "warning", "action": "kept" if listed else "file left out", "fix": fix}
             faults.append(Fault("not_matched", reason, file=entry.file, **place))
-            if not listed:
-                continue
-        kept.append(i)
-        parts.append(named.channels)
+        if named is not None or listed:
+            kept.append(i)
+            parts.append(channels_of(named))
     if not kept:
         pattern = config.files.name_pattern
         nearest = max(faults, key=lambda fault: len(pattern) - len(matched_part(pattern, fault.file)[1]))
         reason = f"none of {len(entries)} files is matched; of this one, the nearest, {nearest.reason}"
         raise CampaignError([replace(nearest, reason=reason, severity="error", action="stopped")])
-    return np.array(kept), columns_of(parts), faults
+    return kept, columns_of(parts), faults
 
 
-def _headers(campaign: Path, entries: Entries, config: Config) -> Columns:
-    """Return what header lines say."""
-    if not config.trace.header_fields:
-        return {}
-    return columns_of([_header(campaign, file, config) for file in entries.files])
+def _headers(campaign: Path, entries: list[Entry], config: Config) -> Columns:
+    """Return what header lines say; nothing of a file that cannot be read: reading it will say why."""
+    rows = []
+    for entry in entries if config.trace.header_fields else ():
+        try:
+            found = read_header(campaign, entry.file, config)
+        except BadFile:
+            found = {}
+        rows.append({name: value for name, value in channels_of(found).items() if value != ""})
+    return columns_of(rows)
 
 
-def _header(campaign: Path, file: str, config: Config) -> Mapping[str, float | str]:
-    """Return what the header lines say; nothing of a file that cannot be read: reading it will say why."""
-    try:
-        found = read_header(campaign, file, config)
-    except BadFile:
-        return {}
-    return {name: value for name, value in found.items() if not name.startswith("_") and value != ""}
+def _lacking(columns: Columns, files: int, config: Config) -> dict[str, np.ndarray]:
+    """Return which of so many files lack each condition column, shape (files,).
 
-
-@dataclass(frozen=True, slots=True)
-class _Needed:
-    """The condition columns that a file must have; unaged rubber needs only the days and the rubber."""
-
-    aged: tuple[str, ...]
-    unaged: tuple[str, ...]
-
-    @classmethod
-    def of(cls, config: Config) -> _Needed:
-        aged = tuple(condition_columns(config))
-        return cls(aged, ("aging_days", *config.rubber) if config.aging else aged)
-
-    def missing(self, columns: Columns, files: int) -> dict[str, np.ndarray]:
-        """Return which of so many files lack each of them, shape (files,)."""
-        none = [None] * files
-        unaged = where(columns.get("aging_days", none), lambda days: days == 0)
-        return {
-            name: ~known(columns.get(name, none)) & (~unaged | (name in self.unaged)) for name in self.aged
-        }
+    Unaged rubber needs only the days and the rubber.
+    """
+    none, names = [None] * files, condition_columns(config)
+    unaged = where(columns.get("aging_days", none), lambda days: days == 0)
+    always = ("aging_days", *config.rubber) if config.aging else names
+    return {name: ~known(columns.get(name, none)) & (~unaged | (name in always)) for name in names}
 
 
 def _from_traces(
-    campaign: Path, entries: Entries, columns: Columns, config: Config, needed: _Needed
+    campaign: Path, entries: list[Entry], columns: Columns, config: Config
 ) -> tuple[Columns, list[float], set[int], list[Fault]]:
     """Return the columns with what constant columns of traces add, reading only files that lack something.
 
     Also the measured speed of each file read (nan of the others), the files to leave out, and their faults.
     """
     none = [None] * len(entries)
-    lacking = needed.missing(columns, len(entries))
+    lacking = _lacking(columns, len(entries), config)
     runs = known(columns.get("run_id", none)) | known(columns.get("speed_mm_s", none))
     added: dict[str, dict[int, float | str]] = {}
     measured = [math.nan] * len(entries)
     left_out: set[int] = set()
     faults: list[Fault] = []
     for i in np.flatnonzero(np.any([~runs, *lacking.values()], axis=0)).tolist():
-        wanted, file = [name for name, lack in lacking.items() if lack[i]], entries.files[i]
+        wanted, file = [name for name, lack in lacking.items() if lack[i]], entries[i].file
         try:
             table = read_trace(campaign, TraceRef(file, {}), config).table
         except BadFile as error:
@@ -297,54 +269,35 @@ def _from_traces(
             continue
         _, plateau = measured_speed(table["time_s"].to_numpy(), table["displacement_mm"].to_numpy())
         measured[i] = plateau * speed_factor(config.units)
-        sources = {
-            name: beside(name, RESERVED)
-            for name in ("run_id", "repeat", "specimen_id", "started_at", "speed_mm_s")
-        }
-        sources |= {name: name for name in wanted}
+        sources = {name: beside(name, RESERVED) for name in FROM_TRACES} | {name: name for name in wanted}
         for name, column in sources.items():
             if columns.get(name, none)[i] is not None or column not in table:
                 continue
             values = table[column]
             if (values == values.iloc[0]).all():
-                added.setdefault(name, {})[i] = _constant(name, values.iloc[0])
+                value = values.iloc[0]
+                constant = value if isinstance(value, str) else of_its_kind(name, float(value))
+                added.setdefault(name, {})[i] = constant
             elif name in wanted:
-                reason = (
-                    f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
-                )
+                span = f"{values.min()} to {values.max()}"
+                reason = f"varies within the file, {span}; a condition is one value."
                 fix = "Write the value that was set into runs.csv."
-                place = {"file": file, "column": name, "action": "file left out", "fix": fix}
-                faults.append(Fault("condition_varies", reason, **place))
+                faults += bad_file(file, "condition_varies", reason, fix, column=name).faults
                 left_out.add(i)
     whole = {**columns, **{name: put(columns.get(name, none), values) for name, values in added.items()}}
     return whole, measured, left_out, faults
 
 
-def _constant(name: str, value: float | str) -> float | str:
-    if name == "repeat" and not isinstance(value, str):
-        return int(value)
-    if name in TEXT_COLUMNS and not isinstance(value, str):
-        return f"{value:g}"
-    return value if isinstance(value, str) else float(value)
-
-
-def _missing(entries: Entries, columns: Columns, needed: _Needed) -> list[Fault]:
+def _missing(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:
     """Return faults of condition columns that no source gives: one per column, or one per cell."""
-    faults = []
-    lacking = {name: np.flatnonzero(lack) for name, lack in needed.missing(columns, len(entries)).items()}
+    faults, table = [], entries[0].table if entries[0].line is not None else None
+    lacking = {name: np.flatnonzero(lack) for name, lack in _lacking(columns, len(entries), config).items()}
     for name, rows in sorted(lacking.items(), key=lambda one: one[1][:1].tolist()):
         if name in columns:
-            for i in rows.tolist():
-                fix = "Fill it: it is one of the config's condition columns."
-                faults.append(entries[i].fault("empty_cell", "the cell is empty.", name, value="", fix=fix))
+            faults += empty_cells(entries, name, rows)
         elif len(rows):
             reason = "there is no such column in runs.csv, file names, header lines or traces."
             fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
-            place = {
-                "file": entries.table if entries.lines is not None else None,
-                "line": 1 if entries.lines is not None else None,
-                "column": name,
-                "fix": fix.strip(),
-            }
-            faults.append(Fault("missing_column", reason, **place))
+            place = {"file": table, "line": 1 if table else None, "column": name}
+            faults.append(Fault("missing_column", reason, fix=fix.strip(), **place))
     return faults

@@ -14,7 +14,7 @@ from sealfit.errors import Fault
 from sealfit.ingest.categorical import Column, Columns, mapped
 from sealfit.ingest.columns import suggestion
 from sealfit.ingest.files import as_number
-from sealfit.ingest.listing import Entries
+from sealfit.ingest.listing import Entry
 
 EXCEL_DAY_0 = datetime(1899, 12, 30)
 EXCEL_DAYS = (32874, 73415)  # 1990 to 2100: other numbers are hours, or seconds, or no times at all
@@ -22,12 +22,12 @@ _USUAL = ("%d.%m.%Y", "%d/%m/%Y", "%m/%d/%Y", "%Y/%m/%d", "%d.%m.%y", "%d-%m-%Y"
 _CLOCKS = (" %H:%M:%S", " %H:%M", " %I:%M:%S %p", " %I:%M %p", "", "T%H:%M:%S", "_%H%M%S", "_%H%M")
 
 
-def join_date_and_time(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
+def join_date_and_time(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
     """Return the columns with `started_at` in place of the config's date and time; faults of these."""
     two = config.files.started_at
     if two is None:
         return columns, []
-    place = {"file": "runs.csv", "line": 1} if entries.lines is not None else {}
+    place = {"file": "runs.csv", "line": 1} if entries[0].line is not None else {}
     missing = [name for name in (two.date, two.time) if name not in columns]
     if missing:
         reason = "there is no such column, but files.started_at names it."
@@ -51,7 +51,7 @@ def join_date_and_time(entries: Entries, columns: Columns, config: Config) -> tu
     return rest | {"started_at": joined}, faults
 
 
-def add_order(entries: Entries, columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
+def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
     """Return the columns with `run_order` and `elapsed_h` where files have start times; faults of bad times.
 
     Times in one of the config's formats, and Excel's serial numbers, become ISO 8601. Equal times share the

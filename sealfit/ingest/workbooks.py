@@ -8,7 +8,8 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -16,8 +17,8 @@ from xml.etree import ElementTree
 
 from sealfit.config import Config
 from sealfit.errors import nearest
-from sealfit.ingest.files import as_utf8, read_bytes
-from sealfit.ingest.formats import CALLED, bad, damage_named, kind_of, library, value_text
+from sealfit.ingest.files import as_utf8, bad_file, read_bytes
+from sealfit.ingest.formats import CALLED, damage_named, kind_of, library, value_text
 
 # ---------------------------------------------------------------- sheets
 
@@ -44,7 +45,7 @@ class Sheet:
             if last >= first_row:
                 fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
                 row = int(re.findall(r"\d+", reference)[0])
-                raise bad(file, "merged_cells", f"the cells {reference} are merged.", fix, line=row)
+                raise bad_file(file, "merged_cells", f"the cells {reference} are merged.", fix, line=row)
 
 
 def read_sheet(
@@ -83,42 +84,39 @@ def read_sheet(
     _refuse_others(raw, file)
     openpyxl = library("openpyxl", file)
     with damage_named(file, "xlsx"):
-        with _Book(openpyxl, raw, formulas=True) as book:
+        with _book(openpyxl, raw, formulas=True) as book:
             title = _title(book, sheet, first, file)
             lines, formulas = _lines(book[title], decimal, head)
         if formulas:
-            with _Book(openpyxl, raw, formulas=False) as book:
+            with _book(openpyxl, raw, formulas=False) as book:
                 lines, _ = _lines(book[title], decimal, head)
                 _refuse_unsaved(book[title], formulas, openpyxl.utils.get_column_letter, file)
         return Sheet("\n".join(lines).encode("utf-8", "replace"), () if head else _merged(raw, title))
 
 
-class _Book:
-    """An open workbook, read row by row, with its formulas or with the values that Excel kept of them."""
-
-    def __init__(self, openpyxl, raw: bytes, *, formulas: bool):
-        options = {"read_only": True, "data_only": not formulas, "keep_links": False}
-        self.book = openpyxl.load_workbook(io.BytesIO(raw), **options)
-
-    def __enter__(self):
-        for sheet in self.book.worksheets:
+@contextmanager
+def _book(openpyxl, raw: bytes, *, formulas: bool) -> Iterator:
+    """Open a workbook to be read row by row, with its formulas or with the values that Excel kept of them."""
+    options = {"read_only": True, "data_only": not formulas, "keep_links": False}
+    book = openpyxl.load_workbook(io.BytesIO(raw), **options)
+    try:
+        for sheet in book.worksheets:
             sheet.reset_dimensions()  # some writers note a size that is not so
-        return self.book
-
-    def __exit__(self, *_):
-        self.book.close()
+        yield book
+    finally:
+        book.close()
 
 
 def _refuse_others(raw: bytes, file: str) -> None:
     if not raw.startswith(_OLE):
         if not raw.startswith(b"PK"):
             fix = "Export it again, or name it for what it is."
-            raise bad(file, "binary_file", "is not an Excel workbook (.xlsx).", fix)
+            raise bad_file(file, "binary_file", "is not an Excel workbook (.xlsx).", fix)
         return
     if _ENCRYPTED in raw:
         fix = "Save it without (File > Info > Protect Workbook > Encrypt with Password)."
-        raise bad(file, "binary_file", "is protected by a password.", fix)
-    raise bad(file, "binary_file", "is a workbook of old Excel (.xls).", "Save it as .xlsx.")
+        raise bad_file(file, "binary_file", "is protected by a password.", fix)
+    raise bad_file(file, "binary_file", "is a workbook of old Excel (.xls).", "Save it as .xlsx.")
 
 
 def _title(book, wanted: str | int | None, first: bool, file: str) -> str:
@@ -127,27 +125,22 @@ def _title(book, wanted: str | int | None, first: bool, file: str) -> str:
     if isinstance(wanted, int):
         if 0 < wanted <= len(titles):
             return titles[wanted - 1]
-        raise bad(
-            file, "missing_sheet", f"there is no sheet {wanted}: it has {len(titles)}.", _listed(titles)
-        )
+        reason = f"there is no sheet {wanted}: it has {len(titles)}."
+        raise bad_file(file, "missing_sheet", reason, _listed(titles))
+    if wanted in titles:
+        return wanted
     if wanted is not None:
-        if wanted in titles:
-            return wanted
         close = nearest(wanted, titles)
-        raise bad(
-            file,
-            "missing_sheet",
-            f"there is no sheet '{wanted}'.",
-            f"Did you mean '{close}'?" if close else _listed(titles),
-        )
+        fix = f"Did you mean '{close}'?" if close else _listed(titles)
+        raise bad_file(file, "missing_sheet", f"there is no sheet '{wanted}'.", fix)
     if first and titles:
         return titles[0]
     filled = [sheet.title for sheet in book.worksheets if _is_filled(sheet)]
     if not filled:
-        raise bad(file, "empty_file", "has no sheet with cells.", "Export it again.")
+        raise bad_file(file, "empty_file", "has no sheet with cells.", "Export it again.")
     if len(filled) > 1:
         fix = f"Choose one in the rig config: sheet = {filled[0]!r} under [trace]. {_listed(filled)}"
-        raise bad(file, "several_tables", f"has {len(filled)} sheets with cells.", fix)
+        raise bad_file(file, "several_tables", f"has {len(filled)} sheets with cells.", fix)
     return filled[0]
 
 
@@ -199,7 +192,7 @@ def _refuse_unsaved(sheet, formulas: list[tuple[int, int]], letter: Callable[[in
             if value is None and (number, place) in places:
                 reason = "the cell holds a formula whose value was not saved."
                 fix = "Open it in Excel and save it, or paste values over the formulas."
-                raise bad(file, "formula", reason, fix, line=number, column=letter(place))
+                raise bad_file(file, "formula", reason, fix, line=number, column=letter(place))
 
 
 def _merged(raw: bytes, title: str) -> tuple[tuple[str, int], ...]:
@@ -251,7 +244,7 @@ def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]
         sheet.check(1, file)
         return sheet.text, "\t"
     fix = "Save it as .csv, .xlsx or .parquet."
-    raise bad(file, "binary_file", f"is {CALLED[kind]}, which is no table of runs.", fix)
+    raise bad_file(file, "binary_file", f"is {CALLED[kind]}, which is no table of runs.", fix)
 
 
 def _parquet_text(raw: bytes) -> bytes:
