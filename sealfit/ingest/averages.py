@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
 
 from sealfit.config import Bins
-from sealfit.ingest.segments import Pieces, median
 
 # ---------------------------------------------------------------- average
 
@@ -65,10 +65,10 @@ def _slow_tau(centred: np.ndarray) -> float:
     return float(tau[inside[0]] if len(inside) else tau.max())
 
 
-def mean_by_group(values: np.ndarray, group: np.ndarray, groups: int, count: np.ndarray) -> np.ndarray:
-    """Return the mean of `values` in each group, shape (groups,), of `count` samples each; NaN for none."""
+def mean_by_group(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return the mean of `values` in each group; NaN for a group without any."""
     with np.errstate(invalid="ignore"):
-        return np.bincount(group, values, minlength=groups) / count
+        return np.bincount(group, values) / np.bincount(group)
 
 
 def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
@@ -81,6 +81,16 @@ def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.nd
     owner, label = np.divmod(pairs[order], max(len(labels), 1))
     made[owner] = np.asarray(labels, object)[label] if len(labels) else None
     return made
+
+
+def _strokes_by_run(row: np.ndarray, run_id: Sequence[str]) -> list[list[tuple[int, slice]]]:
+    """Return the strokes of each run and where their samples lie; `row` is each sample's stroke, rising."""
+    edges = [*np.flatnonzero(np.diff(row, prepend=-1)).tolist(), len(row)]
+    runs: dict[str, list[tuple[int, slice]]] = {}
+    for start, stop in pairwise(edges):
+        stroke = int(row[start])
+        runs.setdefault(run_id[stroke], []).append((stroke, slice(start, stop)))
+    return list(runs.values())
 
 
 def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, np.ndarray]:
@@ -108,84 +118,44 @@ def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, n
         `row`, `bin` (from 0 in the direction of motion), `n`, `force_sd_N`, and the mean of every column of
         `samples`.
     """
-    row, own = owners(samples["row"])
-    run, runs = _numbered(strokes["run_id"], row)
-    back = np.asarray(strokes["direction"])[row] < 0
-    group, width = _bin_of(np.asarray(samples["displacement_mm"]), own, run, runs, back, settings)
-    group, count = _joined(group, len(own), width, settings.min_samples)
-    groups, shown = len(count), np.flatnonzero(count)
-    made = {"row": row[shown // width], "bin": shown % width, "n": count[shown]}
+    row, x = samples["row"], np.asarray(samples["displacement_mm"])
+    bins = np.zeros(len(row), int)
+    for run in _strokes_by_run(row, strokes["run_id"]):
+        low, high = min(x[own].min() for _, own in run), max(x[own].max() for _, own in run)
+        typical = np.median([own.stop - own.start for _, own in run])
+        # Half as many again as needed on average, since samples do not fall into bins evenly.
+        count = int(np.clip(typical // np.ceil(1.5 * settings.min_samples), 1, settings.per_stroke))
+        width = (high - low) / count if high > low else np.inf  # all in the first bin
+        for stroke, own in run:
+            place = np.minimum(((x[own] - low) / width).astype(int), count - 1)
+            place = count - 1 - place if strokes["direction"][stroke] < 0 else place
+            bins[own] = _joined(place, settings.min_samples)
+    bin_of_stroke, group = np.unique(row * settings.per_stroke + bins, return_inverse=True)
+    n = np.bincount(group)
+    made = {"row": bin_of_stroke // settings.per_stroke, "bin": bin_of_stroke % settings.per_stroke, "n": n}
     for name in samples:
         values = np.asarray(samples[name])
         if name == "row":
             continue
         if values.dtype.kind in "fiub":
-            made[name] = mean_by_group(values.astype(float, copy=False), group, groups, count)[shown]
+            made[name] = mean_by_group(values.astype(float, copy=False), group)
         else:
-            made[name] = common_by_group(values, group, groups)[shown]
-    force = np.asarray(samples["force_N"])
-    off = force - mean_by_group(force, group, groups, count)[group]
-    square, n = np.bincount(group, off * off, minlength=groups)[shown], count[shown]
+            made[name] = common_by_group(values, group, len(n))
+    square = np.bincount(group, (samples["force_N"] - made["force_N"][group]) ** 2)
     made["force_sd_N"] = np.sqrt(np.divide(square, n - 1.0, out=np.full(len(n), np.nan), where=n > 1))
     return made
 
 
-def owners(row: np.ndarray) -> tuple[np.ndarray, Pieces]:
-    """Return the strokes with samples, and where those of each lie; `row` is each sample's stroke, rising."""
-    count = np.bincount(row)
-    there = np.flatnonzero(count)
-    return there, Pieces(count[there])
-
-
-def _numbered(labels: Sequence[str], rows: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return a number for the label of each of these rows, as they appear, and how many labels there are."""
-    codes, different = pd.factorize(np.array(labels, object)[rows])
-    return codes, len(different)
-
-
-def _bin_of(
-    x: np.ndarray, own: Pieces, run: np.ndarray, runs: int, back: np.ndarray, settings: Bins
-) -> tuple[np.ndarray, int]:
-    """Return the bin of every sample, counted through all strokes, and how many each stroke has room for."""
-    low, high = range_of_runs(own.min(x), own.max(x), run, runs)
-    typical = np.array([median(own.size[run == i].astype(float)) for i in range(runs)])
-    # Half as many again as needed on average, since samples do not fall into bins evenly.
-    bins = np.clip(typical // np.ceil(1.5 * settings.min_samples), 1, settings.per_stroke).astype(int)
-    width = (high - low) / bins
-    width[width <= 0.0] = np.inf  # all in the first bin
-    place = ((x - own.spread(low[run])) / own.spread(width[run])).astype(int)
-    np.minimum(place, own.spread(bins[run] - 1), out=place)
-    room = int(bins.max())
-    first = np.arange(len(own)) * room + np.where(back, bins[run] - 1, 0)
-    return own.spread(first) + np.where(own.spread(back), -place, place), room
-
-
-def range_of_runs(
-    low: np.ndarray, high: np.ndarray, run: np.ndarray, runs: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest value of every run, shape (runs,), from those of its strokes."""
-    least, largest = np.full(runs, np.inf), np.full(runs, -np.inf)
-    np.minimum.at(least, run, low)
-    np.maximum.at(largest, run, high)
-    return least, largest
-
-
-def _joined(group: np.ndarray, strokes: int, width: int, least: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the group of every sample after thin bins joined their nearest neighbour, and the counts."""
-    count = np.bincount(group, minlength=strokes * width)
-    thin = np.flatnonzero((count > 0) & (count < least))
-    if not len(thin):
-        return group, count
-    target = np.arange(strokes * width)
-    for stroke in np.unique(thin // width):
-        own = np.arange(stroke * width, (stroke + 1) * width)
-        full = own[count[own] >= least]
-        if not len(full):  # a stroke as short as that is one bin
-            full = own[[int(np.argmax(count[own]))]]
-        for one in own[(count[own] > 0) & (count[own] < least)]:
-            target[one] = full[int(np.argmin(np.abs(full - one)))]
-    group = target[group]
-    return group, np.bincount(group, minlength=strokes * width)
+def _joined(bins: np.ndarray, least: int) -> np.ndarray:
+    """Return the bin of every sample of a stroke after thin bins joined their nearest neighbour."""
+    count = np.bincount(bins)
+    full = np.flatnonzero(count >= least)
+    if not len(full):  # a stroke as short as that is one bin
+        full = np.array([count.argmax()])
+    target = np.arange(len(count))
+    for thin in np.flatnonzero((count > 0) & (count < least)):
+        target[thin] = full[np.abs(full - thin).argmin()]
+    return target[bins]
 
 
 # ---------------------------------------------------------------- mean traces
@@ -216,119 +186,90 @@ def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
     dict of str to ndarray
         What table `traces_mean` holds of numbers, and `row`, the first stroke of the run.
     """
-    row, own = owners(samples["row"])
-    (run, runs), (file, files) = (_numbered(strokes[name], row) for name in ("run_id", "file"))
-    back = np.asarray(strokes["direction"])[row] < 0
-    low, step, cells = _grid(np.asarray(samples["displacement_mm"]), own, run, runs)
-    # The cells of every stroke, and of every run, end to end.
-    grid, places = Pieces(cells[run]), Pieces(cells)
-    force, steady = _of_cells(samples, own, grid, low[run], step[run])
-    force, steady = _bridged(force, steady, grid)
-    known = np.flatnonzero(np.isfinite(force))
-    owner, force, steady = grid.of[known], force[known], steady[known]
-    cell = known - grid.start[owner]
-    spot = places.start[run][owner] + cell
-    keep, somewhere = _comparable(spot, places.rows, steady, _travel(cell, owner, back))
-    owner, spot, force = owner[keep], spot[keep], force[keep]
-    strokes_there = np.bincount(spot, minlength=places.rows)
-    if files < len(row):
-        spot, force = _one_per_file(spot, file[owner], files, force)
-    count = np.bincount(spot, minlength=places.rows)
-    mean = mean_by_group(force, spot, places.rows, count)
-    square = np.bincount(spot, (force - mean[spot]) ** 2, minlength=places.rows)
-    error = np.sqrt(
-        np.divide(square, (count - 1.0) * count, out=np.full(places.rows, np.nan), where=count > 1)
-    )
-    shown = np.flatnonzero(count)
-    of = places.of[shown]
-    return {
-        "row": row[np.unique(run, return_index=True)[1]][of],
-        "displacement_mm": low[of] + (shown - places.start[of] + 0.5) * step[of],
-        "force_N": mean[shown],
-        "force_se_N": error[shown],
-        "n": strokes_there[shown],
-        "steady": somewhere[shown],
-    }
+    names = ("displacement_mm", "force_N", "steady")
+    x, force, steady = (np.asarray(samples[name]) for name in names)
+    made = []
+    for run in _strokes_by_run(samples["row"], strokes["run_id"]):
+        low, step, cells = _grid([x[own] for _, own in run])
+        each = [
+            _of_cells(((x[own] - low) / step).astype(int), force[own], steady[own], cells) for _, own in run
+        ]
+        back = np.array([strokes["direction"][stroke] < 0 for stroke, _ in run])
+        of_strokes, steady_cell = (np.array(values) for values in zip(*each, strict=True))
+        keep = _comparable(np.isfinite(of_strokes), steady_cell, back)
+        mean, error = _over_files(np.where(keep, of_strokes, 0.0), keep, [strokes["file"][i] for i, _ in run])
+        shown = np.flatnonzero(keep.any(axis=0))
+        made.append(
+            {
+                "row": np.full(len(shown), run[0][0]),
+                "displacement_mm": low + (shown + 0.5) * step,
+                "force_N": mean[shown],
+                "force_se_N": error[shown],
+                "n": keep.sum(axis=0)[shown],
+                "steady": (keep & steady_cell).any(axis=0)[shown],
+            }
+        )
+    return {name: np.concatenate([run[name] for run in made]) for name in made[0]}
 
 
-def _grid(
-    x: np.ndarray, own: Pieces, run: np.ndarray, runs: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return start, step and number of the cells of every run."""
-    start, stop = own.min(x), own.max(x)
-    low, high = range_of_runs(start, stop, run, runs)
-    span = np.where(high > low, high - low, 1.0)
-    usual = (stop - start) / np.maximum(own.size - 1.0, 1.0)
-    widest = np.zeros(runs)
-    np.maximum.at(widest, run, usual)
-    step = np.maximum(np.where(widest > 0.0, widest, span), span / MAX_CELLS)
-    cells = np.maximum(np.ceil(span / step * (1.0 - 1e-9)), 1).astype(int)
+def _grid(places: Sequence[np.ndarray]) -> tuple[float, float, int]:
+    """Return start, step and number of the cells of a run, from the displacements of its strokes."""
+    low, high = min(x.min() for x in places), max(x.max() for x in places)
+    span = high - low if high > low else 1.0
+    widest = max((x.max() - x.min()) / max(len(x) - 1.0, 1.0) for x in places)
+    step = max(widest if widest > 0.0 else span, span / MAX_CELLS)
+    cells = max(math.ceil(span / step * (1.0 - 1e-9)), 1)
     return low, span / cells, cells
 
 
 def _of_cells(
-    samples: Samples, own: Pieces, grid: Pieces, low: np.ndarray, step: np.ndarray
+    cell: np.ndarray, force: np.ndarray, steady: np.ndarray, cells: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean force in each cell of each stroke, NaN if empty, and whether all samples are steady."""
-    x = np.asarray(samples["displacement_mm"])
-    cell = ((x - own.spread(low)) / own.spread(step)).astype(int)
-    np.minimum(cell, own.spread(grid.size - 1), out=cell)
-    cell += own.spread(grid.start)
-    force = mean_by_group(
-        np.asarray(samples["force_N"]), cell, grid.rows, np.bincount(cell, minlength=grid.rows)
-    )
-    unsteady = cell[~np.asarray(samples["steady"], bool)]
-    return force, np.bincount(unsteady, minlength=grid.rows) == 0
+    """Return a stroke's mean force in each cell, NaN if empty, and whether all samples there are steady.
 
-
-def _bridged(force: np.ndarray, steady: np.ndarray, grid: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """Return force and steady flag with short runs of a stroke's empty cells filled along a straight line."""
-    full = np.flatnonzero(np.isfinite(force))
+    Short runs of empty cells are filled along a straight line.
+    """
+    cell = np.minimum(cell, cells - 1)
+    count = np.bincount(cell, minlength=cells)
+    with np.errstate(invalid="ignore"):
+        mean = np.bincount(cell, force, cells) / count
+    all_steady = np.bincount(cell[~steady], minlength=cells) == 0
+    full = np.flatnonzero(count)
     missing = np.diff(full) - 1
     short = np.flatnonzero((missing > 0) & (missing <= BRIDGED))
-    short = short[grid.of[full[short]] == grid.of[full[short + 1]]]
-    gaps = Pieces(missing[short])
-    left, right = gaps.spread(full[short]), gaps.spread(full[short + 1])
-    empty = left + 1 + np.arange(gaps.rows) - gaps.spread(gaps.start)
-    share = (empty - left) / (right - left)
-    force, steady = force.copy(), steady.copy()
-    force[empty] = (1.0 - share) * force[left] + share * force[right]
-    steady[empty] = steady[left] & steady[right]
-    return force, steady
+    for left, right in zip(full[short], full[short + 1], strict=True):
+        empty = np.arange(left + 1, right)
+        share = (empty - left) / (right - left)
+        mean[empty] = (1.0 - share) * mean[left] + share * mean[right]
+        all_steady[empty] = all_steady[left] & all_steady[right]
+    return mean, all_steady
 
 
-def _travel(cell: np.ndarray, owner: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return how many cells each known cell lies behind its stroke's start, along the motion."""
-    own = Pieces(np.bincount(owner))  # every stroke has a cell
-    turn = own.spread(np.where(back, cell[own.stop - 1], cell[own.start]))
-    return np.where(own.spread(back), turn - cell, cell - turn)
+def _comparable(known: np.ndarray, steady: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Return which cells of strokes may be averaged with others at their place, shape (strokes, cells).
 
-
-def _comparable(
-    spot: np.ndarray, spots: int, steady: np.ndarray, travel: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return which cells of strokes may be averaged with others at their place, and which places are steady.
-
-    The place in the run is `spot`. Repeats need not start at the same place: where one slides steadily,
-    another may just be starting, and its pre-sliding rise would be a dip in the mean. So steady strokes are
-    averaged where there are any, and elsewhere those that have come equally far from their own start.
+    Repeats need not start at the same place: where one slides steadily, another may just be starting, and its
+    pre-sliding rise would be a dip in the mean. So steady strokes are averaged where there are any, and
+    elsewhere those that have come equally far from their own start.
     """
-    somewhere = np.bincount(spot[steady], minlength=spots) > 0
-    keep = steady.copy()
-    others = np.flatnonzero(~somewhere[spot])
-    furthest = np.zeros(spots, int)
-    np.maximum.at(furthest, spot[others], travel[others])
-    keep[others] = travel[others] >= furthest[spot[others]] - SAME_TRAVEL
-    return keep, somewhere
+    cell = np.arange(known.shape[1])
+    first, last = known.argmax(axis=1), len(cell) - 1 - known[:, ::-1].argmax(axis=1)
+    travel = np.where(back[:, None], last[:, None] - cell, cell - first[:, None])
+    sliding = known & steady
+    others = known & ~sliding.any(axis=0)
+    furthest = np.where(others, travel, 0).max(axis=0)
+    return sliding | (others & (travel >= furthest - SAME_TRAVEL))
 
 
-def _one_per_file(
-    spot: np.ndarray, file: np.ndarray, files: int, force: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return place and mean force once for every file at every place."""
-    pair, own, count = np.unique(spot * files + file, return_inverse=True, return_counts=True)
-    if len(pair) == len(spot):
-        return spot, force
-    place = np.zeros(len(pair), int)
-    place[own] = spot
-    return place, mean_by_group(force, own, len(pair), count)
+def _over_files(force: np.ndarray, keep: np.ndarray, file: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard error of the force in each cell over files, each the mean of its strokes."""
+    names, code = np.unique(file, return_inverse=True)
+    if len(names) < len(file):
+        count = np.array([keep[code == i].sum(axis=0) for i in range(len(names))])
+        total = np.array([force[code == i].sum(axis=0) for i in range(len(names))])
+        force, keep = total / np.maximum(count, 1), count > 0
+    n = keep.sum(axis=0)
+    mean = force.sum(axis=0) / np.maximum(n, 1)
+    square = np.where(keep, (force - mean) ** 2, 0.0).sum(axis=0)
+    error = np.divide(square, (n - 1.0) * n, out=np.full(len(n), np.nan), where=n > 1)
+    return mean, np.sqrt(error)

@@ -20,18 +20,10 @@ class Pieces:
         self.stop = np.cumsum(self.size)
         self.start = self.stop - self.size
 
-    def __len__(self) -> int:
-        return len(self.size)
-
-    @property
-    def rows(self) -> int:
-        """Length of the flat array."""
-        return int(self.stop[-1]) if len(self.stop) else 0
-
     @cached_property
     def of(self) -> np.ndarray:
         """The piece of every row, shape (rows,)."""
-        return np.repeat(np.arange(len(self)), self.size)
+        return np.repeat(np.arange(len(self.size)), self.size)
 
     @cached_property
     def slices(self) -> list[slice]:
@@ -41,25 +33,6 @@ class Pieces:
     def spread(self, per_piece: np.ndarray) -> np.ndarray:
         """Return a value per piece as one per row."""
         return np.repeat(per_piece, self.size)
-
-    def max(self, values: np.ndarray) -> np.ndarray:
-        """Return the largest value of every piece, shape (k,)."""
-        return np.maximum.reduceat(values, self.start)
-
-    def min(self, values: np.ndarray) -> np.ndarray:
-        """Return the smallest value of every piece, shape (k,)."""
-        return np.minimum.reduceat(values, self.start)
-
-    def sum(self, values: np.ndarray) -> np.ndarray:
-        """Return the sum over every piece, shape (k,); of a mask, how many are true."""
-        if values.dtype == bool:
-            return np.add.reduceat(values, self.start, dtype=np.int64)
-        # Not by reduceat, which adds one after the other: the mean of a constant would not be that constant.
-        return np.array([np.add.reduce(values[own]) for own in self.slices])
-
-    def mean(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean of every piece, shape (k,)."""
-        return self.sum(values) / self.size
 
 
 def median(values: np.ndarray) -> float:

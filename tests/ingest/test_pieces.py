@@ -22,15 +22,13 @@ def test_quantiles_are_those_of_numpy():
             assert quantile(values, share) == np.quantile(values, share)
 
 
-def test_what_is_computed_of_every_piece_is_what_each_gives_alone():
-    own, pieces = traces("fine"), Pieces(SIZES)
-    flat = np.concatenate(own)
-    npt.assert_array_equal(pieces.max(flat), [values.max() for values in own])
-    npt.assert_array_equal(pieces.min(flat), [values.min() for values in own])
-    npt.assert_allclose(pieces.sum(flat), [values.sum() for values in own], rtol=1e-12)
-    npt.assert_allclose(pieces.mean(flat), [values.mean() for values in own], rtol=1e-12)
-    npt.assert_array_equal(pieces.sum(flat > 0), [(values > 0).sum() for values in own])
+def test_pieces_lie_one_after_the_other():
+    pieces = Pieces(SIZES)
+    flat = np.concatenate(traces("fine"))
+    for own, values in zip(pieces.slices, traces("fine"), strict=True):
+        npt.assert_array_equal(flat[own], values)
     npt.assert_array_equal(pieces.of, np.repeat(np.arange(len(SIZES)), SIZES))
+    npt.assert_array_equal(pieces.spread(np.arange(len(SIZES))), pieces.of)
 
 
 @pytest.mark.parametrize("kind", ["fine", "steps"])
