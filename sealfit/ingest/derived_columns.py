@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
 from sealfit.config import Config
-from sealfit.errors import CampaignError, ConfigError, Fault
+from sealfit.errors import KEPT, NOTED, ConfigError, Fault
 from sealfit.ingest.categorical import (
     Column,
     Columns,
@@ -26,7 +26,7 @@ from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
-from sealfit.ingest.listing import Entry
+from sealfit.ingest.listing import Entry, stopped
 from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- run values
@@ -100,22 +100,21 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
         try:
             values = evaluate(expression, {column: _as_array(cells) for column, cells in read.items()})
         except ConfigError as error:
-            place = {"file": f"config '{config.name}'", "column": f"runs.compute.{name}", "fix": error.fix}
-            raise CampaignError([Fault("config", error.message, **place)]) from error
+            place = {"file": f"config '{config.name}'", "column": f"runs.compute.{name}"}
+            raise stopped("config", error.message, error.fix, **place) from error
         values = np.broadcast_to(values, len(entries)).astype(float)
-        whole = np.all(
-            [np.ones(len(entries), bool), *(where(cells, _is_fine) for cells in read.values())], axis=0
-        )
-        wrong = whole & ~np.isfinite(values)
+        whole = np.ones(len(entries), bool)  # files with a value in every column that is read
+        for cells in read.values():
+            whole &= where(cells, _is_fine)
+        reason = f'is computed as "{text}", which is no number here.'
         fix = "Correct the cells that it reads, or the expression."
-        faults += [
-            entries[i].fault(
-                "not_finite", f'is computed as "{text}", which is no number here.', name, fix=fix
-            )
-            for i in np.flatnonzero(wrong).tolist()
+        wrong = np.flatnonzero(whole & ~np.isfinite(values)).tolist()
+        faults += [entries[i].fault("not_finite", reason, name, fix=fix) for i in wrong]
+        good = (whole & np.isfinite(values)).tolist()
+        columns[name] = [
+            of_its_kind(name, value) if fine else None
+            for value, fine in zip(values.tolist(), good, strict=True)
         ]
-        known_here = np.where(whole, values, math.nan).tolist()
-        columns[name] = [of_its_kind(name, value) if math.isfinite(value) else None for value in known_here]
     return {name: column for name, column in columns.items() if not name.startswith("_")}, faults
 
 
@@ -142,12 +141,9 @@ def to_values(entries: list[Entry], columns: Columns, config: Config) -> tuple[C
     A column of numbers is one whose name says so, one of the config's condition columns or a channel where
     more than half of the cells are numbers, and any where all are.
     """
-    faults: list[Fault] = []
-    made: Columns = {}
-    for name, cells in columns.items():
-        made[name], found = _column(name, cells, entries, config)
-        faults += found
-    return made, faults
+    made = {name: _column(name, cells, entries, config) for name, cells in columns.items()}
+    faults = [fault for _, found in made.values() for fault in found]
+    return {name: column for name, (column, _) in made.items()}, faults
 
 
 def _column(name: str, cells: Column, entries: list[Entry], config: Config) -> tuple[Column, list[Fault]]:
@@ -161,25 +157,21 @@ def _column(name: str, cells: Column, entries: list[Entry], config: Config) -> t
     if wrong and not meant and len(wrong) >= (1 - _MOSTLY) * count:
         return labels, []
     if wrong and not meant and name not in config.condition:
-        i = wrong[0]
+        entry, label = entries[wrong[0]], labels[wrong[0]]
         reason = f"{len(wrong)} of {count} cells are not numbers; the column is kept as labels."
         fix = "Empty the cell, or put a number there."
-        place = {"severity": "warning", "action": "kept", "value": labels[i], "fix": fix}
-        return labels, [entries[i].fault("not_a_number", reason, name, **place)]
-    fix = "Put a number there."
-    faults = [
-        entries[i].fault("not_a_number", "is not a number.", name, value=labels[i], fix=fix) for i in wrong
-    ]
+        return labels, [entry.fault("not_a_number", reason, name, value=label, fix=fix, **KEPT)]
+
+    def faults(rows: list[int], reason: str, values: Column, fix: str) -> list[Fault]:
+        return [entries[i].fault("not_a_number", reason, name, value=values[i], fix=fix) for i in rows]
+
+    found = faults(wrong, "is not a number.", labels, "Put a number there.")
     if name not in COUNTS:
-        return values, faults
+        return values, found
+    broken = where(values, lambda value: math.isfinite(value) and value != int(value))
     fix = f"Number the {COUNTS[name]} 1, 2, 3."
-    faults += [
-        entries[i].fault("not_a_number", "is not a whole number.", name, value=values[i], fix=fix)
-        for i in np.flatnonzero(
-            where(values, lambda value: math.isfinite(value) and value != int(value))
-        ).tolist()
-    ]
-    return mapped(values, lambda value: int(value) if math.isfinite(value) else -1), faults
+    found += faults(np.flatnonzero(broken).tolist(), "is not a whole number.", values, fix)
+    return mapped(values, lambda value: int(value) if math.isfinite(value) else -1), found
 
 
 def _number(cell: float | str) -> float:
@@ -190,14 +182,12 @@ def _number(cell: float | str) -> float:
 def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Columns:
     """Return the columns with numbers of other units converted; cells without a number stay as they are."""
 
-    def converted(cell: float | str, convert: Conversion) -> float | str:
+    def converted(convert: Conversion, cell: float | str) -> float | str:
         number = _number(cell)
         return convert.of_cell(number) if math.isfinite(number) else cell
 
-    changed = {name: convert for name, convert in conversions.items() if name in columns}
-    return columns | {
-        name: mapped(columns[name], partial(converted, convert=c)) for name, c in changed.items()
-    }
+    changed = {name: partial(converted, c) for name, c in conversions.items() if name in columns}
+    return columns | {name: mapped(columns[name], convert) for name, convert in changed.items()}
 
 
 def empty_cells(entries: list[Entry], name: str, rows: np.ndarray) -> list[Fault]:
@@ -213,38 +203,26 @@ ABSOLUTE_ZERO_C = -273.15
 
 def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
     """Return faults of impossible values: negative days, no load, no speed, below absolute zero."""
-    rules = (
-        ("aging_days", lambda value: value < 0, "is below 0 days.", "Days count from 0, unaged."),
-        (
-            "load_N",
-            lambda value: value <= 0,
-            "is not above 0.",
-            "A normal load presses; leave the cell empty if it is unknown.",
-        ),
-        (
-            "speed_mm_s",
-            lambda value: value == 0,
-            "is not a sliding speed.",
-            "Leave it empty if it is unknown.",
-        ),
-        *(
-            (
-                name,
-                lambda value: not isinstance(value, str) and value <= ABSOLUTE_ZERO_C,
-                "is not above absolute zero.",
-                "Temperatures are in °C; give another unit in the rig config.",
-            )
-            for name in columns
-            if name.endswith("_C")
-        ),
-    )
-    found = [
-        (i, entries[i].fault("out_of_range", reason, name, value=columns[name][i], fix=fix))
-        for name, wrong, reason, fix in rules
-        if name in columns
-        for i in np.flatnonzero(where(columns[name], wrong)).tolist()
-    ]
+    found: list[tuple[int, Fault]] = []
+
+    def add(name: str, wrong: Callable[[float], bool], reason: str, fix: str) -> None:
+        for i in np.flatnonzero(where(columns.get(name, []), wrong)).tolist():
+            value = columns[name][i]
+            found.append((i, entries[i].fault("out_of_range", reason, name, value=value, fix=fix)))
+
+    add("aging_days", lambda value: value < 0, "is below 0 days.", "Days count from 0, unaged.")
+    fix = "A normal load presses; leave the cell empty if it is unknown."
+    add("load_N", lambda value: value <= 0, "is not above 0.", fix)
+    fix = "Leave it empty if it is unknown."
+    add("speed_mm_s", lambda value: value == 0, "is not a sliding speed.", fix)
+    fix = "Temperatures are in °C; give another unit in the rig config."
+    for name in (name for name in columns if name.endswith("_C")):
+        add(name, _is_below_absolute_zero, "is not above absolute zero.", fix)
     return [fault for _, fault in sorted(found, key=lambda one: one[0])]
+
+
+def _is_below_absolute_zero(value: float | str) -> bool:
+    return not isinstance(value, str) and value <= ABSOLUTE_ZERO_C
 
 
 # ---------------------------------------------------------------- derive
@@ -252,12 +230,10 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
 #
 # Everything here works on what is already known of each file, and reads none.
 
-SETTING = (
-    0.005  # commanded speeds and loads closer than this share are one setting; a plate or a step is more
-)
-SAME_SPEED = (
-    0.05  # measured speeds closer than this share are one commanded speed; rigs repeat within a few percent
-)
+# Share by which commanded speeds and loads of one setting differ at most; a plate or a step is more.
+SETTING = 0.005
+# Share by which measured speeds of one commanded speed differ at most; rigs repeat within a few percent.
+SAME_SPEED = 0.05
 
 
 def condition_keys(columns: Columns, files: int, config: Config) -> list[str]:
@@ -357,12 +333,9 @@ def add_runs(
     added = {**columns, "run_id": put(given, run_ids)}
     if not groups:
         return added, []
-    reason = (
-        "neither run_id nor a commanded speed is given; "
-        "files of one condition share a run within 5 % of speed."
-    )
-    said = Fault("run_id_derived", reason, severity="info", action="kept", fix="Give run_id or speed_mm_s.")
-    return added, [said]
+    reason = "neither run_id nor a commanded speed is given; "
+    reason += "files of one condition share a run within 5 % of speed."
+    return added, [Fault("run_id_derived", reason, fix="Give run_id or speed_mm_s.", **NOTED)]
 
 
 def _of_one_speed(members: Sequence[int], measured: Sequence[float]) -> list[list[int]]:
@@ -432,15 +405,10 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
                 value = "none" if mine is None else mine
                 faults.append(entry.fault("run_disagrees", reason, name, value=value, fix=fix))
         if specimen[i] != specimen[j] and _same(told["speed_mm_s"][i], told["speed_mm_s"][j]):
-            reason = (
-                f"run '{run[i]}' has repeats on several specimens; their scatter counts as that of repeats."
-            )
-            place = {
-                "severity": "warning",
-                "action": "kept",
-                "fix": "Give each specimen a run_id of its own.",
-            }
-            faults.append(entry.fault("run_specimens", reason, "specimen_id", value=specimen[i], **place))
+            scatter = "their scatter counts as that of repeats"
+            reason = f"run '{run[i]}' has repeats on several specimens; {scatter}."
+            about = {"value": specimen[i], "fix": "Give each specimen a run_id of its own.", **KEPT}
+            faults.append(entry.fault("run_specimens", reason, "specimen_id", **about))
     return faults
 
 

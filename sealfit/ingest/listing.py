@@ -7,14 +7,14 @@ import io
 import os
 import re
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from sealfit.config import Config
-from sealfit.errors import BadFile, CampaignError, Fault, nearest, printable
+from sealfit.errors import KEPT, BadFile, CampaignError, Fault, nearest, printable
 from sealfit.ingest.categorical import Columns, mapped
 from sealfit.ingest.columns import suggestion
 from sealfit.ingest.files import as_number, inside, split_line
@@ -36,6 +36,7 @@ KNOWN = (
 
 
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
+PASSED_OVER = {"severity": "info", "action": "file left out"}
 FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
 _BLANK = b" \t,;\n"  # a line of nothing else is none
 
@@ -69,7 +70,7 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, 
     """
     if not campaign.is_dir():
         what = "is not a folder." if campaign.exists() else "does not exist."
-        raise _stop("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
+        raise stopped("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
     cells: Columns = {}
     if table := _runs_table(campaign, config):
         entries, cells, faults = _read_runs(campaign, config, table)
@@ -78,7 +79,7 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, 
     else:
         count = sum(1 for _ in campaign.rglob("*.csv"))
         fix = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
-        raise _stop("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", fix, file=RUNS_CSV)
+        raise stopped("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", fix, file=RUNS_CSV)
     outside = {entry.file for entry in entries if inside(campaign, entry.file) is None}
     faults = faults + _paths(campaign, entries, outside) + _unlisted(campaign, entries, outside, config)
     return entries, cells, faults
@@ -91,7 +92,8 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     ]
 
 
-def _stop(check: str, reason: str, fix: str, **place) -> CampaignError:
+def stopped(check: str, reason: str, fix: str, **place) -> CampaignError:
+    """Return the error of a campaign, or of a table, that cannot be used."""
     return CampaignError([Fault(check, reason, fix=fix, **place)])
 
 
@@ -100,11 +102,10 @@ def _runs_table(campaign: Path, config: Config) -> str | None:
     found, named = runs_tables(campaign, config), config.files.runs_table
     if len(found) > 1:
         fix = "Delete or rename one, or name the one that counts: runs_table under [files] in the rig config."
-        raise _stop("several_tables", f"{' and '.join(found)} are both there.", fix, file=found[0])
+        raise stopped("several_tables", f"{' and '.join(found)} are both there.", fix, file=found[0])
     if named is not None and not found:
-        raise _stop(
-            "missing_file", "does not exist, but files.runs_table names it.", "Check its path.", file=named
-        )
+        reason = "does not exist, but files.runs_table names it."
+        raise stopped("missing_file", reason, "Check its path.", file=named)
     return found[0] if found else None
 
 
@@ -112,7 +113,7 @@ def _read_runs(campaign: Path, config: Config, table: str) -> tuple[list[Entry],
     lines, columns, faults = read_table(campaign, table, config, needed="file")
     files = [_posix(campaign, file) for file in columns.pop("file", [])]
     if not files and not any(fault.severity == "error" for fault in faults):
-        raise _stop("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
+        raise stopped("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
     entries = [Entry(file, line, table) for file, line in zip(files, lines, strict=False)]
     return entries, columns, faults
 
@@ -142,19 +143,20 @@ def read_table(
         text, delimiter = text_of_runs(folder, table, config)
     except BadFile as error:
         place = {"file": table, "line": error.fault.line, "column": error.fault.column}
-        raise _stop(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
+        raise stopped(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
     _, head = next(_lines(text), (1, ""))
     delimiter = delimiter or max(",;\t", key=head.count)
-    names, faults = _our_names(_cells(head, delimiter) if head else [], config)
+    header = _cells(head, delimiter) if head else []
+    names, faults = _our_names(header, table, config)
     if needed and needed not in names:
-        fix = suggestion(needed, _cells(head, delimiter) if head else [])
-        raise _stop("missing_column", "there is no such column.", fix, file=table, line=1, column=needed)
-    lines, columns = _rows(text, names, delimiter, faults, needed)
+        fix = suggestion(needed, header)
+        raise stopped("missing_column", "there is no such column.", fix, file=table, line=1, column=needed)
+    lines, columns, found = _rows(text, names, delimiter, table, needed)
     # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
     if delimiter != ",":
         columns = {name: mapped(column, _decimal_point) for name, column in columns.items()}
     columns = {name: column if name == needed else mapped(column, _said) for name, column in columns.items()}
-    return lines, columns, [replace(fault, file=table) for fault in faults]
+    return lines, columns, faults + found
 
 
 def _lines(text: bytes) -> Iterator[tuple[int, str]]:
@@ -177,38 +179,32 @@ def _decimal_point(cell: str) -> str:
 
 
 def _rows(
-    text: bytes, names: list[str], delimiter: str, faults: list[Fault], needed: str | None
-) -> tuple[list[int], Columns]:
-    """Return the line of every row, and the columns that have a name; adds to `faults`."""
-    lines, rows = [], []
+    text: bytes, names: list[str], delimiter: str, table: str, needed: str | None
+) -> tuple[list[int], Columns, list[Fault]]:
+    """Return the line of every row, the columns that have a name, and the faults of lines left out."""
+    lines, rows, faults = [], [], []
     named = max((i for i, name in enumerate(names, start=1) if name), default=0)
     for number, line in islice(_lines(text), 1, None):
-        if _left_open(line, delimiter):
-            reason = "a quotation mark is left open."
-            faults.append(Fault("open_quote", reason, file=RUNS_CSV, line=number, fix="Close or delete it."))
-            continue
         cells = _cells(line, delimiter)
-        if any(cells[len(names) :]):
-            reason = f"the line has {len(cells)} cells where {len(names)} are named."
-            faults.append(
-                Fault("too_many_cells", reason, file=RUNS_CSV, line=number, fix="Quote cells with commas.")
-            )
-            continue
-        if len(cells) < named:
-            reason = f"the line has {len(cells)} cells where {named} are named."
-            fix = "Complete the line: a cell that is empty needs its separator."
-            faults.append(Fault("too_few_cells", reason, file=RUNS_CSV, line=number, fix=fix))
-            continue
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
-        if needed and needed not in row:
+        place = {"file": table, "line": number}
+        if _left_open(line, delimiter):
+            check, reason, fix = "open_quote", "a quotation mark is left open.", "Close or delete it."
+        elif any(cells[len(names) :]):
+            reason = f"the line has {len(cells)} cells where {len(names)} are named."
+            check, fix = "too_many_cells", "Quote cells with commas."
+        elif len(cells) < named:
+            reason = f"the line has {len(cells)} cells where {named} are named."
+            check, fix = "too_few_cells", "Complete the line: a cell that is empty needs its separator."
+        elif needed and needed not in row:
             reason = "no trace file is named." if needed == "file" else "the cell is empty."
-            faults.append(
-                Fault("empty_cell", reason, file=RUNS_CSV, line=number, column=needed, fix="Fill it.")
-            )
+            check, fix, place["column"] = "empty_cell", "Fill it.", needed
+        else:
+            lines.append(number)
+            rows.append(row)
             continue
-        lines.append(number)
-        rows.append(row)
-    return lines, {name: [row.get(name) for row in rows] for name in names if name}
+        faults.append(Fault(check, reason, fix=fix, **place))
+    return lines, {name: [row.get(name) for row in rows] for name in names if name}, faults
 
 
 def _left_open(line: str, delimiter: str) -> bool:
@@ -216,36 +212,30 @@ def _left_open(line: str, delimiter: str) -> bool:
     return '"' in line and next(csv.reader([f"{line}\n"], delimiter=delimiter))[-1].endswith("\n")
 
 
-def _our_names(header: list[str], config: Config) -> tuple[list[str], list[Fault]]:
-    """Return our name of every column of runs.csv, and faults: missing, doubled, or misspelt columns."""
+def _our_names(header: list[str], table: str, config: Config) -> tuple[list[str], list[Fault]]:
+    """Return our name of every column of a table, and faults: missing, doubled, or misspelt columns."""
     ours = {str(theirs.name): name for name, theirs in config.files.runs_columns.items()}
     names = [ours.get(name, name) for name in header]
     faults = []
+
+    def add(check: str, name: str, reason: str, fix: str, **done) -> None:
+        faults.append(Fault(check, reason, file=table, line=1, column=name, fix=fix, **done))
+
     for name in sorted({name for name in names if name and names.count(name) > 1}):
-        reason = f"stands {names.count(name)} times in the header."
-        faults.append(
-            Fault("duplicate_column", reason, file=RUNS_CSV, line=1, column=name, fix="Rename one.")
-        )
+        add("duplicate_column", name, f"stands {names.count(name)} times in the header.", "Rename one.")
     for theirs in ours:
         if theirs not in header:
-            reason, fix = (
-                "there is no such column, but files.runs_columns names it.",
-                suggestion(theirs, header),
-            )
-            faults.append(Fault("missing_column", reason, file=RUNS_CSV, line=1, column=theirs, fix=fix))
+            reason = "there is no such column, but files.runs_columns names it."
+            add("missing_column", theirs, reason, suggestion(theirs, header))
     wanted = [*dict.fromkeys([*KNOWN, *config.condition])]
     for name in names:
         close = nearest(name, wanted) if name not in wanted and name != "file" else ""
         if close and close.lower() == name.lower() and close not in names:
-            reason, fix = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."
-            faults.append(Fault("column_name", reason, file=RUNS_CSV, line=1, column=name, fix=fix))
+            reason = f"differs from '{close}' in the case of letters only."
+            add("column_name", name, reason, f"Write '{close}'.")
         elif close and close not in names and SequenceMatcher(None, name, close).ratio() > 0.85:
-            reason, fix = (
-                f"is kept as a channel; it looks like '{close}'.",
-                f"Write '{close}' if that is meant.",
-            )
-            place = {"file": RUNS_CSV, "line": 1, "column": name}
-            faults.append(Fault("column_name", reason, severity="warning", action="kept", fix=fix, **place))
+            reason = f"is kept as a channel; it looks like '{close}'."
+            add("column_name", name, reason, f"Write '{close}' if that is meant.", **KEPT)
     return names, faults
 
 
@@ -259,25 +249,22 @@ def _posix(campaign: Path, file: str) -> str:
 def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
     glob = config.files.glob
     if PurePosixPath(glob).is_absolute() or ".." in PurePosixPath(glob).parts or not glob:
-        raise _stop(
-            "path_outside", f"files.glob = {glob!r} leads outside the campaign folder.", "Make it relative."
-        )
+        reason = f"files.glob = {glob!r} leads outside the campaign folder."
+        raise stopped("path_outside", reason, "Make it relative.")
     files = sorted(
         (p.relative_to(campaign).as_posix() for p in campaign.glob(glob) if not p.is_dir()), key=natural
     )
     if not files:
-        reason = (
-            f"no file in '{campaign}' matches files.glob = {glob!r}, "
-            "which stands for paths below that folder."
-        )
-        raise _stop("missing_file", reason, _nearest_file(campaign, glob))
+        reason = f"no file in '{campaign}' matches files.glob = {glob!r}, "
+        reason += "which stands for paths below that folder."
+        raise stopped("missing_file", reason, _nearest_file(campaign, glob))
     faults, kept = [], []
     for file in files:
         if not _is_utf8(file):
             faults.append(_odd_name(file, "error"))
         elif pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
             reason = f"excluded by files.exclude = {pattern!r}."
-            faults.append(Fault("excluded", reason, file=file, severity="info", action="file left out"))
+            faults.append(Fault("excluded", reason, file=file, **PASSED_OVER))
         else:
             kept.append(Entry(file))
     return kept, faults
@@ -299,10 +286,8 @@ def _paths(campaign: Path, entries: list[Entry], outside: set[str]) -> list[Faul
             fix = "Copy it into the folder of runs.csv and write its path relative to it."
             faults.append(entry.fault("path_outside", reason, "file", value=entry.file, fix=fix))
         elif entry.file in lines:
-            reason = f"the trace file is listed already on line {lines[entry.file]}."
-            faults.append(
-                entry.fault("duplicate_file", reason, "file", value=entry.file, fix="Delete one line.")
-            )
+            reason, fix = f"the trace file is listed already on line {lines[entry.file]}.", "Delete one line."
+            faults.append(entry.fault("duplicate_file", reason, "file", value=entry.file, fix=fix))
         lines.setdefault(entry.file, entry.line)
     if entries and not faults and not any((campaign / entry.file).is_file() for entry in entries):
         reason = f"none of the {len(entries)} trace files listed exists."
@@ -322,9 +307,8 @@ def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: C
         there |= {p.relative_to(campaign).as_posix() for p in found}
     files = there - listed - {table}
     reason, fix = f"is not in {table}.", "Add it to runs.csv if it is a trace."
-    place = {"severity": "info", "action": "file left out", "fix": fix}
     return [
-        Fault("not_listed", reason, file=f, **place) if _is_utf8(f) else _odd_name(f, "info")
+        Fault("not_listed", reason, file=f, fix=fix, **PASSED_OVER) if _is_utf8(f) else _odd_name(f, "info")
         for f in sorted(files, key=natural)
         if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
     ]
@@ -340,9 +324,8 @@ def _is_utf8(file: str) -> bool:
 
 
 def _odd_name(file: str, severity: str) -> Fault:
-    reason, fix = "the name of the file is not UTF-8.", "Rename it."
-    place = {"file": printable(file), "severity": severity, "action": "file left out"}
-    return Fault("file_name", reason, fix=fix, **place)
+    done = {"severity": severity, "action": "file left out", "fix": "Rename it."}
+    return Fault("file_name", "the name of the file is not UTF-8.", file=printable(file), **done)
 
 
 def files_beside(campaign: Path, files: Collection[str]) -> set[str]:

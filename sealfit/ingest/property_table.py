@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.errors import CampaignError, Fault, nearest
+from sealfit.errors import KEPT, CampaignError, Fault, nearest
 from sealfit.ingest.categorical import Columns, keys_of, known, where
 from sealfit.ingest.cells import LISTED
 from sealfit.ingest.columns import suggestion
@@ -22,7 +22,7 @@ from sealfit.ingest.derived_columns import (
     with_computed,
     with_day_0,
 )
-from sealfit.ingest.listing import Entry, read_table
+from sealfit.ingest.listing import Entry, read_table, stopped
 from sealfit.store.manifest import BATCH
 
 DAYS = "aging_days"
@@ -58,7 +58,7 @@ def read_properties(
     table = path.name
     lines, columns, faults = read_table(path.parent, table, config, needed=None)
     if not lines and not faults:
-        raise _stop(table, "no_rows", "has a header but no rows.", "Write one row per specimen.")
+        raise stopped("no_rows", "has a header but no rows.", "Write one row per specimen.", file=table)
     entries = [Entry(table, line, table) for line in lines]
     columns = with_day_0(in_our_units(columns, config.conversions("runs")), _of_table(config, columns))
     words = {name: columns.pop(name) for name in {*LABELS, batch} if name in columns}
@@ -68,7 +68,9 @@ def read_properties(
     faults += found
     if DAYS not in columns:
         fix = suggestion(DAYS, [*columns, *words]) + " Name it in files.runs_columns of a --config."
-        raise _stop(table, "missing_column", "there is no such column.", fix.strip(), line=1, column=DAYS)
+        raise stopped(
+            "missing_column", "there is no such column.", fix.strip(), file=table, line=1, column=DAYS
+        )
     config = _of_table(config, columns)
     try:
         chosen = _properties(table, columns, config, properties)
@@ -76,11 +78,10 @@ def read_properties(
         raise CampaignError([*(f for f in faults if f.severity != "info"), *error.faults]) from error
     if batch != BATCH and batch not in words:
         fix = suggestion(batch, [*columns, *words])
-        raise _stop(table, "missing_column", "there is no such column.", fix, line=1, column=batch)
+        raise stopped("missing_column", "there is no such column.", fix, file=table, line=1, column=batch)
     if batch not in words and (close := nearest(batch, list(columns))):
         reason, fix = f"is not used; it looks like '{batch}'.", f"Write '{batch}' if that is meant."
-        place = {"file": table, "line": 1, "column": close, "severity": "warning", "action": "kept"}
-        faults.append(Fault("column_name", reason, fix=fix, **place))
+        faults.append(Fault("column_name", reason, file=table, line=1, column=close, fix=fix, **KEPT))
     faults += out_of_range(entries, columns) + _lacking(entries, columns, config)
     if stopping := [f for f in faults if f.severity == "error" and f.action == "stopped"]:
         raise CampaignError(stopping)
@@ -89,7 +90,7 @@ def read_properties(
     faults += _left_out(entries, made[~usable])
     if not (made["aging_days"][usable] > 0).any():
         fix = f"Give values of aged specimens: {DAYS} above 0."
-        raise _stop(table, "nothing_left", "holds no value of an aged specimen.", fix)
+        raise stopped("nothing_left", "holds no value of an aged specimen.", fix, file=table)
     return made[usable].reset_index(drop=True), faults
 
 
@@ -113,16 +114,18 @@ def _properties(table: str, columns: Columns, config: Config, named: Sequence[st
     for name in named:
         if name not in numbers:
             what = "is no column of numbers." if name in columns else "there is no such column."
-            raise _stop(table, "missing_column", what, suggestion(name, numbers), line=1, column=name)
+            raise stopped("missing_column", what, suggestion(name, numbers), file=table, line=1, column=name)
     if named:
         return list(dict.fromkeys(named))
     if len(numbers) == 1:
         return numbers
     if not numbers:
         fix = "Add one of numbers, or correct the cells that are none."
-        raise _stop(table, "missing_column", "there is no column of a property.", fix, line=1)
+        raise stopped("missing_column", "there is no column of a property.", fix, file=table, line=1)
     reason = f"which column is the property is not said: {', '.join(numbers)}."
-    raise _stop(table, "missing_column", reason, f"Name it, or several: --property {numbers[0]}.", line=1)
+    raise stopped(
+        "missing_column", reason, f"Name it, or several: --property {numbers[0]}.", file=table, line=1
+    )
 
 
 def _lacking(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:
@@ -158,19 +161,10 @@ def _left_out(entries: list[Entry], rows: pd.DataFrame) -> list[Fault]:
     """Return a finding for every property that some rows have no value of: how many, and in which lines."""
     faults = []
     for name, lines in rows.groupby("quantity", sort=False)["line"]:
-        listed = ", ".join(str(line) for line in lines.head(LISTED)) + (
-            ", ..." if len(lines) > LISTED else ""
-        )
+        more = ", ..." if len(lines) > LISTED else ""
+        listed = ", ".join(map(str, lines.head(LISTED))) + more
         reason = f"{len(lines)} rows have no value and are left out: {listed}."
-        place = {
-            "file": entries[0].table,
-            "line": int(lines.iloc[0]),
-            "column": name,
-            "value": float(len(lines)),
-        }
-        faults.append(Fault("empty_cell", reason, severity="warning", action="row left out", **place))
+        place = {"file": entries[0].table, "line": int(lines.iloc[0]), "column": name}
+        done = {"severity": "warning", "action": "row left out"}
+        faults.append(Fault("empty_cell", reason, value=float(len(lines)), **place, **done))
     return faults
-
-
-def _stop(table: str, check: str, reason: str, fix: str, **place) -> CampaignError:
-    return CampaignError([Fault(check, reason, fix=fix, file=table, **place)])
