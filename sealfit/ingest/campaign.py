@@ -55,20 +55,8 @@ def inputs_table(
 ) -> tuple[pd.DataFrame, Fingerprints]:
     """Return table `inputs`, every trace file of the campaign and those not used, and their fingerprints.
 
-    Parameters
-    ----------
-    campaign : Path
-        Campaign folder.
-    marks : Fingerprints
-        The files of the listing, as they were read.
-    plan : sequence of ndarray
-        The files of each part, by their numbers in the listing.
-    parts : sequence of Part
-        The parts.
-    used : ndarray of bool, shape (files,)
-        Which files of the listing have a stroke that is used.
-    faults : sequence of Fault
-        All findings; those that leave out files which are not in the listing name them.
+    `marks` are those of the listing's files, `plan` the numbers of each part's files in the listing, and
+    `used` says which of them have a stroke that is used. Faults name the files that are not in the listing.
     """
     others: dict[str, str] = {}  # files that are not in the listing, and their status
     for fault in faults:
@@ -146,8 +134,6 @@ def ingest_campaign(
     ----------
     campaign : Path
         Folder with runs.csv, or with files that the config's glob finds.
-    config : Config
-        The rig.
     workers : int
         Processes; the tables do not depend on it.
     on_file : callable, optional

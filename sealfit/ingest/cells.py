@@ -104,8 +104,7 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- cells
-# Data lines of a trace file to columns of numbers: Arrow's CSV reader, and a patient one for what it cannot
-# read.
+# Data lines to columns of numbers: Arrow's CSV reader, and a patient one for what it cannot read.
 #
 # Both give the same columns and the line number of every row; the patient one also names what stands in the
 # way: text where a number belongs, remarks typed beside a number, lines with too few or too many cells.
@@ -188,14 +187,8 @@ def read_cells(
 ) -> list[Cells]:
     """Return the data of trace files that have the same header, those of each file by themselves.
 
-    Parameters
-    ----------
-    bodies : sequence of (str, bytes)
-        What messages call each file, and its data lines as clean UTF-8 (`body_of`).
-    layout : Layout
-        Where the data begin, in all of the files.
-    numeric : mapping of int to str
-        Positions (from 0) that must hold numbers, and the names that messages call them.
+    `bodies` are what messages call each file, and its data lines as clean UTF-8 (`body_of`); `numeric` are
+    the positions (from 0) that must hold numbers, and the names that messages call them.
     """
     sizes = [body.count(b"\n") + 1 for _, body in bodies]
     columns = _fast(b"\n".join(body for _, body in bodies), sum(sizes), layout, settings, numeric)

@@ -15,8 +15,6 @@ from sealfit.ingest.files import Layout, as_number, bad_file, split_line
 from sealfit.tables import BINS, RUNS
 
 # ---------------------------------------------------------------- columns
-# From a file's columns to ours: which position holds what, and what the other columns are called.
-
 LONGEST_LIST = 400  # characters of the names of columns that a message lists
 NO_COLUMN = "there is no such column."
 SLOTS = ("time_s", "displacement_mm", "force_N", "load_N")  # always numbers

@@ -23,25 +23,23 @@ MAX_CHARACTERS = 1000
 MAX_DEPTH = 60
 """Deepest nesting: keeps the walk far below Python's recursion limit."""
 
+_OF_ONE = ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh", "sign")
 FUNCTIONS = {  # name: (function, fewest arguments, most arguments)
-    **{
-        name: (getattr(np, name), 1, 1)
-        for name in ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh", "sign")
-    },
+    **{name: (getattr(np, name), 1, 1) for name in _OF_ONE},
     "min": (lambda *values: reduce(np.minimum, values), 2, 20),
     "max": (lambda *values: reduce(np.maximum, values), 2, 20),
     "where": (np.where, 3, 3),
 }
-_BINARY = {
+_OPERATORS = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
     ast.Mult: np.multiply,
     ast.Div: np.divide,
     ast.Pow: np.power,
-}
-_UNARY = {ast.USub: np.negative, ast.UAdd: np.positive}
-_JOIN = {ast.And: np.logical_and, ast.Or: np.logical_or}
-_COMPARE = {
+    ast.USub: np.negative,
+    ast.UAdd: np.positive,
+    ast.And: np.logical_and,
+    ast.Or: np.logical_or,
     ast.Lt: np.less,
     ast.LtE: np.less_equal,
     ast.Gt: np.greater,
@@ -145,12 +143,12 @@ class _Checked:
             case ast.Name(id=name) if not name.startswith("__"):
                 self.names.add(name)
                 return lambda values: _as_number(values[name], name, self.text)
-            case ast.UnaryOp(op=op, operand=part) if type(op) in _UNARY:
+            case ast.UnaryOp(op=op, operand=part) if type(op) in _OPERATORS:
                 inner = self.number(part, depth + 1)
-                return lambda values: _UNARY[type(op)](inner(values))
-            case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+                return lambda values: _OPERATORS[type(op)](inner(values))
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
                 one, other = self.number(left, depth + 1), self.number(right, depth + 1)
-                return lambda values: _BINARY[type(op)](one(values), other(values))
+                return lambda values: _OPERATORS[type(op)](one(values), other(values))
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
                 return self.call(name, arguments, depth)
             case ast.Compare() | ast.BoolOp() | ast.UnaryOp(op=ast.Not()):
@@ -165,7 +163,7 @@ class _Checked:
         match node:
             case ast.BoolOp(op=op, values=parts):
                 inner = [self.truth(part, depth + 1) for part in parts]
-                return lambda values: reduce(_JOIN[type(op)], [part(values) for part in inner])
+                return lambda values: reduce(_OPERATORS[type(op)], [part(values) for part in inner])
             case ast.UnaryOp(op=ast.Not(), operand=part):
                 only = self.truth(part, depth + 1)
                 return lambda values: np.logical_not(only(values))
@@ -175,9 +173,9 @@ class _Checked:
                 comparators=[ast.Constant(value=str() as label)],
             ) if not name.startswith("__"):
                 self.names.add(name)
-                return lambda values: _COMPARE[type(op)](np.asarray(values[name]).astype(str), label)
+                return lambda values: _OPERATORS[type(op)](np.asarray(values[name]).astype(str), label)
             case ast.Compare(left=left, ops=ops, comparators=rights) if all(
-                type(op) in _COMPARE for op in ops
+                type(op) in _OPERATORS for op in ops
             ):
                 sides = [self.number(part, depth + 1) for part in (left, *rights)]
                 return lambda values: _compared(ops, [side(values) for side in sides])
@@ -225,5 +223,5 @@ def _as_number(value: object, name: str, text: str) -> np.ndarray:
 
 
 def _compared(ops: list[ast.cmpop], sides: list[np.ndarray]) -> np.ndarray:
-    tests = [_COMPARE[type(op)](a, b) for op, a, b in zip(ops, sides, sides[1:], strict=False)]
+    tests = [_OPERATORS[type(op)](a, b) for op, a, b in zip(ops, sides, sides[1:], strict=False)]
     return reduce(np.logical_and, tests)

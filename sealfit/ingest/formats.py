@@ -79,12 +79,10 @@ def library(name: str, file: str) -> ModuleType:
 
 def require_libraries(files: Sequence[str], settings: TraceFormat) -> None:
     """Raise `CampaignError` if a library that some of the files need is not installed."""
-    first: dict[str, str] = {}
-    for file in files:
-        first.setdefault(kind_of(file, settings), file)
     for kind, name in _LIBRARIES.items():
-        if kind in first:
-            library(name, first[kind])
+        file = next((file for file in files if kind_of(file, settings) == kind), None)
+        if file is not None:
+            library(name, file)
 
 
 @contextmanager
@@ -216,14 +214,8 @@ def _chosen(
 ) -> str:
     """Return the one of several tables in a file that the config names, or the only one that fits it.
 
-    Parameters
-    ----------
-    options : mapping of str to collection of str
-        The tables, and the names of their columns.
-    key : str
-        The key of the config: "group" or "variable".
-    derived : str, optional
-        A column that need not be in the file.
+    `options` are the tables, and the names of their columns; `key` is that of the config, "group" or
+    "variable". The column `derived` need not be in the file.
     """
     wanted = getattr(settings, key)
     if not options:
@@ -325,23 +317,20 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     return Arrays(tuple(header), (), tuple(table.T.astype(float)))
 
 
-def _is_vector(value: object) -> bool:
-    return isinstance(value, np.ndarray) and value.ndim == 1 and value.size > 1
-
-
 def _tables(
     variables: Mapping[str, object], inside: str = ""
 ) -> dict[str, dict[str, np.ndarray] | np.ndarray]:
     """Return every matrix, and the vectors of every struct and of the file itself, by their names."""
     found: dict[str, dict[str, np.ndarray] | np.ndarray] = {}
-    vectors = {name: value for name, value in variables.items() if _is_vector(value)}
+    arrays = {name: value for name, value in variables.items() if isinstance(value, np.ndarray)}
+    vectors = {name: value for name, value in arrays.items() if value.ndim == 1 and value.size > 1}
     if any(_column(value) is not None for value in vectors.values()):
         found[inside or VECTORS] = vectors
     for name, value in variables.items():
         path = f"{inside}.{name}" if inside else name
         if isinstance(value, dict):
             found |= _tables(value, path)
-        elif isinstance(value, np.ndarray) and value.ndim == 2 and value.size and value.dtype.kind in "fiub":
+        elif name in arrays and value.ndim == 2 and value.size and value.dtype.kind in "fiub":
             found[path] = value
     return found
 

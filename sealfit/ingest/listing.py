@@ -123,16 +123,8 @@ def read_table(
 ) -> tuple[list[int], Columns, list[Fault]]:
     """Return the line of every row of a table, its cells by our names of the columns, and its faults.
 
-    Cells are text, None where they say that there is nothing, except in the column that is needed.
-
-    Parameters
-    ----------
-    folder, table : Path, str
-        A CSV, Excel or Parquet file and its folder.
-    config : Config
-        Says what `files.runs_columns` are called.
-    needed : str, optional
-        Column that every row must have.
+    The table is a CSV, Excel or Parquet file. Cells are text, None where they say that there is nothing,
+    except in the column that is needed in every row.
 
     Raises
     ------

@@ -91,12 +91,7 @@ def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[i
     neighbours in the order of their names, so the least and the largest name, which Parquet keeps, tell a
     reader what to skip.
 
-    Parameters
-    ----------
-    conditions, runs : sequence of str, length n
-        Condition and run of every file.
-    sizes : sequence of int, length n
-        Sizes of the files in bytes.
+    The arguments are condition, run and size in bytes of every file.
 
     Examples
     --------
@@ -305,14 +300,9 @@ def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) ->
 
 def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
     """Return the parts in one array; null where a file lacks the channel."""
-    kinds = {part.dtype.kind for part in parts if part is not None}
-    if kinds <= set("fiub"):
-        return np.concatenate(
-            [np.full(n, np.nan) if p is None else p for p, n in zip(parts, length, strict=True)]
-        )
-    return np.concatenate(
-        [np.full(n, None, object) if p is None else p for p, n in zip(parts, length, strict=True)]
-    )
+    numbers = all(part is None or part.dtype.kind in "fiub" for part in parts)
+    null = np.nan if numbers else None
+    return np.concatenate([np.full(n, null) if p is None else p for p, n in zip(parts, length, strict=True)])
 
 
 def _traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:

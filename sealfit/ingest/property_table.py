@@ -43,8 +43,8 @@ def read_properties(
         The table: CSV, Excel or Parquet; a row per specimen with `aging_days`, the other condition columns
         and a column per property.
     config : Config
-        Names, units and computed columns are those of a table of runs: `files.runs_columns`, `runs.compute`.
-        Condition columns that the table lacks are not needed.
+        Names, units and computed columns are those of a table of runs. Condition columns that the table lacks
+        are not needed.
     properties : sequence of str
         Columns of the properties; by default the only column of numbers that is no condition.
     batch : str

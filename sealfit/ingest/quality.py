@@ -50,12 +50,8 @@ def stroke_faults(
 ) -> list[Fault]:
     """Return what is wrong with one stroke by itself: too short, gappy, saturated, stuck.
 
-    Findings of this module do not say which file and stroke they belong to; whoever asks adds that.
-
-    Parameters
-    ----------
-    time_s, force_N, line : ndarray, shape (n,)
-        The whole trace, and the line in the file of each of its rows.
+    Findings of this module do not say which file and stroke they belong to; whoever asks adds that. The
+    arrays, shape (n,), are the whole trace, and the line in the file of each of its rows.
     """
     found = [] if stroke.settles else [_unsettled(stroke)]
     if stroke.short is not None:
@@ -81,12 +77,8 @@ def _unsettled(stroke: Stroke) -> Fault:
 def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
     """Return that a stroke ends before its friction is steady, if it does.
 
-    Parameters
-    ----------
-    left_N, force_N : float
-        What is left of the pre-sliding rise where the steady window ends, and the mean force without it.
-    unit : str
-        Unit of the force.
+    `left_N` is what is left of the pre-sliding rise where the steady window ends, `force_N` the mean force
+    without it.
     """
     if not abs(left_N) > STILL_RISING * abs(force_N):
         return []
@@ -232,12 +224,8 @@ def load_faults(measured: float, declared: float, unit: str) -> list[Fault]:
 def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
     """Return that friction force over load is no coefficient of friction, in some conditions or in all.
 
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady`; rows with `used` false, and those without a load, are left out.
-    config : Config
-        Its units: where force and load are not of one dimension (a torque over a load), nothing is said.
+    Rows of `steady` with `used` false, and those without a load, are left out. Where force and load are not
+    of one dimension (a torque over a load), nothing is said.
     """
     if "load_N" not in steady:
         return []
@@ -264,12 +252,7 @@ def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
 def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame:
     """Return table `quality`: a row per finding, and one "ok" for every file of `files` without any.
 
-    Parameters
-    ----------
-    faults : sequence of Fault
-        Findings, in any order; those of the campaign come first, then by file, stroke and line.
-    files : sequence of str
-        Every trace file of the campaign, in order.
+    Findings of the campaign come first, then by file, stroke and line.
     """
     told = {fault.file for fault in faults}
     rows = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in faults]
@@ -298,12 +281,7 @@ CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) -> list[Fault]:
     """Return, for every column that some files have no value of, how many, what that does, and the fix.
 
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady`; rows with `used` false are left out.
-    aged_only : collection of str
-        Columns that unaged rubber need not have: how others are aged.
+    Rows of `steady` with `used` false are left out. Unaged rubber need not have the columns `aged_only`.
     """
     used = steady[steady["used"].to_numpy(bool)]
     aged = used["aging_days"] != 0 if aged_only else True

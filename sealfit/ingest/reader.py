@@ -75,15 +75,6 @@ class Trace:
 def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
     """Return one trace, with bad rows left out and named.
 
-    Parameters
-    ----------
-    campaign : Path
-        Campaign folder; `ref.file` is relative to it and never outside it.
-    ref : TraceRef
-        The file and what runs.csv and its name say.
-    config : Config
-        How the file is written.
-
     Raises
     ------
     BadFile
@@ -101,13 +92,6 @@ def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list
 
     Files with the same header are parsed in one go: Arrow hands every call over to another thread, which
     takes longer than to parse a short file.
-
-    Parameters
-    ----------
-    files : sequence of (TraceRef, bytes)
-        What is known of each file, and its bytes.
-    config : Config
-        How the files are written.
     """
     found: list[Trace | BadFile | _Opened] = []
     alike: dict[tuple, list[int]] = {}

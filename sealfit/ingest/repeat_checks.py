@@ -306,12 +306,6 @@ def copied_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
 
     Two measurements never have the same mean, scatter and positions to the last digit. A copy, or a second
     link to one file, would count one measurement twice; the first is kept.
-
-    Parameters
-    ----------
-    strokes : DataFrame
-        One row per stroke: file, stroke, several, n, force_N, force_sd_N, displacement_from_mm,
-        displacement_to_mm, used.
     """
     samples = ["n", "force_N", "force_sd_N", "displacement_from_mm", "displacement_to_mm"]
     own = strokes[strokes["used"].to_numpy(bool) & (strokes["force_sd_N"] > 0.0)]
@@ -332,11 +326,6 @@ def turned_sign(strokes: pd.DataFrame) -> list[Fault]:
 
     An offset of the sensor larger than the friction turns the sign in one direction only; with strokes in
     both, the mean over the directions is the friction.
-
-    Parameters
-    ----------
-    strokes : DataFrame
-        One row per stroke: direction, force_N, used.
     """
     used = strokes[strokes["used"].to_numpy(bool)]
     against = used["force_N"] * used["direction"]

@@ -66,13 +66,6 @@ FROM_TRACES = ("run_id", "repeat", "specimen_id", "started_at", "speed_mm_s")
 def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     """Return every trace file of a campaign with its channels, and what was found that does not stop the run.
 
-    Parameters
-    ----------
-    campaign : Path
-        Folder with runs.csv, or with files that the config's glob finds.
-    config : Config
-        What makes a condition, and what file names and header lines say.
-
     Raises
     ------
     CampaignError

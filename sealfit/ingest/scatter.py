@@ -46,10 +46,6 @@ def repeat_means(steady: pd.DataFrame) -> pd.DataFrame:
     left out.
     """
     rows = steady[steady["used"].to_numpy(bool)] if "used" in steady.columns else steady
-    if not len(rows):
-        return pd.DataFrame(
-            {"file": [], "run_id": [], "repeat": np.array([], int), "force_N": np.array([], float)}
-        )
     means = rows.groupby(["run_id", "repeat", "file"], sort=True, observed=True)["force_N"].mean().abs()
     return means.reset_index()[["file", "run_id", "repeat", "force_N"]]
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
+from itertools import islice
 
 import pandas as pd
 
@@ -40,10 +41,8 @@ def join_date_and_time(entries: list[Entry], columns: Columns, config: Config) -
     for i, cells in enumerate(zip(columns[two.date], columns[two.time], strict=True)):
         if (cells[0] is None) != (cells[1] is None):
             empty, other = (two.date, two.time) if cells[0] is None else (two.time, two.date)
-            reason = f"the cell is empty, but '{other}' is not."
-            faults.append(
-                entries[i].fault("empty_cell", reason, empty, value="", fix="Fill it, or empty both.")
-            )
+            reason, fix = f"the cell is empty, but '{other}' is not.", "Fill it, or empty both."
+            faults.append(entries[i].fault("empty_cell", reason, empty, value="", fix=fix))
         # A workbook's date is a midnight: 2024-03-01 00:00:00.
         day = re.sub(r"[ T]00:00(:00)?$", "", str(cells[0]).strip())
         joined.append(None if None in cells else f"{day} {str(cells[1]).strip()}")
@@ -71,7 +70,7 @@ def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[C
     ]
     as_given = not formats and config.files.started_at is None
     as_iso = {
-        text: time.isoformat() if time and not (as_given and _iso(text)) else text
+        text: time.isoformat() if time and not (as_given and _read(datetime.fromisoformat, text)) else text
         for text, time in read.items()
     }
     columns = columns | {"started_at": mapped(texts, as_iso.__getitem__)}
@@ -93,21 +92,13 @@ def _with_none(values: pd.Series) -> Column:
 
 def _time(text: str, formats: Sequence[str]) -> datetime | None:
     """Return the time by the first format that fits, else ISO 8601, else Excel's serial number, or None."""
-    return (
-        next((time for one in formats if (time := _by_format(text, one))), None) or _iso(text) or _excel(text)
-    )
+    in_formats = (_read(datetime.strptime, text, one) for one in formats)
+    return next(filter(None, in_formats), None) or _read(datetime.fromisoformat, text) or _excel(text)
 
 
-def _by_format(text: str, one: str) -> datetime | None:
+def _read(reader: Callable[..., datetime], *given: str) -> datetime | None:
     try:
-        return datetime.strptime(text, one)
-    except ValueError:
-        return None
-
-
-def _iso(text: str) -> datetime | None:
-    try:
-        return datetime.fromisoformat(text)
+        return reader(*given)
     except ValueError:
         return None
 
@@ -127,12 +118,9 @@ def _reason(formats: Sequence[str]) -> str:
 
 def _fix(text: str) -> str:
     """Return a fix: the formats that a date is in, by the usual ones, or how it should be written."""
-    found = (date + clock for clock in _CLOCKS for date in _USUAL if _by_format(text, date + clock))
-    likely = list(dict.fromkeys(found))[:2]
+    usual = (date + clock for clock in _CLOCKS for date in _USUAL)
+    likely = list(islice((repr(one) for one in usual if _read(datetime.strptime, text, one)), 2))
     if likely:
-        return (
-            f"Set date_format = {' or '.join(repr(one) for one in likely)} under [files] in the rig config."
-        )
-    return (
-        "Write it as 2024-03-01T09:30:00, or give its format: date_format = '%d.%m.%Y %H:%M' under [files]."
-    )
+        return f"Set date_format = {' or '.join(likely)} under [files] in the rig config."
+    fix = "Write it as 2024-03-01T09:30:00, or give its format: "
+    return fix + "date_format = '%d.%m.%Y %H:%M' under [files]."

@@ -42,12 +42,7 @@ class StoredTraces:
 
 
 def by_conditions(parts: Mapping[Path, Iterable[str]]) -> list[StoredTraces]:
-    """Return the parts of table `traces` in groups that share no condition.
-
-    Parameters
-    ----------
-    parts : mapping of Path to iterable of str
-        The conditions of each part.
+    """Return the parts of table `traces`, given with their conditions, in groups that share no condition.
 
     Examples
     --------
@@ -84,19 +79,8 @@ def stroke_index(table: pd.DataFrame) -> pd.MultiIndex:
 def strokes_of(traces: pd.DataFrame, strokes: pd.MultiIndex) -> tuple[np.ndarray, np.ndarray]:
     """Return where each stroke's samples begin, the end of the last added, and which of `strokes` each is.
 
-    Parameters
-    ----------
-    traces : DataFrame
-        Rows of table `traces`.
-    strokes : MultiIndex
-        File and stroke of each.
-
-    Returns
-    -------
-    edges : ndarray of int, shape (n + 1,)
-        Samples edges[k] to edges[k + 1] are one stroke.
-    own : ndarray of int, shape (n,)
-        Its place in `strokes`; -1 where it is not among them.
+    Samples edges[k] to edges[k + 1] of table `traces` are one stroke, which is `strokes[own[k]]`, given by
+    its file and number; own[k] is -1 where it is not among them. Shapes are (n + 1,) and (n,).
     """
     file = traces["file"]
     if isinstance(file.dtype, pd.CategoricalDtype):
@@ -185,14 +169,7 @@ def seen_by_parts(config: Config) -> str:
 def part_key(listing: Listing, hashes: Sequence[str | None], seen: str) -> str | None:
     """Return a hash of what a part is made from, or None where a file's content is not known.
 
-    Parameters
-    ----------
-    listing : Listing
-        Its files, and what is known of them.
-    hashes : sequence of str or None
-        Of the content of each.
-    seen : str
-        What `seen_by_parts` says.
+    `hashes` are those of the content of its files; `seen` is what `seen_by_parts` says.
     """
     if None in hashes:
         return None
@@ -210,12 +187,7 @@ def _file_name(key: str | None, asked: Asked) -> str:
 def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
     """Return the stored parts that are whole, by their keys.
 
-    Parameters
-    ----------
-    out : Path
-        Folder of results.
-    files : dict of str to int
-        Files that the last ingest left there, and their sizes in bytes.
+    `files` are those that the last ingest left in the folder `out`, and their sizes in bytes.
     """
     whole = {Path(name).stem: out / name for name in files if name.startswith(f"{PARTS}/")}
     for name, size in files.items():

@@ -13,7 +13,7 @@ from sealfit.config import Config
 from sealfit.errors import BadFile, Fault
 from sealfit.ingest.averages import standard_error
 from sealfit.ingest.file_names import TraceRef
-from sealfit.ingest.files import read_marked
+from sealfit.ingest.files import bad_file, read_marked
 from sealfit.ingest.quality import (
     equal_neighbours,
     load_faults,
@@ -103,15 +103,10 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
 
 def _unmoved(trace: Trace, config: Config) -> Fault:
     """Return what is to be said of a trace without strokes."""
-    span = np.ptp(trace.columns["displacement_mm"])
-    return Fault(
-        "no_motion",
-        f"nothing moves: displacement stays within {span:.3g} {config.units.unit('displacement')}.",
-        file=trace.ref.file,
-        column="displacement_mm",
-        action="file left out",
-        fix="Check the displacement column and its unit, or set strokes.min_travel_mm in the config.",
-    )
+    span, unit = np.ptp(trace.columns["displacement_mm"]), config.units.unit("displacement")
+    reason = f"nothing moves: displacement stays within {span:.3g} {unit}."
+    fix = "Check the displacement column and its unit, or set strokes.min_travel_mm in the config."
+    return bad_file(trace.ref.file, "no_motion", reason, fix, column="displacement_mm").fault
 
 
 def _strokes_before(ref: TraceRef) -> int:

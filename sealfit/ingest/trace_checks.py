@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from sealfit.config import Config, Quality
-from sealfit.errors import ConfigError, Fault
+from sealfit.errors import KEPT, ConfigError, Fault
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.segments import median, quantile
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm
@@ -85,26 +85,12 @@ def force_spikes(
     if not suspects.any():
         return keep, []
     spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects)))
-    if len(spikes) > settings.max_bad_rows * len(force_N):
-        reason = (
-            f"{len(spikes)} samples jump away from their neighbours: too many to be single wrong samples."
-        )
+    count = len(spikes)
+    if count > settings.max_bad_rows * len(force_N):
+        reason = f"{count} samples jump away from their neighbours: too many to be single wrong samples."
         fix = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
-        value = float(len(spikes))
-        return keep, [
-            Fault(
-                "spikes",
-                reason,
-                file,
-                None,
-                None,
-                "force_N",
-                value,
-                severity="warning",
-                action="kept",
-                fix=fix,
-            )
-        ]
+        place = {"file": file, "column": "force_N", "value": float(count)}
+        return keep, [Fault("spikes", reason, fix=fix, **place, **KEPT)]
     keep[spikes] = False
     starts = np.array([stroke.start for stroke in strokes])
     several = len(strokes) > 1
@@ -122,18 +108,9 @@ def resolution(values: np.ndarray) -> float:
 
 
 def _spike(file: str, stroke: int | None, column: str, value: float, off: float, line: int) -> Fault:
-    return Fault(
-        "spike",
-        f"a single sample, {abs(off):.4g} off its neighbours.",
-        file=file,
-        stroke=stroke,
-        line=int(line),
-        column=column,
-        value=float(value),
-        severity="warning",
-        action="row left out",
-        fix=FIX,
-    )
+    reason = f"a single sample, {abs(off):.4g} off its neighbours."
+    place = {"file": file, "stroke": stroke, "line": int(line), "column": column, "value": float(value)}
+    return Fault("spike", reason, severity="warning", action="row left out", fix=FIX, **place)
 
 
 # ---------------------------------------------------------------- speed unit
@@ -232,9 +209,8 @@ def _of_cuts(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, fl
 def _strokes(displacement_mm: np.ndarray) -> int:
     """Return how often a trace goes from its lowest quarter to its highest or back: roughly, its strokes."""
     low, high = quantile(displacement_mm, 0.01), quantile(displacement_mm, 0.99)
-    ends = displacement_mm[
-        (displacement_mm < low + 0.25 * (high - low)) | (displacement_mm > high - 0.25 * (high - low))
-    ]
+    quarter = 0.25 * (high - low)
+    ends = displacement_mm[(displacement_mm < low + quarter) | (displacement_mm > high - quarter)]
     return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))
 
 
@@ -248,8 +224,8 @@ def speed_fault(
     the file is kept with a warning: every table holds the measured speed. Beyond, the file is left out, and
     the fix names the mix-up that fits the factor. Arguments as in `measured_speed`.
     """
-    commanded = _commanded(ref)
-    if commanded is None:
+    commanded = ref.channels.get("speed_set_mm_s")
+    if not isinstance(commanded, int | float) or not commanded > 0:
         return None
     factor, tolerance = speed_factor(config.units), config.quality.speed_disagreement
     mean, plateau = (factor * speed for speed in measured_speed(time_s, displacement_mm))
@@ -264,23 +240,14 @@ def speed_fault(
     ratio = measured / commanded
     if abs(ratio - 1) <= tolerance:
         return None
-    unit, gross = config.units.unit("speed"), not 1 / GROSS <= ratio <= GROSS
-    fix = "Check the commanded speed, or slip in the drive."
-    return Fault(
-        "speed_disagreement",
-        f"displacement over time gives {measured:.4g} {unit}, commanded are {commanded:.4g} {unit}.",
-        file=ref.file,
-        column="displacement_mm",
-        value=measured,
-        severity="error" if gross else "warning",
-        action="file left out" if gross else "kept",
-        fix=_mix_up(ratio, time_s, displacement_mm, tolerance) if gross else fix,
-    )
-
-
-def _commanded(ref: TraceRef) -> float | None:
-    speed = ref.channels.get("speed_set_mm_s")
-    return speed if isinstance(speed, int | float) and speed > 0 else None
+    unit = config.units.unit("speed")
+    reason = f"displacement over time gives {measured:.4g} {unit}, commanded are {commanded:.4g} {unit}."
+    place = {"file": ref.file, "column": "displacement_mm", "value": measured}
+    if 1 / GROSS <= ratio <= GROSS:
+        fix = "Check the commanded speed, or slip in the drive."
+        return Fault("speed_disagreement", reason, fix=fix, **place, **KEPT)
+    fix = _mix_up(ratio, time_s, displacement_mm, tolerance)
+    return Fault("speed_disagreement", reason, action="file left out", fix=fix, **place)
 
 
 def _nearest(commanded: float, mean: float, plateau: float) -> float:

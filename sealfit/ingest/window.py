@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import chdtrc
 
-from sealfit.ingest.presliding import Rise, Start, rise_of, transient_rows
+from sealfit.ingest.presliding import Start, rise_of, transient_rows
 from sealfit.ingest.segments import median, stretches, weighted_median
 
 # Share of the plateau speed below which the platform rests. A ripple of the speed stays above it.
@@ -101,7 +101,8 @@ def steady_window(
     speed, half, blurred = local_speed(
         time_s, median_filter(along_mm, 5, mode="nearest"), noise_mm, tolerance
     )
-    plateau = plateau_speed(time_s, speed)
+    # The speed below which half of the distance is slid: blind to rests and ramps.
+    plateau = weighted_median(speed, np.maximum(speed, 0.0) * np.gradient(time_s))
     moves = speed > REST * plateau
     sliding = speed > STANDSTILL * plateau
     sliding[:origin] = moves[:origin] = False
@@ -120,7 +121,8 @@ def steady_window(
             rows = slice(still, end)
             distance = _distance(time_s[rows], along_mm[rows], begin - still, 0 if blurred else half)
             rise = rise_of(Start(distance, force_N[rows], begin - still))
-            begin = max(begin, still + _rows_of(rise, distance))
+            if rise.end_mm > 0.0:
+                begin = max(begin, still + int(distance.searchsorted(rise.end_mm)))
             settled = force_N[begin:end] - rise.at(distance[begin - still :])
             off = transient_rows(settled)
             begin += off
@@ -134,11 +136,6 @@ def steady_window(
             settles &= _settles(time_s[rows], along_mm[rows], noise_mm, tolerance)
         since = last
     return Window(steady, sliding, left, length, settles)
-
-
-def _rows_of(rise: Rise, distance_mm: np.ndarray) -> int:
-    """Return how many rows of a start lie before the end of its rise."""
-    return int(distance_mm.searchsorted(rise.end_mm)) if rise.end_mm > 0.0 else 0
 
 
 def _distance(time_s: np.ndarray, along_mm: np.ndarray, ramp_end: int, averaged: int) -> np.ndarray:
@@ -251,11 +248,6 @@ def first_motion(force_N: np.ndarray, since: int) -> int:
     up = _first(share > HALF_UP)
     still = _last(share[:up] < ONSET) if up else None
     return since if still is None else since + still
-
-
-def plateau_speed(time_s: np.ndarray, speed: np.ndarray) -> float:
-    """Return the speed below which half of the distance is slid: blind to rests and ramps."""
-    return weighted_median(speed, np.maximum(speed, 0.0) * np.gradient(time_s))
 
 
 def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -> float:

@@ -57,22 +57,10 @@ def read_sheet(
     first: bool = False,
     head: bool = False,
 ) -> Sheet:
-    """Return a sheet of a workbook as text.
+    """Return a sheet of a workbook as text: its name or number (from 1), or None for the only one with cells.
 
-    Parameters
-    ----------
-    raw : bytes
-        The workbook.
-    file : str
-        What messages call it.
-    sheet : str, int or None
-        Name or number (from 1) of the sheet; None for the only one with cells in it.
-    decimal : str
-        Mark with which numbers are written.
-    first : bool
-        Whether None means the first sheet.
-    head : bool
-        Whether `HEAD_ROWS` rows are enough.
+    With `first`, None means the first sheet; with `head`, `HEAD_ROWS` rows are enough. Numbers are written
+    with the mark `decimal`.
 
     Raises
     ------
