@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 from zlib import crc32
@@ -157,21 +158,10 @@ class Scatter:
 
 
 def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, draws: Draws) -> Scatter:
-    """Return the scatter of files, runs and specimens; gains multiply each other.
-
-    Parameters
-    ----------
-    noise : sequence of Noise
-        The SPEC's.
-    files : DataFrame
-        With `file`, `run_id` and `specimen_id`.
-    draws : Draws
-        Source of randomness.
-    """
+    """Return the scatter of `files`, their runs and specimens; gains multiply each other."""
     n = len(files)
     gain, offset, speed, outlier = np.ones(n), np.zeros(n), np.ones(n), np.zeros(n, bool)
-    for number, kind in enumerate(noise):
-        random = draws.stream(*_purpose(noise, number))
+    for kind, random in _streams(noise, draws):
         match kind:
             case RepeatGain():
                 gain *= 1.0 + kind.sd_rel * random.standard_normal(n)
@@ -213,19 +203,15 @@ def sample_noise_N(
     """
     n = len(force_N)
     total = np.zeros(n)
-    for number, kind in enumerate(noise):
-        random = draws.stream(*_purpose(noise, number), file)
+    for kind, random in _streams(noise, draws, file):
         match kind:
             case White():
                 total += kind.sd_N * random.standard_normal(n)
             case Proportional():
                 total += kind.sd_rel * np.abs(force_N) * random.standard_normal(n)
             case Autocorrelated():
-                step = {
-                    "samples": 1.0,
-                    "s": time_s[1] - time_s[0],
-                    "mm": (time_s[1] - time_s[0]) * speed_mm_s,
-                }[kind.unit]
+                second = time_s[1] - time_s[0]
+                step = {"samples": 1.0, "s": second, "mm": second * speed_mm_s}[kind.unit]
                 total += kind.sd_N * remembering(random.standard_normal(n), np.exp(-step / kind.length))
     return total
 
@@ -233,9 +219,9 @@ def sample_noise_N(
 def displacement_noise_mm(noise: Sequence[Noise], n: int, file: int, draws: Draws) -> np.ndarray:
     """Return the noise of one trace's displacement in mm, shape (n,)."""
     total = np.zeros(n)
-    for number, kind in enumerate(noise):
+    for kind, random in _streams(noise, draws, file):
         if isinstance(kind, DisplacementNoise):
-            total += kind.sd_mm * draws.stream(*_purpose(noise, number), file).standard_normal(n)
+            total += kind.sd_mm * random.standard_normal(n)
     return total
 
 
@@ -247,68 +233,48 @@ def quantised(noise: Sequence[Noise], force_N: np.ndarray) -> np.ndarray:
     return force_N
 
 
-def _purpose(noise: Sequence[Noise], number: int) -> tuple[str, int]:
-    """Return the name of a stream: the kind of noise, and its number among those of the kind."""
-    return noise[number].kind, sum(other.kind == noise[number].kind for other in noise[:number])
+def _streams(noise: Sequence[Noise], draws: Draws, *file: int) -> Iterator[tuple[Noise, np.random.Generator]]:
+    """Yield every kind of noise with its generator, which its number among those of the kind names."""
+    seen: Counter[str] = Counter()
+    for kind in noise:
+        yield kind, draws.stream(kind.kind, seen[kind.kind], *file)
+        seen[kind.kind] += 1
 
 
 # ---------------------------------------------------------------- defects
 # Defects that ingest must find, in files that the truth lists.
 
+DEFECTS = ("missing_cells", "spikes", "gaps", "saturated", "reversed")  # keys of `BadData`
 Columns = dict[str, np.ndarray]  # a trace's columns, each of shape (n,); NaN is written as an empty cell
 
 
 def draw_defects(noise: Sequence[Noise], files: int, draws: Draws) -> dict[int, str]:
     """Return the defect of each file that has one; fewer than asked if there are not enough files."""
-    wanted = [
-        defect
-        for kind in noise
-        if isinstance(kind, BadData)
-        for defect in DEFECTS
-        for _ in range(getattr(kind, defect))
-    ]
+    wanted: list[str] = []
+    for kind in noise:
+        if isinstance(kind, BadData):
+            for defect in DEFECTS:
+                wanted += getattr(kind, defect) * [defect]
     order = draws.stream("bad_data").permutation(files).tolist()
     return dict(zip(order, wanted, strict=False))
 
 
 def spoil(columns: Columns, defect: str, random: np.random.Generator) -> Columns:
     """Return a trace's columns with one of `DEFECTS`."""
-    return DEFECTS[defect](columns, random)
-
-
-def _missing_cells(columns: Columns, random: np.random.Generator) -> Columns:
     force = columns["force_N"].copy()
-    force[random.choice(len(force), size=max(1, len(force) // 50), replace=False)] = np.nan
+    n = len(force)
+    match defect:
+        case "missing_cells":
+            force[random.choice(n, size=max(1, n // 50), replace=False)] = np.nan
+        case "spikes":
+            force[random.choice(n, size=3, replace=False)] = 10.0 * force[np.argmax(np.abs(force))]
+        case "gaps":
+            first = int(n * random.uniform(0.4, 0.5))
+            gap = slice(first, first + n // 10)
+            return {name: np.delete(values, gap) for name, values in columns.items()}
+        case "saturated":
+            limit = 0.97 * np.median(np.abs(force))
+            force = np.clip(force, -limit, limit)
+        case "reversed":
+            return {name: values[::-1] for name, values in columns.items()}
     return {**columns, "force_N": force}
-
-
-def _spikes(columns: Columns, random: np.random.Generator) -> Columns:
-    force = columns["force_N"].copy()
-    force[random.choice(len(force), size=3, replace=False)] = 10.0 * force[np.argmax(np.abs(force))]
-    return {**columns, "force_N": force}
-
-
-def _gap(columns: Columns, random: np.random.Generator) -> Columns:
-    n = len(columns["force_N"])
-    first = int(n * random.uniform(0.4, 0.5))
-    keep = np.r_[0:first, first + n // 10 : n]
-    return {name: values[keep] for name, values in columns.items()}
-
-
-def _saturated(columns: Columns, random: np.random.Generator) -> Columns:
-    force = columns["force_N"]
-    limit = 0.97 * np.median(np.abs(force))
-    return {**columns, "force_N": np.clip(force, -limit, limit)}
-
-
-def _reversed(columns: Columns, random: np.random.Generator) -> Columns:
-    return {name: values[::-1] for name, values in columns.items()}
-
-
-DEFECTS: dict[str, Callable[[Columns, np.random.Generator], Columns]] = {
-    "missing_cells": _missing_cells,
-    "spikes": _spikes,
-    "gaps": _gap,
-    "saturated": _saturated,
-    "reversed": _reversed,
-}
