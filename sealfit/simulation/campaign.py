@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,8 @@ import pyarrow.csv
 
 from sealfit.errors import ConfigError, OutError, RequestError
 from sealfit.simulation.channels import TraceChannel, add_channels, trace_channel
+from sealfit.simulation.model import CONDITIONS
 from sealfit.simulation.motion import (
-    CONDITIONS,
     Motion,
     SteadyLaw,
     finer,
@@ -46,6 +45,9 @@ SCHEMA = 1
 MADE_BY = "sealfit simulate"
 # Decimals of a mean force in N. They are far below any noise.
 DIGITS = 9
+PER_FILE = (
+    "file", "run_id", "direction", "speed_mm_s", "mean_force_N", "gain", "offset_N", "outlier", "defect",
+)  # fmt: skip
 
 
 def truth_path(campaign: Path) -> Path:
@@ -101,24 +103,20 @@ def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
     """
     spec = Spec.model_validate(truth["spec"])
     law = steady_law(spec)
-    table = points
-    if "direction" not in table and "speed_mm_s" in table:
-        table = table.assign(direction=np.sign(table["speed_mm_s"]))
-    if "load_N" not in table and len(spec.design.loads_N) == 1:
-        table = table.assign(load_N=spec.design.loads_N[0])
-    own = [name for name, there in spec.design.columns.items() if there]
-    needed = dict.fromkeys(["speed_mm_s", *own, *(name for e in law.effects for name in e.channels)])
-    for name in needed:
-        if name not in table:
+    if "direction" not in points and "speed_mm_s" in points:
+        points = points.assign(direction=np.sign(points["speed_mm_s"]))
+    if "load_N" not in points and len(spec.design.loads_N) == 1:
+        points = points.assign(load_N=spec.design.loads_N[0])
+    channels = {}
+    for name in ("speed_mm_s", *spec.design.columns, *(name for e in law.effects for name in e.channels)):
+        if name not in points:
             raise RequestError(
                 "the points lack a column.", column=name, fix="Add it; the truth depends on it."
             )
-        if table[name].isna().any():
-            raise RequestError(
-                f"the points have {int(table[name].isna().sum())} empty cells.", column=name, fix="Fill them."
-            )
-    channels = {name: table[name].to_numpy() for name in needed}
-    return np.broadcast_to(law.force_N(channels), (len(table),)).astype(float)
+        if empty := int(points[name].isna().sum()):
+            raise RequestError(f"the points have {empty} empty cells.", column=name, fix="Fill them.")
+        channels[name] = points[name].to_numpy()
+    return np.broadcast_to(law.force_N(channels), (len(points),)).astype(float)
 
 
 def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) -> dict:
@@ -135,33 +133,19 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
     effect_rms_N : ndarray, shape (effects,)
         RMS over all steady rows of what each effect adds to the force.
     """
-    conditions = [name for name in CONDITIONS if name in files]
-    per_file = [
-        "file",
-        "run_id",
-        "direction",
-        "speed_mm_s",
-        "mean_force_N",
-        "gain",
-        "offset_N",
-        "outlier",
-        "defect",
-    ]
-    runs = (
-        files.groupby(["run_id", "direction"], sort=False)["mean_force_N"].mean().round(DIGITS).reset_index()
-    )
-    both = spec.design.strokes_per_file > 1
-    sign = runs["direction"].map({1: "+", -1: "-"})
-    runs["run_id"] = runs["run_id"] + sign if both else runs["run_id"]
+    physics = []
+    for row in files.drop_duplicates("condition").to_dict("records"):
+        given = {name: float(row[name]) for name in CONDITIONS if name in row}
+        physics.append({"condition": row["condition"], **given, **law_of_condition(spec.physics, given)})
+    means = files.groupby(["run_id", "direction"], sort=False)["mean_force_N"].mean()
+    runs = means.round(DIGITS).reset_index()
+    if spec.design.both_ways:
+        runs["run_id"] += runs["direction"].map({1: "+", -1: "-"})
     return {
         "schema": SCHEMA,
         "made_by": MADE_BY,
         "spec": spec.model_dump(mode="json"),
-        "physics": [
-            {"condition": row["condition"], **{c: float(row[c]) for c in conditions}}
-            | law_of_condition(spec.physics, {c: float(row[c]) for c in conditions})
-            for row in files.drop_duplicates("condition").to_dict("records")
-        ],
+        "physics": physics,
         "effects": [
             {
                 "id": e.id,
@@ -179,7 +163,7 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
         "files": [
             # pandas makes NaN of None
             {**row, "defect": row["defect"] if isinstance(row["defect"], str) else None}
-            for row in files[per_file].round(DIGITS).to_dict("records")
+            for row in files[list(PER_FILE)].round(DIGITS).to_dict("records")
         ],
     }
 
@@ -196,16 +180,6 @@ NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]
 CRAWL = 1e-3
 # Number of rows per file for the RMS of an effect. It gives two digits.
 RMS_ROWS = 64
-
-
-@dataclass(frozen=True)
-class SetUp:
-    """The set-up of the rig for one file: its number, real speed, and gain and offset of the force."""
-
-    number: int
-    speed_mm_s: float
-    gain: float
-    offset_N: float
 
 
 def simulate(spec: Spec, out: Path) -> None:
@@ -271,26 +245,27 @@ def _write(spec: Spec, folder: Path) -> dict:
     spec = spec.risen()
     files = add_channels(plan_files(spec.design, draws.stream("order")), spec.channels, draws)
     scatter = draw_scatter(spec.noise, files, draws)
-    starts = spec.design.start_mm + spec.design.start_scatter_mm * draws.stream("start").standard_normal(
-        len(files)
-    )
+    shifts = draws.stream("start").standard_normal(len(files))
+    starts = spec.design.start_mm + spec.design.start_scatter_mm * shifts
     defects = draw_defects(spec.noise, len(files), draws)
     squares, weights, known = np.zeros(len(law.effects)), 0, []
-    records = files.to_dict("records")
-    for number, record in enumerate(records):
+    for number, record in enumerate(files.to_dict("records")):
         speed = record["speed_mm_s"] * scatter.speed[number]
         motion = move(spec.design, speed, record["direction"], starts[number])
         along = {
-            c.name: _along(c, motion, number, draws) for c in spec.channels if isinstance(c, TraceChannel)
+            c.name: trace_channel(c, motion.time_s, draws.stream("channel", c.name, number))
+            for c in spec.channels
+            if isinstance(c, TraceChannel)
         }
         channels = _channels(record, motion, along)
-        setup = SetUp(number, speed, scatter.gain[number], scatter.offset_N[number])
-        force = _force(spec, law, motion, channels, setup, draws)
+        friction, added = _forces(spec, law, motion, channels, speed)
+        clean = scatter.gain[number] * friction + added + scatter.offset_N[number]
+        force = clean + sample_noise_N(spec.noise, clean, motion.time_s, speed, number, draws)
         noise = displacement_noise_mm(spec.noise, len(force), number, draws)
         columns = {
             "time_s": motion.time_s,
             "displacement_mm": np.round(motion.displacement_mm + noise, DISPLACEMENT_DECIMALS),
-            "force_N": force,
+            "force_N": np.round(quantised(spec.noise, force), spec.force_decimals),
             **along,
         }
         if number in defects:
@@ -320,10 +295,6 @@ def _write(spec: Spec, folder: Path) -> dict:
     return truth_document(spec, pd.DataFrame(known), np.sqrt(squares / weights))
 
 
-def _along(channel: TraceChannel, motion: Motion, number: int, draws: Draws) -> np.ndarray:
-    return trace_channel(channel, motion.time_s, draws.stream("channel", channel.name, number))
-
-
 def _channels(record: dict, motion: Motion, along: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return a file's channels as sealfit's tables name them: shape (1,) for those of the file, else (n,)."""
     return {
@@ -342,16 +313,11 @@ def _rows(channels: dict[str, np.ndarray], rows: np.ndarray | slice) -> dict[str
     return {name: values[rows] if len(values) > 1 else values for name, values in channels.items()}
 
 
-def _force(
-    spec: Spec,
-    law: SteadyLaw,
-    motion: Motion,
-    channels: dict[str, np.ndarray],
-    setup: SetUp,
-    draws: Draws,
-) -> np.ndarray:
-    """Return a trace's measured force in N, shape (n,)."""
-    parts = law.parts({**channels, **_begun(spec, motion, setup.speed_mm_s)})
+def _forces(
+    spec: Spec, law: SteadyLaw, motion: Motion, channels: dict[str, np.ndarray], speed: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a trace's friction and the force that effects add to it, without noise, in N, (n,) each."""
+    parts = law.parts({**channels, **_begun(spec, motion, speed)})
     limit, viscous, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
     if not (np.isfinite(limit + viscous).all() and np.isfinite(added).all()):
         raise ConfigError(
@@ -359,15 +325,9 @@ def _force(
             fix="Check their parameters and formulas.",
         )
     if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
-        friction = with_presliding(
-            limit + viscous, motion, np.full(motion.time_s.size, spec.design.stiffness_mm)
-        )
-    else:
-        friction = _dynamic(spec, law, motion, channels, setup.speed_mm_s) + viscous
-    clean = setup.gain * friction + added + setup.offset_N
-    noise = sample_noise_N(spec.noise, clean, motion.time_s, setup.speed_mm_s, setup.number, draws)
-    noisy = clean + noise
-    return np.round(quantised(spec.noise, noisy), spec.force_decimals)
+        rise = np.full(motion.time_s.size, spec.design.stiffness_mm)
+        return with_presliding(limit + viscous, motion, rise), added
+    return _dynamic(spec, law, motion, channels, speed) + viscous, added
 
 
 def _dynamic(

@@ -18,8 +18,7 @@ from sealfit.ingest.expression import evaluate, parse
 # ---------------------------------------------------------------- physics
 # The declared model of a SPEC: Eq. 14 with Eq. 15, one law for all series or one each.
 
-# Parameters of the model without effects. The suffixes _s and _c refer to mu_s and mu_c.
-QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
+CONDITIONS = ("temperature_C", "compression_ratio_pct", "aging_days")
 
 
 class Law(Strict):
@@ -77,9 +76,9 @@ class Physics(Strict):
 
 
 def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the parameters of the declared model without effects at given conditions.
+    """Return the parameters of the declared model without effects at given conditions, shape (n,) each.
 
-    They are `QUANTITIES`, shape (n,) each.
+    They are mu_0s, a_s, b_s of mu_s, mu_0c, a_c, b_c of mu_c, v_s and sigma_2.
 
     Parameters
     ----------
@@ -90,37 +89,25 @@ def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) 
         (day 0) has v_s and sigma_2 of `physics` itself, whatever its temperature cell says.
     """
     n = len(next(iter(conditions.values()))) if conditions else 1
-    temperature = conditions.get("temperature_C")
-    compression = conditions.get("compression_ratio_pct")
-    days = conditions.get("aging_days", np.ones(n))
-    values = {
-        **{f"{name}_s": np.full(n, getattr(physics.mu_s, name)) for name in ("a", "b")},
-        **{f"{name}_c": np.full(n, getattr(physics.mu_c, name)) for name in ("a", "b")},
-        "mu_0s": np.full(n, physics.mu_s.mu_0),
-        "mu_0c": np.full(n, physics.mu_c.mu_0),
-        "v_s": np.full(n, physics.v_s),
-        "sigma_2": np.full(n, physics.sigma_2),
-    }
-    if physics.growth is not None:
-        growth = physics.growth
+    values = {}
+    for end, law in (("s", physics.mu_s), ("c", physics.mu_c)):
+        values |= {f"mu_0{end}": law.mu_0, f"a_{end}": law.a, f"b_{end}": law.b}
+    values |= {"v_s": physics.v_s, "sigma_2": physics.sigma_2}
+    values = {name: np.full(n, value) for name, value in values.items()}
+    if (growth := physics.growth) is not None:
         factor = growth.factor(
-            growth.reference_temperature_C if temperature is None else temperature,
-            growth.reference_compression_pct if compression is None else compression,
+            conditions.get("temperature_C", growth.reference_temperature_C),
+            conditions.get("compression_ratio_pct", growth.reference_compression_pct),
         )
         values["a_s"], values["a_c"] = values["a_s"] * factor, values["a_c"] * factor
     for series in physics.series:
-        own = np.asarray(days) > 0
-        for wanted, found in (
-            (series.temperature_C, temperature),
-            (series.compression_ratio_pct, compression),
-        ):
-            if wanted is not None:
-                own = own & (found == wanted if found is not None else False)
-        for name in ("a_s", "b_s", "a_c", "b_c", "v_s", "sigma_2"):
-            value = getattr(series, name)
-            if value is not None:
-                values[name] = np.where(own, value, values[name])
-    return {name: values[name] for name in QUANTITIES}
+        own, given = conditions.get("aging_days", np.ones(n)) > 0, series.model_dump(exclude_none=True)
+        for name in CONDITIONS:
+            if name in given:
+                own = own & (conditions.get(name, np.nan) == given.pop(name))
+        for name, value in given.items():
+            values[name] = np.where(own, value, values[name])
+    return values
 
 
 # ---------------------------------------------------------------- effects
@@ -153,11 +140,7 @@ class EffectEntry(Strict):
             raise ValueError("id = 'expression' and formula belong together")
         if self.formula is not None:
             try:
-                unknown = [
-                    n
-                    for n in sorted(parse(self.formula).names)
-                    if n not in (*self.channels, *self.parameters)
-                ]
+                unknown = sorted(parse(self.formula).names - {*self.channels, *self.parameters})
             except ConfigError as error:
                 raise ValueError(str(error)) from None
             if self.channels and unknown:
@@ -233,16 +216,15 @@ def _check_reference(entry: EffectEntry, effect: Effect, place: str) -> None:
 
 
 def _bound_channels(entry: EffectEntry, effect: Effect, place: str) -> tuple[str, ...]:
-    if entry.channels:
-        if len(entry.channels) != len(effect.reads):
-            raise ConfigError(
-                f"{place}: reads {len(effect.reads)} channels, {len(entry.channels)} given.",
-                fix=f"Give channels for {', '.join(effect.reads)}, in this order.",
-            )
-        return entry.channels
-    if CHANNEL in effect.reads:
+    if not entry.channels and CHANNEL in effect.reads:
         raise ConfigError(f"{place}: reads a channel of your choice.", fix='Add channels = ["<column>"].')
-    return effect.reads
+    channels = entry.channels or effect.reads
+    if len(channels) != len(effect.reads):
+        raise ConfigError(
+            f"{place}: reads {len(effect.reads)} channels, {len(channels)} given.",
+            fix=f"Give channels for {', '.join(effect.reads)}, in this order.",
+        )
+    return channels
 
 
 def _check_parameters(entry: EffectEntry, effect: Effect, place: str) -> None:
@@ -264,13 +246,9 @@ def _check_parameters(entry: EffectEntry, effect: Effect, place: str) -> None:
 
 
 def _target(entry: EffectEntry, effect: Effect, place: str) -> tuple[Target, Operation]:
-    pairs = [
-        (target, operation)
-        for target, operation in effect.acts_on
-        if entry.acts_on in (None, target) and entry.operation in (None, operation)
-    ]
-    if pairs:
-        return pairs[0]
+    for target, operation in effect.acts_on:
+        if entry.acts_on in (None, target) and entry.operation in (None, operation):
+            return target, operation
     known = ", ".join(f"{target} by {operation}" for target, operation in effect.acts_on)
     wanted = " by ".join(part for part in (entry.acts_on, entry.operation) if part)
     raise ConfigError(
@@ -292,25 +270,15 @@ def _expression(entry: EffectEntry) -> BoundEffect:
 
 def _levels(entry: EffectEntry) -> BoundEffect:
     (channel,) = entry.channels
-    labels = np.array(list(entry.parameters), dtype=str)
-    order = np.argsort(labels)
-    values = np.array(list(entry.parameters.values()))[order]
-    labels = labels[order]
 
     def shape(given: Mapping[str, np.ndarray]) -> np.ndarray:
-        found = _as_label(np.asarray(given[channel]))
-        place = np.minimum(np.searchsorted(labels, found), labels.size - 1)
-        return np.where(labels[place] == found, values[place], 0.0)  # 0 for a category without a value
+        values = np.asarray(given[channel])
+        label = "{:g}".format if values.dtype.kind in "fiu" else str  # so that repeat 2.0 is level "2"
+        found, codes = np.unique(values, return_inverse=True)
+        # 0 for a category without a value
+        return np.array([entry.parameters.get(label(value), 0.0) for value in found])[codes]
 
     target, operation = entry.acts_on or "force", entry.operation or "add"
     return BoundEffect(
         LEVELS, (channel,), target, operation, "value of the level", dict(entry.parameters), shape
     )
-
-
-def _as_label(values: np.ndarray) -> np.ndarray:
-    """Return categories as text; numbers as %g, so that repeat 2.0 is level "2"."""
-    if values.dtype.kind in "fiu":
-        found, codes = np.unique(values, return_inverse=True)
-        return np.array([f"{v:g}" for v in found], dtype=str)[codes].reshape(values.shape)
-    return values.astype(str)

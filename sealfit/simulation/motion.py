@@ -10,7 +10,7 @@ import numpy as np
 
 from sealfit.physics.aging_laws import aging_law
 from sealfit.physics.stribeck import stribeck_decay
-from sealfit.simulation.model import QUANTITIES, BoundEffect, Physics, declared_parameters, resolve_effects
+from sealfit.simulation.model import CONDITIONS, BoundEffect, Physics, declared_parameters, resolve_effects
 from sealfit.simulation.spec import STEADY_LENGTHS, Design, Spec
 
 # ---------------------------------------------------------------- motion
@@ -56,9 +56,8 @@ def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> 
     total = design.strokes_per_file * period + 0.5 * rest
     step = max(1.0 / design.sampling_Hz, total / (design.max_rows - 1))
     step = np.ceil(np.round(step / TICK_S, 6)) * TICK_S
-    return move_at(
-        design, speed_mm_s, direction, start_mm, np.round(np.arange(int(total / step) + 1) * step, 5)
-    )
+    time = np.round(np.arange(int(total / step) + 1) * step, 5)
+    return move_at(design, speed_mm_s, direction, start_mm, time)
 
 
 def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, time: np.ndarray) -> Motion:
@@ -71,10 +70,9 @@ def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, 
     cruising = (since > ramp) & (since < ramp + cruise)
     steady_from = 0.5 * speed_mm_s * ramp + STEADY_LENGTHS * design.stiffness_mm
     sign = direction * np.where(number % 2, -1, 1)
-    both = design.strokes_per_file > 1
     return Motion(
         time_s=time,
-        stroke_time_s=np.maximum(since, 0.0) if both else time,
+        stroke_time_s=np.maximum(since, 0.0) if design.both_ways else time,
         displacement_mm=start_mm + np.where(sign > 0, along, length - along),
         distance_mm=along,
         speed_mm_s=sign * speed,
@@ -143,9 +141,8 @@ def with_presliding(
     damping_s : float
         sigma_1 / sigma_0 in s.
     """
-    decay = np.exp(
-        -np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / rise_mm
-    ).tolist()
+    steps = np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0]))
+    decay = np.exp(-steps / rise_mm).tolist()
     result = limit_N.astype(float)
     phase = 2 * motion.stroke + motion.cruising
     edges = np.flatnonzero(np.diff(phase, prepend=-1, append=-1))
@@ -172,7 +169,6 @@ BY_TARGET = {
     "v_s": ("v_s",),
     "sigma_2": ("sigma_2",),
 }
-CONDITIONS = ("temperature_C", "compression_ratio_pct", "aging_days")
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +185,7 @@ class SteadyLaw:
 
     def without(self, number: int) -> SteadyLaw:
         """Return the law without its effect `number`."""
-        return replace(self, effects=tuple(e for k, e in enumerate(self.effects) if k != number))
+        return replace(self, effects=self.effects[:number] + self.effects[number + 1 :])
 
     def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the steady bristle force, viscous part and added forces, in N, broadcast over the channels.
@@ -212,43 +208,29 @@ class SteadyLaw:
                 now[quantity] = self._changed(target, now[quantity], channels)
         days = given.get("aging_days", np.zeros(1))
         for end in "sc":
-            law = aging_law(days, mu_0=now[f"mu_0{end}"], a=now[f"a_{end}"], b=now[f"b_{end}"])
-            now[f"mu_{end}"] = self._changed(f"mu_{end}", law, channels)
+            now[f"mu_{end}"] = self._changed(f"mu_{end}", _aged(now, end, days), channels)
         speed = np.atleast_1d(channels["speed_mm_s"]).astype(float)
         mu = now["mu_c"] + (now["mu_s"] - now["mu_c"]) * stribeck_decay(speed, now["v_s"])
-        mu = self._changed("mu", mu, channels, factors_first=True)
+        for operation in ("multiply", "add"):
+            mu = self._changed("mu", mu, channels, operation)
         load = np.asarray(channels.get("load_N", 1.0), dtype=float)
-        limit, viscous = load * mu * np.sign(speed), now["sigma_2"] * speed
-        for effect in self._acting("force", "multiply"):
-            factor = 1.0 + effect.shape(channels)
-            limit, viscous = limit * factor, viscous * factor
-        added = np.zeros(1)
-        for effect in self._acting("force", "add"):
-            added = added + effect.shape(channels)
-        return limit, viscous, added
+        limit = self._changed("force", load * mu * np.sign(speed), channels, "multiply")
+        viscous = self._changed("force", now["sigma_2"] * speed, channels, "multiply")
+        return limit, viscous, self._changed("force", np.zeros(1), channels, "add")
 
     def force_N(self, channels: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the force of steady sliding, in N, signed as in the file."""
         limit, viscous, added = self.parts(channels)
         return limit + viscous + added
 
-    def _acting(self, target: str, operation: str) -> list[BoundEffect]:
-        return [e for e in self.effects if (e.acts_on, e.operation) == (target, operation)]
-
     def _changed(
-        self,
-        target: str,
-        value: np.ndarray,
-        channels: Mapping[str, np.ndarray],
-        *,
-        factors_first: bool = False,
+        self, target: str, value: np.ndarray, channels: Mapping[str, np.ndarray], operation: str | None = None
     ) -> np.ndarray:
-        own = [e for e in self.effects if e.acts_on == target]
-        if factors_first:
-            own.sort(key=lambda effect: effect.operation == "add")
-        for effect in own:
-            shape = effect.shape(channels)
-            value = value * (1.0 + shape) if effect.operation == "multiply" else value + shape
+        """Return a value with the effects on `target` applied, all of them or those of one operation."""
+        for effect in self.effects:
+            if effect.acts_on == target and operation in (None, effect.operation):
+                shape = effect.shape(channels)
+                value = value * (1.0 + shape) if effect.operation == "multiply" else value + shape
         return value
 
 
@@ -265,11 +247,12 @@ def steady_law(spec: Spec) -> SteadyLaw:
 
 def law_of_condition(physics: Physics, condition: Mapping[str, float]) -> dict[str, float]:
     """Return the declared model's parameters at one condition without effects, mu_s and mu_c included."""
-    given = {name: np.array([condition[name]], dtype=float) for name in CONDITIONS if name in condition}
+    given = {name: np.array([value], dtype=float) for name, value in condition.items()}
     values = {name: float(value[0]) for name, value in declared_parameters(physics, given).items()}
-    days = float(condition.get("aging_days", 0.0))
-    for end in "sc":
-        values[f"mu_{end}"] = float(
-            aging_law(days, mu_0=values[f"mu_0{end}"], a=values[f"a_{end}"], b=values[f"b_{end}"])
-        )
-    return {name: values[name] for name in ("mu_s", "mu_c", *QUANTITIES)}
+    days = condition.get("aging_days", 0.0)
+    return {f"mu_{end}": float(_aged(values, end, days)) for end in "sc"} | values
+
+
+def _aged(values: Mapping, end: str, days):
+    """Return mu_s or mu_c (`end` "s" or "c") after so many days by Eq. 15."""
+    return aging_law(days, mu_0=values[f"mu_0{end}"], a=values[f"a_{end}"], b=values[f"b_{end}"])

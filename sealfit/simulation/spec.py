@@ -18,7 +18,7 @@ from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import parse
 from sealfit.simulation.channels import Channel
-from sealfit.simulation.model import EffectEntry, Physics, resolve_effects
+from sealfit.simulation.model import CONDITIONS, EffectEntry, Physics, resolve_effects
 from sealfit.simulation.noise import Noise
 
 # ---------------------------------------------------------------- design
@@ -81,14 +81,20 @@ class Design(Strict):
         return self.unaged or bool(self.days)
 
     @property
-    def columns(self) -> dict[str, bool]:
-        """Which condition columns and load runs.csv has."""
-        return {
-            "temperature_C": bool(self.temperatures_C),
-            "compression_ratio_pct": bool(self.compressions_pct),
+    def both_ways(self) -> bool:
+        """Whether every file has strokes in both directions."""
+        return self.strokes_per_file > 1
+
+    @property
+    def columns(self) -> list[str]:
+        """The condition columns and load that runs.csv has."""
+        values = {
+            "temperature_C": self.temperatures_C,
+            "compression_ratio_pct": self.compressions_pct,
             "aging_days": self.aging,
-            "load_N": bool(self.loads_N),
+            "load_N": self.loads_N,
         }
+        return [name for name, there in values.items() if there]
 
     @model_validator(mode="after")
     def _holds_together(self) -> Design:
@@ -96,7 +102,7 @@ class Design(Strict):
             values = getattr(self, name)
             if len(set(values)) != len(values):
                 raise ValueError(f"{name} names a value twice")
-        if self.strokes_per_file > 1 and len(self.directions) < 2:
+        if self.both_ways and len(self.directions) < 2:
             raise ValueError("strokes_per_file above 1 needs directions = [1, -1]: strokes go both ways")
         if self.stroke_mm < 2.5 * STEADY_LENGTHS * self.stiffness_mm:
             raise ValueError(
@@ -114,21 +120,12 @@ class Design(Strict):
 
 
 def plan_files(design: Design, random: np.random.Generator) -> pd.DataFrame:
-    """Return one row per trace file, sorted as runs.csv lists them.
+    """Return one row per trace file, sorted as runs.csv lists them; `random` gives the order of the runs.
 
-    Parameters
-    ----------
-    design : Design
-        The SPEC's.
-    random : Generator
-        Gives the order of the runs.
-
-    Returns
-    -------
-    DataFrame
-        The columns of runs.csv without channels, and `condition`, `direction`, `run_order` (from 1) and
-        `elapsed_h`. A run's repeats follow each other. Columns that the design does not have are missing.
+    The columns are those of runs.csv without channels, and `condition`, `direction`, `run_order` (from 1) and
+    `elapsed_h`. A run's repeats follow each other. Columns that the design does not have are missing.
     """
+    ways = design.directions[:1] if design.both_ways else design.directions
     rows = []
     for (temperature, compression, days), specimen in product(
         _conditions(design), range(1, design.specimens + 1)
@@ -139,17 +136,11 @@ def plan_files(design: Design, random: np.random.Generator) -> pd.DataFrame:
             parts += [f"{compression:g}pct"] if compression is not None else []
         condition = "_".join(parts) or "rubber"
         specimen_id = f"{condition}_s{specimen}"
-        for load, speed, direction in product(
-            design.loads_N or (None,), design.speeds_mm_s, _directions(design)
-        ):
+        for load, speed, direction in product(design.loads_N or (None,), design.speeds_mm_s, ways):
             words = [specimen_id if design.specimens > 1 else condition]
             words += [f"{load:g}N"] if len(design.loads_N) > 1 else []
             words += [f"{speed:g}mms"]
-            words += (
-                [{1: "fwd", -1: "back"}[direction]]
-                if len(design.directions) > 1 and not _both(design)
-                else []
-            )
+            words += [{1: "fwd", -1: "back"}[direction]] if len(ways) > 1 else []
             run_id = "_".join(words)
             for repeat in range(1, design.repeats + 1):
                 rows.append(
@@ -168,16 +159,8 @@ def plan_files(design: Design, random: np.random.Generator) -> pd.DataFrame:
                     }
                 )
     files = pd.DataFrame(rows)
-    files = files.drop(columns=[name for name, there in design.columns.items() if not there])
+    files = files.drop(columns=[name for name in (*CONDITIONS, "load_N") if name not in design.columns])
     return _dated(files, design, random) if design.dated else files
-
-
-def _both(design: Design) -> bool:
-    return design.strokes_per_file > 1
-
-
-def _directions(design: Design) -> tuple[int, ...]:
-    return design.directions[:1] if _both(design) else design.directions
 
 
 def _conditions(design: Design) -> list[tuple[float | None, float | None, float | None]]:
@@ -193,9 +176,9 @@ def _conditions(design: Design) -> list[tuple[float | None, float | None, float 
 def _dated(files: pd.DataFrame, design: Design, random: np.random.Generator) -> pd.DataFrame:
     """Return `files` with started_at, run_order and elapsed_h."""
     runs = files["run_id"].drop_duplicates().to_numpy()
-    place = dict(zip(runs, range(len(runs)), strict=True))
     if design.order != "listed":
-        place = dict(zip(random.permutation(runs).tolist(), range(len(runs)), strict=True))
+        runs = random.permutation(runs)
+    place = {run: number for number, run in enumerate(runs)}
     by_days = design.order == "calendar" and "aging_days" in files
     block = files["aging_days"].to_numpy() if by_days else np.zeros(len(files))
     order = np.lexsort([files["repeat"], files["run_id"].map(place), block])
@@ -209,9 +192,8 @@ def _dated(files: pd.DataFrame, design: Design, random: np.random.Generator) -> 
     run_order = np.empty(len(files))
     run_order[order] = np.arange(1, len(files) + 1)
     seconds = np.round(elapsed * 3600).astype(int)  # started_at is written to the second
-    started = [
-        (design.first_start + timedelta(seconds=s)).isoformat(timespec="seconds") for s in seconds.tolist()
-    ]
+    times = (design.first_start + timedelta(seconds=s) for s in seconds.tolist())
+    started = [time.isoformat(timespec="seconds") for time in times]
     return files.assign(started_at=started, run_order=run_order, elapsed_h=seconds / 3600)
 
 
@@ -219,28 +201,12 @@ def _dated(files: pd.DataFrame, design: Design, random: np.random.Generator) -> 
 # What a SPEC says: rubber, rig, design, effects and scatter; checked on load, unknown keys refused.
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-TRACE_NAMES = ("time_s", "displacement_mm", "force_N")
-RUN_NAMES = (
-    "file",
-    "run_id",
-    "repeat",
-    "specimen_id",
-    "temperature_C",
-    "compression_ratio_pct",
-    "aging_days",
-    "load_N",
-)
-DERIVED_NAMES = (
-    "distance_mm",
-    "stroke",
-    "direction",
-    "run_order",
-    "elapsed_h",
-    "speed_set_mm_s",
-    "condition",
-    "series",
-)
-TAKEN = {*TRACE_NAMES, *RUN_NAMES, *DERIVED_NAMES, "speed_mm_s", "started_at", "rubber", "pi"}
+TAKEN = {  # of traces, of runs.csv, derived from them, and of formulas
+    "time_s", "displacement_mm", "force_N",
+    "file", "run_id", "repeat", "specimen_id", *CONDITIONS, "load_N", "speed_mm_s", "started_at",
+    "distance_mm", "stroke", "direction", "run_order", "elapsed_h", "speed_set_mm_s", "condition", "series",
+    "rubber", "pi",
+}  # fmt: skip
 
 
 class Spec(Strict):
@@ -258,10 +224,10 @@ class Spec(Strict):
     @property
     def channel_names(self) -> tuple[str, ...]:
         """Every channel that an effect may read, in the names of sealfit's tables."""
-        own = [name for name, there in self.design.columns.items() if there]
         dated = ["run_order", "elapsed_h"] if self.design.dated else []
         along = ["time_s", "displacement_mm", "distance_mm", "speed_mm_s", "direction", "stroke"]
-        return (*along, "repeat", "specimen_id", *own, *dated, *(c.name for c in self.channels))
+        own = [channel.name for channel in self.channels]
+        return (*along, "repeat", "specimen_id", *self.design.columns, *dated, *own)
 
     def risen(self) -> Spec:
         """Return the SPEC whose `design.stiffness_mm` is the longest rise that `physics.sigma_0` makes.
@@ -299,18 +265,16 @@ class Spec(Strict):
                 )
         labels = {c.name: c.labels for c in self.channels if c.kind == "category" and c.labels}
         for number, effect in enumerate(self.effects):
-            for category in effect.parameters if effect.id == LEVELS and effect.channels[0] in labels else ():
-                if category not in labels[effect.channels[0]]:
-                    raise ValueError(
-                        f"effects.{number} (levels): '{category}' is no label of {effect.channels[0]}"
-                    )
-            read = sorted(parse(effect.formula).names) if effect.formula is not None else ()
-            for name in (*effect.channels, *(n for n in read if n not in effect.parameters)):
+            place = f"effects.{number} ({effect.id})"
+            if effect.id == LEVELS and (known := labels.get(effect.channels[0])):
+                for category in effect.parameters:
+                    if category not in known:
+                        raise ValueError(f"{place}: '{category}' is no label of {effect.channels[0]}")
+            read = parse(effect.formula).names - set(effect.parameters) if effect.formula is not None else ()
+            for name in (*effect.channels, *sorted(read)):
                 if name not in self.channel_names:
-                    raise ValueError(
-                        f"effects.{number} ({effect.id}): there is no channel '{name}'; known are "
-                        + ", ".join(self.channel_names)
-                    )
+                    known = ", ".join(self.channel_names)
+                    raise ValueError(f"{place}: there is no channel '{name}'; known are {known}")
         return self
 
 
@@ -333,6 +297,7 @@ def load_spec(path: Path) -> Spec:
         raise ConfigError("is not UTF-8.", file=path, fix="Save it as UTF-8.") from error
     try:
         spec = Spec.model_validate(tomllib.loads(text))
+        resolve_effects(spec.effects)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(
             f"is not TOML: {error}.", file=path, fix="See sample_data/simulated.spec.toml for an example."
@@ -341,8 +306,6 @@ def load_spec(path: Path) -> Spec:
         raise ConfigError(
             explain(error, Spec), file=path, fix="sample_data/README.md lists every key."
         ) from error
-    try:
-        resolve_effects(spec.effects)
     except ConfigError as error:
         raise ConfigError(error.message, file=path, fix=error.fix) from error
     return spec
