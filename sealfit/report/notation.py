@@ -13,9 +13,6 @@ from sealfit.config import Config
 from sealfit.ingest.categorical import UNAGED
 from sealfit.units import Units
 
-# ---------------------------------------------------------------- numbers
-# Numbers for readers: a value rounded to its uncertainty, and a typographic minus sign.
-
 NOTHING = "–"
 THIN = "\u202f"  # narrow no-break space: between thousands, and around the cross of a power of ten
 _UP = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -97,9 +94,8 @@ def measured(value: float | None, lo: float | None, hi: float | None, digits: in
     if not known(value):
         return NOTHING, NOTHING
     if not (known(lo) and known(hi)):
-        return number(value), f"from {number(lo)}" if known(lo) else f"up to {number(hi)}" if known(
-            hi
-        ) else NOTHING
+        end = f"from {number(lo)}" if known(lo) else f"up to {number(hi)}" if known(hi) else NOTHING
+        return number(value), end
     if hi == lo:
         return number(value), f"[{number(lo)}, {number(hi)}]"
     power = _power(max(abs(value), abs(lo), abs(hi)))
@@ -227,10 +223,11 @@ def symbol_html(name: str) -> Markup:
     >>> str(symbol_html("mu_s")), str(symbol_html("<b>"))
     ('<i>μ</i><sub>s</sub>', '&lt;b&gt;')
     """
-    base, sub = _split(name)
-    if base is None:
+    word, sub = _split(name)
+    if word is None:
         return escape(name)
-    return Markup("<i>{}</i><sub>{}</sub>").format(base, sub) if sub else Markup("<i>{}</i>").format(base)
+    letter = Markup("<i>{}</i>").format(GREEK.get(word, word))
+    return letter + Markup("<sub>{}</sub>").format(sub) if sub else letter
 
 
 def symbol_plain(name: str) -> str:
@@ -241,8 +238,9 @@ def symbol_plain(name: str) -> str:
     >>> symbol_plain("sigma_2"), symbol_plain("rate")
     ('σ_2', 'rate')
     """
-    base, sub = _split(name)
-    return name if base is None else f"{base}_{sub}" if sub else base
+    word, sub = _split(name)
+    letter = GREEK.get(word, word)
+    return name if word is None else f"{letter}_{sub}" if sub else letter
 
 
 def symbol_math(name: str) -> str:
@@ -253,18 +251,16 @@ def symbol_math(name: str) -> str:
     >>> symbol_math("mu_s"), symbol_math("cost$")
     ('$\\mu_{\\mathrm{s}}$', 'cost\\$')
     """
-    base, sub = _split(name)
-    if base is None:
+    word, sub = _split(name)
+    if word is None:
         return plain(name)
-    letter = next((f"\\{word}" for word, sign in GREEK.items() if sign == base), base)
+    letter = f"\\{word}" if word in GREEK else word
     return f"${letter}_{{\\mathrm{{{sub}}}}}$" if sub else f"${letter}$"
 
 
 def _split(name: str) -> tuple[str | None, str]:
     found = _SYMBOL.fullmatch(str(name))
-    if found is None:
-        return None, ""
-    return GREEK.get(found[1], found[1]), found[2] or found[3] or ""
+    return (None, "") if found is None else (found[1], found[2] or found[3] or "")
 
 
 def plain(text: object) -> str:
@@ -404,6 +400,10 @@ class ConditionNames:
         except ValueError:
             return float("nan")
 
+    def place(self, text: object) -> tuple[bool, list]:
+        """Return a sort key of conditions and series: unaged first, then by the numbers of their names."""
+        return not is_unaged(text), natural(self(text))
+
     @property
     def key(self) -> str:
         """The names of the values, in their order; "" for a single one."""
@@ -412,11 +412,10 @@ class ConditionNames:
         return " · ".join(channel_words(name, self.units) for name in self.columns)
 
     def _value(self, name: str, value: str) -> str:
+        if not re.fullmatch(r"-?[0-9.]+(e[-+]?[0-9]+)?", value):
+            return value
         unit = self.units.of(name)
-        number = re.fullmatch(r"-?[0-9.]+(e[-+]?[0-9]+)?", value)
-        if unit:
-            return f"{value} {unit}" if number else value
-        return f"{channel_words(name, self.units)} {value}" if number else value
+        return f"{value} {unit}" if unit else f"{channel_words(name, self.units)} {value}"
 
 
 def is_unaged(text: object) -> bool:
@@ -426,5 +425,31 @@ def is_unaged(text: object) -> bool:
 
 def joined(words: Sequence[str]) -> str:
     """Return "a", "a and b", "a, b and c"."""
-    words = [str(word) for word in words]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else ""
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+def capital(text: str) -> str:
+    """Return text with its first letter large."""
+    return text[:1].upper() + text[1:]
+
+
+# ---------------------------------------------------------------- order
+
+
+def is_number(text: str) -> bool:
+    """Return whether text is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def by_number(text: str) -> tuple[int, float, str]:
+    """Return a sort key that puts texts that are numbers by their size and before the others."""
+    return (0, float(text), "") if is_number(text) else (1, 0.0, text)
+
+
+def natural(text: str) -> list[tuple[int, float, str]]:
+    """Return a sort key that puts 9 before 10, word by word."""
+    return [by_number(word) for word in text.split()]

@@ -14,7 +14,6 @@ from sealfit.report.notation import (
     ConditionNames,
     count,
     given,
-    is_unaged,
     known,
     measured,
     number,
@@ -22,7 +21,7 @@ from sealfit.report.notation import (
     symbol_html,
     true_units,
 )
-from sealfit.report.style import MOST_ROWS, natural, spread
+from sealfit.report.style import MOST_ROWS, spread
 
 # ---------------------------------------------------------------- law tables
 # Rows of the joint aging laws: form, parameters and evidence.
@@ -219,7 +218,7 @@ def _values(fit: pd.DataFrame, key: str) -> dict[tuple[str, str, str], dict]:
 
 def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.DataFrame, str]:
     """Return the rows of at most `MOST_ROWS` conditions or series, and a note on the selection."""
-    every = sorted(fit[key].unique(), key=lambda name: _place(name, names))
+    every = sorted(fit[key].unique(), key=names.place)
     if len(every) <= MOST_ROWS:
         return fit, ""
     stored = (
@@ -287,13 +286,8 @@ def _rows_of(
     found: dict[tuple[str, str], Rows] = {}
     for row in _records(fit, key, second):
         found.setdefault((row[key], row[second]), {})[row["parameter"], row["unit"] or ""] = row
-    places = {name: _place(name, names) for name, _ in found}
+    places = {name: names.place(name) for name, _ in found}
     return sorted(found.items(), key=lambda entry: places[entry[0][0]])
-
-
-def _place(name: str, names: ConditionNames) -> tuple[bool, list]:
-    """Return a sort key of a condition or series."""
-    return not is_unaged(name), natural((names(name), None))
 
 
 def _records(rows: pd.DataFrame, *keys: str) -> list[dict]:

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 import matplotlib as mpl
@@ -19,8 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from numpy.typing import ArrayLike
 
-from sealfit.report.notation import count, plain, power_of_ten, short, symbol_math
+from sealfit.report.notation import count, joined, plain, power_of_ten, short, symbol_math
 
 # ---------------------------------------------------------------- excerpts
 # Selection of the panels, rows and legend keys that are shown for a large campaign.
@@ -81,8 +82,7 @@ def telling(
             said.append(f"the {third} {words}")
     rest = spread([k for k in range(len(things)) if k not in picked], MOST_PANELS - len(picked))
     said.append(f"{len(rest)} of the others, selected evenly" if picked else "selected evenly")
-    words = " and ".join([", ".join(said[:-1]), said[-1]]) if len(said) > 1 else said[0]
-    text = f"{MOST_PANELS} of {count(len(things), what, what)} are drawn: {words}."
+    text = f"{MOST_PANELS} of {count(len(things), what, what)} are drawn: {joined(said)}."
     return [things[k] for k in sorted([*picked, *rest])], text
 
 
@@ -104,7 +104,6 @@ def rms(values: Iterable[float]) -> float:
 
 
 # ---------------------------------------------------------------- axes
-# Shared by the plots: ticks, one scale for all panels, and the order of names.
 
 MOST_TICKS = 8  # names of categories that fit below a panel
 MOST_VALUES = 6  # values of four digits that fit there
@@ -155,37 +154,15 @@ def category_ticks(ax: Axes, labels: Sequence[str]) -> None:
     ax.grid(axis="x", visible=False)
 
 
+def draw_band(ax: Axes, x: ArrayLike, lo: ArrayLike, hi: ArrayLike, colour: str, alpha: float = 0.2) -> None:
+    """Shade what lies between `lo` and `hi`, without an outline."""
+    ax.fill_between(x, lo, hi, color=colour, alpha=alpha, linewidth=0)
+
+
 def padded(low: float, high: float) -> tuple[float, float]:
     """Return the ends of a scale that holds both values with a little room."""
     room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
     return float(low - room), float(high + room)
-
-
-def is_number(text: str) -> bool:
-    """Return whether text is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def in_order(values: Iterable[str], key: Callable[[str], str] = str) -> list[str]:
-    """Return texts in order, those that are numbers by their size and before the others."""
-    return sorted(
-        values,
-        key=lambda value: (0, float(key(value)), "") if is_number(key(value)) else (1, 0.0, key(value)),
-    )
-
-
-def natural(entry: tuple[str, object]) -> list[tuple[int, float, str]]:
-    """Return a sort key that puts 9 before 10."""
-    return [(0, float(word), "") if is_number(word) else (1, 0.0, word) for word in entry[0].split()]
-
-
-def capital(text: str) -> str:
-    """Return text with its first letter large."""
-    return text[:1].upper() + text[1:]
 
 
 def evenly(count: int, wanted: int) -> list[int]:
@@ -194,7 +171,6 @@ def evenly(count: int, wanted: int) -> list[int]:
 
 
 # ---------------------------------------------------------------- style
-# Style of the plots: colours, sizes, and the layout of panels in a figure.
 
 # Okabe & Ito, Color Universal Design (2008): distinguishable with all common kinds of colour vision.
 # Yellow is left out: it is too light for lines on white.
@@ -260,7 +236,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes, with a text alternative."""
+    """One pair of axes, with a text alternative; `limits` are set before `draw`, as by `Axes.set`."""
 
     title: str
     alt: str
@@ -268,6 +244,7 @@ class Panel:
     height: float = HEIGHT  # inches
     left: float = 0.68  # inches left of the axes, for their tick labels
     effect: int | None = None  # row in the closure's effects that it belongs to
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -334,7 +311,7 @@ def panel_figure(panel: Panel) -> Figure:
         return figure
 
 
-def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> Axes:
+def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> None:
     width, height = figure.get_figwidth(), figure.get_figheight()
     box = (
         (left + panel.left) / width,
@@ -343,6 +320,7 @@ def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> Axes:
         (panel.height - _BOTTOM - _TOP) / height,
     )
     ax = figure.add_axes(box)
+    ax.set(**panel.limits)
     panel.draw(ax)
     if ax.get_xscale() == "linear" and isinstance(ax.xaxis.get_major_locator(), AutoLocator):
         ax.xaxis.set_major_locator(round_ticks())
@@ -350,7 +328,6 @@ def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> Axes:
         _put_power_behind_title(axis)
     if panel.title:
         ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE), y=1.0)
-    return ax
 
 
 def _put_power_behind_title(axis: Axis) -> None:
@@ -383,11 +360,10 @@ def _handle(key: Key) -> Line2D | Patch:
         label = label.replace("_", " ", 1)
     if key.mark in ("band", "bar"):
         return Patch(color=key.colour, alpha=0.25 if key.mark == "band" else 1.0, label=label, linewidth=0)
+    drawn = Line2D([], [], color=key.colour, label=label)
     if key.mark in ("point", "open", "left"):
-        marker = {"point": "o", "open": "o", "left": "<"}[key.mark]
         face = "white" if key.mark == "open" else key.colour
-        return Line2D(
-            [], [], color=key.colour, marker=marker, markerfacecolor=face, linestyle="", label=label
-        )
-    style = {"line": "-", "dotted": ":", "dashed": "--"}[key.mark]
-    return Line2D([], [], color=key.colour, linestyle=style, label=label)
+        drawn.set(linestyle="", marker="<" if key.mark == "left" else "o", markerfacecolor=face)
+    else:
+        drawn.set_linestyle({"line": "-", "dotted": ":", "dashed": "--"}[key.mark])
+    return drawn

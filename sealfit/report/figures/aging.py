@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,7 @@ from sealfit.report.notation import (
     is_unaged,
     joined,
     measured,
+    natural,
     number,
     plain,
     short,
@@ -36,8 +38,8 @@ from sealfit.report.style import (
     Key,
     Panel,
     Plot,
+    draw_band,
     evenly,
-    natural,
     padded,
     rms,
     round_ticks,
@@ -47,10 +49,9 @@ from sealfit.report.style import (
 )
 from sealfit.units import Units
 
-# ---------------------------------------------------------------- figures curves
-
 TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
 MOST_TRACES = 6
+UNCORRECTED = Key("before, without the effects", FLOOR, "dotted")
 
 
 # ---------------------------------------------------------------- aging
@@ -59,42 +60,23 @@ def draw_aging(
 ) -> None:
     """Draw the coefficients of one series over aging time: the law with its band, and each condition's fit.
 
-    Parameters
-    ----------
-    ax : Axes
-        Drawn on; the caller owns the figure.
-    points : DataFrame
-        Columns quantity, aging_days, value, lo95, hi95: the fits per condition.
-    curves : DataFrame
-        Rows of table `aging_curves`.
-    units : Units
-        Give the labels their true units.
-    before : DataFrame, optional
-        Rows of the same table without the loop's effects.
+    `points` are the fits per condition, with columns quantity, aging_days, value, lo95, hi95; `curves` are
+    rows of table `aging_curves`, and `before` those of the same table without the loop's effects.
     """
     quantities = list(dict.fromkeys([*curves["quantity"], *points["quantity"]]))
     for k, quantity in enumerate(quantities):
         colour, marker = CYCLE[k % len(CYCLE)], "os^Dv"[k % 5]
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
-        ax.fill_between(
-            curve["aging_days"], curve["lo95"], curve["hi95"], color=colour, alpha=0.18, linewidth=0
-        )
+        draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, alpha=0.18)
         ax.plot(curve["aging_days"], curve["value"], color=colour)
         if before is not None:
             earlier = before[before["quantity"] == quantity].sort_values("aging_days")
             ax.plot(earlier["aging_days"], earlier["value"], color=colour, linestyle=":", linewidth=1.1)
         here = points[points["quantity"] == quantity]
-        spread = np.nan_to_num(
-            np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float)
-        )
+        ends = np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float)
+        spread = np.abs(np.nan_to_num(ends))
         markers, *_ = ax.errorbar(
-            here["aging_days"],
-            here["value"],
-            np.abs(spread),
-            color=colour,
-            fmt=marker,
-            elinewidth=0.8,
-            capsize=1.5,
+            here["aging_days"], here["value"], spread, color=colour, fmt=marker, elinewidth=0.8, capsize=1.5
         )
         explain(markers, [_of_point(row) for row in here.to_dict("records")])
     ax.xaxis.set_major_locator(round_ticks(integer=True))
@@ -120,7 +102,7 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     names = ConditionNames.of(config)
     quantities = list(dict.fromkeys(curves["quantity"]))
     points = aging_points(tables["steady_fit"], quantities, names)
-    series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural((names(s), None)))
+    series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural(names(s)))
     misfit = _law_misfits(points, curves) if len(series) > MOST_PANELS else {}
     series, note = telling(
         series,
@@ -140,28 +122,22 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     out = 0.0 if of_property else 0.002  # share of a campaign's values that may lie outside
     span = padded(shown.quantile(out), shown.quantile(1 - out))
     right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
+    limits = {"xlim": (-0.03 * right, 1.03 * right), "ylim": span}
     unaged = points["series"].map(is_unaged).astype(bool)
     panels = []
     for name in series:
         curve, earlier = curves[curves["series"] == name], before[before["series"] == name]
         here = points[(points["series"] == name) | (unaged & (points["rubber"] == rubber.get(name)))]
-
-        def draw(ax: Axes, here=here, curve=curve, earlier=earlier) -> None:
-            draw_aging(ax, here, curve, config.units, earlier)
-            ax.set_ylim(*span)
-            ax.set_xlim(-0.03 * right, 1.03 * right)
-
+        draw = partial(draw_aging, points=here, curves=curve, units=config.units, before=earlier)
         first = float(curve["value"].iloc[0])
-        alt = (
-            f"Aging, {names(name)}: {joined([symbol_plain(q) for q in quantities])} over {number(right)} d; "
-        )
-        alt += f"{symbol_plain(quantities[0])} starts at {number(first)}."
-        panels.append(Panel(short(names(name)), alt, draw))
+        symbols = [symbol_plain(quantity) for quantity in quantities]
+        alt = f"Aging, {names(name)}: {joined(symbols)} over {number(right)} d; "
+        alt += f"{symbols[0]} starts at {number(first)}."
+        panels.append(Panel(short(names(name)), alt, draw, limits=limits))
     legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
     of_point = "mean of a condition, 95 %" if of_property else "fit per condition, 95 %"
     legend += [Key(of_point, FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
-    if len(before):
-        legend.append(Key("before, without the effects", FLOOR, "dotted"))
+    legend += [UNCORRECTED] if len(before) else []
     return Plot("aging", "Aging", tuple(panels), tuple(legend), note)
 
 
@@ -171,10 +147,8 @@ def _law_misfits(points: pd.DataFrame, curves: pd.DataFrame) -> dict[str, float]
     gaps: dict[str, list[float]] = {}
     for (name, quantity), own in points.groupby(["series", "quantity"]):
         if (law := laws.get((name, quantity))) is not None:
-            expected = np.interp(
-                own["aging_days"].astype(float), law["aging_days"], law["value"].astype(float)
-            )
-            gaps.setdefault(name, []).extend((own["value"].astype(float) - expected).tolist())
+            days, values = own["aging_days"].astype(float), own["value"].astype(float)
+            gaps.setdefault(name, []).extend(values - np.interp(days, law["aging_days"], law["value"]))
     return {name: rms(values) for name, values in gaps.items()}
 
 
@@ -192,28 +166,14 @@ def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: Con
 def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
     """Draw one run's mean force along its displacement with its standard error; the steady window is shaded.
 
-    Parameters
-    ----------
-    ax : Axes
-        Drawn on; the caller owns the figure.
-    trace : DataFrame
-        Rows of table `traces_mean` of this run; the force is drawn in the direction of motion.
-    units : Units
-        Give the labels their true units.
+    `trace` are its rows of table `traces_mean`; the force is drawn in the direction of motion.
     """
     thin = envelope(along_motion(trace))
-    error = thin["force_se_N"].fillna(0)
-    ax.fill_between(
-        thin["displacement_mm"],
-        thin["force_N"] - error,
-        thin["force_N"] + error,
-        color=AFTER,
-        alpha=0.25,
-        linewidth=0,
-    )
+    x, force, error = thin["displacement_mm"], thin["force_N"], thin["force_se_N"].fillna(0)
+    draw_band(ax, x, force - error, force + error, AFTER, alpha=0.25)
     whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
-    ax.plot(thin["displacement_mm"], thin["force_N"], color=SKY, linewidth=0.8)
-    ax.plot(thin["displacement_mm"], thin["force_N"].where(whole), color=AFTER, linewidth=0.9)
+    ax.plot(x, force, color=SKY, linewidth=0.8)
+    ax.plot(x, force.where(whole), color=AFTER, linewidth=0.9)
     trace = trace.sort_values("displacement_mm")
     steady = trace["steady"].astype(bool)
     ax.fill_between(
@@ -247,7 +207,8 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     if chosen.empty:
         return None
     names, units = ConditionNames.of(config), config.units
-    shown = along_motion(traces[traces["run_id"].isin(chosen["run_id"])])["force_N"].dropna()
+    traces = traces[traces["run_id"].isin(chosen["run_id"])]
+    shown = along_motion(traces)["force_N"].dropna()
     span = padded(shown.min(), shown.max())
     panels = []
     for run in chosen.itertuples():
@@ -255,39 +216,22 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         speed = f", {given(run.speed)} {units.unit('speed')}" if np.isfinite(run.speed) else ""
         repeats = int(trace["n"].max())
         title = f"{names(run.condition)}{speed}"
-
-        def draw(ax: Axes, trace=trace) -> None:
-            draw_trace(ax, trace, units)
-            ax.set_ylim(*span)
-
         alt = f"Mean trace of {title}, {count(repeats, 'stroke')} averaged: {units.quantity('force')} from "
         alt += f"{number(trace['force_N'].min())} to {number(trace['force_N'].max())} {units.unit('force')}."
-        panels.append(Panel(short(title, 40), alt, draw))
-    counts = traces[traces["run_id"].isin(chosen["run_id"])].groupby("run_id")["n"]
-    fewer = bool((counts.min() < counts.max()).any())
-    legend = (
-        Key("mean of all repeats", AFTER),
-        *([Key("mean of fewer repeats", SKY)] if fewer else []),
-        Key("± standard error", AFTER, "band"),
-        Key("steady window", QUIET, "band"),
-    )
-    return Plot("traces_mean", "Averaged traces", tuple(panels), legend)
+        draw = partial(draw_trace, trace=trace, units=units)
+        panels.append(Panel(short(title, 40), alt, draw, limits={"ylim": span}))
+    legend = [Key("mean of all repeats", AFTER)]
+    if (traces["n"] < traces.groupby("run_id")["n"].transform("max")).any():
+        legend.append(Key("mean of fewer repeats", SKY))
+    legend += [Key("± standard error", AFTER, "band"), Key("steady window", QUIET, "band")]
+    return Plot("traces_mean", "Averaged traces", tuple(panels), tuple(legend))
 
 
 def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return up to six runs: conditions spread evenly, and along them the speeds from slow to fast.
 
-    Parameters
-    ----------
-    traces : DataFrame
-        Columns run_id and condition of table `traces_mean`, one row or more of a run.
-    runs : DataFrame
-        Table `runs`, for the speeds.
-
-    Returns
-    -------
-    DataFrame
-        Columns run_id, condition and speed; of six runs or fewer all of them, in their order.
+    `traces` has columns run_id and condition, one row or more of a run; table `runs` gives the speeds. The
+    result has columns run_id, condition and speed; of six runs or fewer it has all, in their order.
     """
     if traces.empty:
         return pd.DataFrame(columns=["run_id", "condition", "speed"])
@@ -298,21 +242,18 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     if len(known) <= MOST_TRACES:
         return known
     groups = [g.sort_values("speed") for _, g in known.groupby("condition", sort=False)]
-    n = min(MOST_TRACES, len(known))
     picked = []
-    for k, place in enumerate(evenly(len(groups), n)):
-        group = groups[place]
+    for k, group in enumerate(groups[place] for place in evenly(len(groups), MOST_TRACES)):
         left = group[~group["run_id"].isin([row["run_id"] for row in picked])]
         if len(left):
-            picked.append(left.iloc[evenly(len(left), n)[k]])
+            picked.append(left.iloc[evenly(len(left), MOST_TRACES)[k]])
     return pd.DataFrame(picked)
 
 
-# ---------------------------------------------------------------- figures laws
-# The master curve: the values of all conditions over aging time scaled by the rate at their temperature.
+# ---------------------------------------------------------------- the master curve
+# The values of all conditions over aging time scaled by the rate at their temperature.
 
 MARKERS = "os^Dv<>"
-SCALED = "scaled aging time"
 
 
 def draw_master_curve(
@@ -324,24 +265,14 @@ def draw_master_curve(
 ) -> None:
     """Draw one quantity's values over scaled aging time, and the law with its 95 % band.
 
-    Parameters
-    ----------
-    ax : Axes
-        Drawn on; the caller owns the figure.
-    rows : DataFrame
-        Rows of table `master_curve`.
-    colours : mapping
-        Of each aging temperature.
-    units : Units
-        Give the labels their true units.
-    before : DataFrame, optional
-        Rows of the same table without the loop's effects: their law is drawn.
+    `rows` are rows of table `master_curve`, `colours` those of the aging temperatures. Of `before`, rows of
+    the same table without the loop's effects, the law is drawn.
     """
     values, law = rows[rows["kind"] == "value"], rows[rows["kind"] == "law"].sort_values("scaled_days")
     aged = values[values["scaled_days"] > 0]
     ax.set_xscale("symlog", linthresh=float(aged["scaled_days"].min()), linscale=0.7)
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.fill_between(law["scaled_days"], law["lo95"], law["hi95"], color=FLOOR, alpha=0.2, linewidth=0)
+    draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], FLOOR)
     ax.plot(law["scaled_days"], law["value"], color=FLOOR)
     if before is not None:
         earlier = before[before["kind"] == "law"].sort_values("scaled_days")
@@ -350,27 +281,17 @@ def draw_master_curve(
     ax.plot(fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=BLACK, clip_on=False)
     percents = np.sort(aged["compression_ratio_pct"].dropna().unique())
     for (celsius, percent), own in aged.groupby(["temperature_C", "compression_ratio_pct"], dropna=False):
-        marker = (
-            MARKERS[int(np.searchsorted(percents, percent)) % len(MARKERS)] if np.isfinite(percent) else "o"
-        )
+        rank = int(np.searchsorted(percents, percent)) if np.isfinite(percent) else 0
+        marker, colour = MARKERS[rank % len(MARKERS)], colours.get(celsius, BLACK)
         (points,) = ax.plot(
-            own["scaled_days"],
-            own["value"],
-            linestyle="",
-            marker=marker,
-            markersize=4,
-            color=colours.get(celsius, BLACK),
+            own["scaled_days"], own["value"], linestyle="", marker=marker, markersize=4, color=colour
         )
-        place = ", ".join(
-            f"{given(value)} {unit}"
-            for value, unit in ((celsius, "°C"), (percent, "%"))
-            if np.isfinite(value)
-        )
+        known = [(value, unit) for value, unit in ((celsius, "°C"), (percent, "%")) if np.isfinite(value)]
+        place = ", ".join(f"{given(value)} {unit}" for value, unit in known)
         texts = zip(own["value"], own["aging_days"], strict=True)
         explain(points, [f"{number(value, 4)}\n{place}, {given(days)} d" for value, days in texts])
-    quantity = str(rows["quantity"].iloc[0])
-    ax.set_xlabel(f"{SCALED} ({plain(units.of('aging_days'))})")
-    ax.set_ylabel(symbol_math(quantity))
+    ax.set_xlabel(f"scaled aging time ({plain(units.of('aging_days'))})")
+    ax.set_ylabel(symbol_math(rows["quantity"].iloc[0]))
 
 
 def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
@@ -386,20 +307,16 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     for (rubber, quantity), rows in spread(groups, MOST_PANELS):
         earlier = before[(before["rubber"] == rubber) & (before["quantity"] == quantity)]
         shown = pd.concat([rows["value"], earlier.loc[earlier["kind"] == "law", "value"]])
-        span = padded(shown.min(), shown.max())
-
-        def draw(ax: Axes, rows=rows, span=span, earlier=earlier) -> None:
-            draw_master_curve(ax, rows, colours, config.units, earlier)
-            ax.set_ylim(*span)
-
+        limits = {"ylim": padded(shown.min(), shown.max())}
+        draw = partial(draw_master_curve, rows=rows, colours=colours, units=config.units, before=earlier)
         title = f"{rubber}, {symbol_plain(quantity)}" if several else symbol_plain(quantity)
         alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
-        panels.append(Panel(title, alt, draw))
+        panels.append(Panel(title, alt, draw, limits=limits))
     legend = [
         Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)
     ]
     legend += [Key("unaged", BLACK, "point"), Key("law, 95 % band", FLOOR, "band")]
-    legend += [Key("before, without the effects", FLOOR, "dotted")] if len(before) else []
+    legend += [UNCORRECTED] if len(before) else []
     note = (
         "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; master_curve.parquet has all."
     )

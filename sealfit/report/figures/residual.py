@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from functools import partial
+from itertools import chain
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ from sealfit.report.drawing import explain
 from sealfit.report.figures.speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.notation import (
     by_gain,
+    capital,
     channel_label,
     channel_words,
     effect_label,
@@ -35,19 +37,21 @@ from sealfit.report.style import (
     Key,
     Panel,
     Plot,
-    capital,
     category_ticks,
+    draw_band,
     is_logarithmic,
     log_axis,
     value_ticks,
 )
 from sealfit.units import Units
 
-# ---------------------------------------------------------------- figures loop
-# Errors before and after, and the variance of the residual by level.
-
 LEVELS = ("specimen", "run", "file", "stroke", "sample")
 ERRORS = (("rmse_N", "all bins"), ("rmse_runs_N", "run means"), ("heldout_rmse_N", "held out"))
+MOST_CHANNELS = 18
+MANY_CATEGORIES = 24
+LOG_SPAN = 50.0
+Z95 = 1.959964
+STAGES = (Key("before", BEFORE, "open"), Key("after", AFTER, "point"))
 
 
 # ---------------------------------------------------------------- before and after
@@ -56,6 +60,7 @@ def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
     rows = [(key, label) for key, label in ERRORS if known(closure["before"].get(key))]
     values = [closure[stage].get(key) for key, _ in rows for stage in ("before", "after")]
     texts = together(values)
+    above = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
     box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85}
     largest = max(value for value in values if known(value))
     for k, (key, _) in enumerate(rows):
@@ -64,19 +69,9 @@ def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
         if known(after) and after != before:
             ax.plot([before, after], [y, y], color=QUIET, linewidth=1.2, zorder=1)
             ax.plot(after, y, "o", color=AFTER, markersize=6.5, zorder=3)
-            ax.annotate(
-                texts[2 * k + 1],
-                (after, y),
-                (0, 7),
-                textcoords="offset points",
-                ha="center",
-                color=AFTER,
-                bbox=box,
-            )
+            ax.annotate(texts[2 * k + 1], (after, y), color=AFTER, bbox=box, **above)
         ax.plot(before, y, "o", color=BEFORE, markersize=6.5, zorder=2)
-        ax.annotate(
-            texts[2 * k], (before, y), (0, 7), textcoords="offset points", ha="center", color=BEFORE, bbox=box
-        )
+        ax.annotate(texts[2 * k], (before, y), color=BEFORE, bbox=box, **above)
     floor = closure.get("noise_floor_N")
     if known(floor):
         ax.axvline(floor, color=FLOOR, linestyle="--", linewidth=1.0, zorder=0)
@@ -114,20 +109,14 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, co
     """Return the errors before and after with the noise floor, or None if the loop was not run."""
     if closure is None or not any(known(closure["before"].get(key)) for key, _ in ERRORS):
         return None
-    unit = config.units.unit("force")
-    pairs = [
-        f"{label} {number(closure['before'].get(key))} before, "
-        f"{number(closure['after'].get(key))} {unit} after"
-        for key, label in ERRORS
-    ]
-    floor = closure.get("noise_floor_N")
-    alt = (
-        f"Rms errors: {'; '.join(pairs)}; "
-        f"noise floor {f'{number(floor)} {unit}' if known(floor) else 'unknown'}."
-    )
-    panels = [
-        Panel("Errors and noise floor", alt, lambda ax: draw_errors(ax, closure, config.units), left=0.86)
-    ]
+    unit, floor = config.units.unit("force"), closure.get("noise_floor_N")
+    alt = "Rms errors: "
+    for key, label in ERRORS:
+        before, after = (number(closure[stage].get(key)) for stage in ("before", "after"))
+        alt += f"{label} {before} before, {after} {unit} after; "
+    alt += f"noise floor {f'{number(floor)} {unit}' if known(floor) else 'unknown'}."
+    draw = partial(draw_errors, closure=closure, units=config.units)
+    panels = [Panel("Errors and noise floor", alt, draw, left=0.86)]
     before, after = tables["residuals_before"], tables["residuals_after"]
     if len(before) and len(after):
         held = before["heldout_residual_N"].notna().any() and after["heldout_residual_N"].notna().any()
@@ -135,19 +124,12 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, co
         a, b = run_means(before, column).to_numpy(), run_means(after, column).to_numpy()
         if len(a) >= 4 and len(b) >= 4:
             alt = f"{'Held-out errors' if held else 'Errors'} of {len(a)} run means: standard deviation "
-            alt += f"{number(float(np.std(a)))} before, "
-            alt += f"{number(float(np.std(b)))} {unit} after."
-            panels.append(
-                Panel(
-                    "Errors of run means", alt, lambda ax: draw_histogram(ax, a, b, config.units, bool(held))
-                )
-            )
-    same = closure["before"] == closure["after"]
-    legend = (
-        [Key("declared model", BEFORE, "bar")]
-        if same
-        else [Key("before", BEFORE, "bar"), Key("after", AFTER, "bar")]
-    )
+            alt += f"{number(float(np.std(a)))} before, {number(float(np.std(b)))} {unit} after."
+            draw = partial(draw_histogram, before=a, after=b, units=config.units, held_out=held)
+            panels.append(Panel("Errors of run means", alt, draw))
+    legend = [Key("before", BEFORE, "bar"), Key("after", AFTER, "bar")]
+    if closure["before"] == closure["after"]:
+        legend = [Key("declared model", BEFORE, "bar")]
     if known(floor):
         legend.append(Key("noise floor", FLOOR, "dashed"))
     return Plot("before_after", "Errors before and after", tuple(panels), tuple(legend))
@@ -164,47 +146,35 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config:
     if errors is None or channels.empty:
         return None
     order = channel_order(channels)
-    own = [
-        name
-        for effect in by_gain(closure["effects"])
-        if not effect["candidate"]
-        for name in effect["channels"]
-    ]
+    added = [effect for effect in by_gain(closure["effects"]) if not effect["candidate"]]
+    own = chain.from_iterable(effect["channels"] for effect in added)
     name = next((name for name in own if name in order), order[0])
     panel = _channel_panel(channels[channels["channel"] == name], name, tables, config)
-    legend = (
-        Key("before", BEFORE, "open"),
-        Key("after", AFTER, "point"),
-        *(key for key in errors.legend if key.mark == "dashed"),
-    )
+    floor = (key for key in errors.legend if key.mark == "dashed")
     title = "Residual and errors before and after"
-    return Plot("finding", title, (panel, replace(errors.panels[0], height=panel.height)), legend)
+    return Plot("finding", title, (panel, errors.panels[0]), (*STAGES, *floor))
 
 
 # ---------------------------------------------------------------- residual by level
 def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
     """Draw the residual variance at every level, before and after; beside each bar its standard deviation."""
     whole = levels[levels["channel"].isna()]
-    names = [name for name in LEVELS if name in set(whole["level"])]
-    names += [name for name in dict.fromkeys(whole["level"]) if name not in LEVELS]
-    bars = [(stage, name) for name in names for stage in ("before", "after")]
+    names = [*LEVELS, *(name for name in dict.fromkeys(whole["level"]) if name not in LEVELS)]
+    names = [name for name in reversed(names) if name in set(whole["level"])]
     sd = {(row.stage, row.level): row.sd_N for row in whole.itertuples()}
-    found = [sd.get(bar) for bar in bars]
-    texts = dict(zip(bars, together(found), strict=True))
-    largest = max([value**2 for value in found if known(value)], default=1.0) or 1.0
+    texts = dict(zip(sd, together(list(sd.values())), strict=True))
+    largest = max([value**2 for value in sd.values() if known(value)], default=1.0) or 1.0
     single = not any(stage == "after" for stage in whole["stage"])
-    for k, name in enumerate(reversed(names)):
+    for k, name in enumerate(names):
         for stage, colour, shift in (("before", BEFORE, 0.19), ("after", AFTER, -0.19)):
             value = sd.get((stage, name))
             if not known(value):
                 continue
-            y = k if single else k + shift
-            ax.barh(y, value**2, 0.34, color=colour, linewidth=0)
-            ax.annotate(
-                texts[stage, name], (value**2, y), (4, 0), textcoords="offset points", va="center", size=7.5
-            )
+            place = (value**2, k if single else k + shift)
+            ax.barh(place[1], place[0], 0.34, color=colour, linewidth=0)
+            ax.annotate(texts[stage, name], place, (4, 0), textcoords="offset points", va="center", size=7.5)
     unit = plain(units.unit("force"))
-    ax.set_yticks(range(len(names)), list(reversed(names)))
+    ax.set_yticks(range(len(names)), names)
     ax.set_ylim(-0.6, len(names) - 0.4)
     ax.set_xlim(0.0, 1.2 * largest)
     ax.grid(axis="y", visible=False)
@@ -220,37 +190,18 @@ def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot 
     unit = config.units.unit("force")
     parts = [f"{row.level} {row.stage} {number(row.sd_N)} {unit}" for row in whole.itertuples()]
     alt = f"Standard deviation of the residual by level: {', '.join(parts)}."
-    height = 0.82 + 0.42 * whole["level"].nunique()
-    title = f"Variance by level (labels: sd in {unit})"
-    panel = Panel(
-        title, alt, lambda ax: draw_levels(ax, levels, config.units), height=max(height, 1.6), left=0.86
-    )
+    height = max(0.82 + 0.42 * whole["level"].nunique(), 1.6)
+    draw = partial(draw_levels, levels=levels, units=config.units)
+    panel = Panel(f"Variance by level (labels: sd in {unit})", alt, draw, height, left=0.86)
     legend = (Key("before", BEFORE, "bar"), Key("after", AFTER, "bar"))
     return Plot("variance_levels", "Residual variance by level", (panel,), legend)
-
-
-# ---------------------------------------------------------------- figures residual
-
-MOST_CHANNELS = 18
-MANY_CATEGORIES = 24
-LOG_SPAN = 50.0
-Z95 = 1.959964
 
 
 # ---------------------------------------------------------------- residual by channel
 def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> None:
     """Draw the mean residual along one channel before and after, with 95 % intervals from whole units.
 
-    Parameters
-    ----------
-    ax : Axes
-        Drawn on; the caller owns the figure.
-    rows : DataFrame
-        Rows of table `channels` of this channel.
-    channel : str
-        Its name.
-    units : Units
-        Give the labels their true units.
+    `rows` are those of table `channels` of this channel.
     """
     numeric = rows["x"].notna().all() and channel != "direction"
     x = rows["x"].to_numpy(float) if numeric else np.arange(len(rows), dtype=float)
@@ -260,7 +211,9 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     # The two stages are drawn side by side, so that neither hides the other.
     apart = 0.008 * (np.ptp(np.log(x)) if log else np.ptp(x)) if numeric else 0.09
     ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
-    many = not numeric and len(rows) > MANY_CATEGORIES  # drawn finer, or they are one blot
+    size = {"markersize": 3.6, "markeredgewidth": 0.9, "elinewidth": 0.9, "capsize": 1.8}
+    if not numeric and len(rows) > MANY_CATEGORIES:  # drawn finer, or they are one blot
+        size = {"markersize": 1.8, "markeredgewidth": 0.6, "elinewidth": 0.4, "capsize": 0.0}
     for stage, colour, marker, shift in (("before", BEFORE, "o", -apart), ("after", AFTER, "s", apart)):
         spread = Z95 * rows[f"{stage}_se_N"].fillna(0.0).to_numpy(float)
         places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
@@ -270,15 +223,12 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
             spread,
             color=colour,
             marker=marker,
-            markersize=1.8 if many else 3.6,
             markerfacecolor="white" if stage == "before" else colour,
-            markeredgewidth=0.6 if many else 0.9,
             linestyle="-" if numeric else "",
             linewidth=0.8,
-            elinewidth=0.4 if many else 0.9,
-            capsize=0.0 if many else 1.8,
             zorder=2 if stage == "before" else 3,
             rasterized=len(rows) > MOST_MARKS,
+            **size,
         )
         if len(rows) <= MOST_MARKS:
             names = [number(value, 4) for value in x] if numeric else categories(rows, channel)
@@ -300,9 +250,8 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
 def categories(rows: pd.DataFrame, channel: str) -> list[str]:
     """Return the names of a category's rows; both directions in words."""
     if channel == "direction":
-        return [
-            "forward" if value > 0 else "backward" for value in rows["x"].fillna(rows["label"]).astype(float)
-        ]
+        signs = rows["x"].fillna(rows["label"]).astype(float)
+        return ["forward" if sign > 0 else "backward" for sign in signs]
     return rows["label"].astype(str).tolist()
 
 
@@ -323,8 +272,7 @@ def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plo
         _channel_panel(channels[channels["channel"] == name], name, tables, config, span)
         for name in channel_order(channels)[:MOST_CHANNELS]
     ]
-    legend = (Key("before", BEFORE, "open"), Key("after", AFTER, "point"))
-    return Plot("residual_channels", "Residual by variable", tuple(panels), legend)
+    return Plot("residual_channels", "Residual by variable", tuple(panels), STAGES)
 
 
 def _channel_panel(
@@ -336,11 +284,7 @@ def _channel_panel(
 ) -> Panel:
     """Return a panel of the mean residual along a channel; `span` is that of its axis of forces."""
     rows = rows.sort_values("x") if rows["x"].notna().all() else rows
-
-    def draw(ax: Axes) -> None:
-        draw_channel(ax, rows, name, config.units)
-        ax.set_ylim(*(span or _span(rows)))
-
+    draw = partial(draw_channel, rows=rows, channel=name, units=config.units)
     words = channel_words(name, config.units)
     largest = [rows[f"{stage}_N"].abs().max() for stage in ("before", "after")]
     alt = f"Mean residual along {words}: largest {number(largest[0])} before, {number(largest[1])} "
@@ -348,7 +292,7 @@ def _channel_panel(
     tested = tables["levels"].dropna(subset=["channel", "p_value"])
     p = tested.loc[(tested["stage"] == "before") & (tested["channel"] == name), "p_value"]
     alt += f"; p {p_value(p.min())} before." if len(p) else "."
-    return Panel(short(capital(words), 38), alt, draw)
+    return Panel(short(capital(words), 38), alt, draw, limits={"ylim": span or _span(rows)})
 
 
 def _span(channels: pd.DataFrame) -> tuple[float, float]:
@@ -369,16 +313,7 @@ def _span(channels: pd.DataFrame) -> tuple[float, float]:
 def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> None:
     """Draw an effect along one channel: its form with the 95 % band, and the free shape it was compared with.
 
-    Parameters
-    ----------
-    ax : Axes
-        Drawn on; the caller owns the figure.
-    rows : DataFrame
-        Rows of table `shapes` of this effect and channel.
-    effect : mapping
-        Its entry in closure.json.
-    units : Units
-        Give the labels their true units.
+    `rows` are those of table `shapes` of this effect and channel, `effect` is its entry in closure.json.
     """
     channel, scale = rows["channel"].iloc[0], shape_scale(effect)
     numeric = rows["x"].notna().all() and channel != "direction"
@@ -388,7 +323,7 @@ def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> N
     ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
     if numeric:
         x = rows["x"].to_numpy(float)
-        ax.fill_between(x, lo, hi, color=AFTER, alpha=0.2, linewidth=0)
+        draw_band(ax, x, lo, hi, AFTER)
         ax.plot(x, free, color=FLOOR, linestyle="--", linewidth=1.1)
         ax.plot(x, value, color=AFTER)
         ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
@@ -429,22 +364,15 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, c
         return None
     panels = []
     for (index, channel), rows in shapes.groupby(["effect", "channel"], sort=False):
-        if not 0 <= int(index) < len(closure["effects"]):
-            continue
         effect = closure["effects"][int(index)]
         rows = rows.sort_values("x") if rows["x"].notna().all() else rows
-
-        def draw(ax: Axes, rows=rows, effect=effect) -> None:
-            draw_shape(ax, rows, effect, config.units)
-
+        draw = partial(draw_shape, rows=rows, effect=effect, units=config.units)
         scale = shape_scale(effect)
         words = effect_label(effect, config.units)
         alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
         alt += f"{shape_label(rows, effect, config.units)} from {number(scale * rows['value'].min())} to "
         alt += f"{number(scale * rows['value'].max())}."
         panels.append(Panel(short(capital(words), 40), alt, draw, effect=int(index)))
-    if not panels:
-        return None
     legend = [Key("effect, 95 % band", AFTER)]
     if shapes["free"].notna().any():
         legend.append(Key("free shape", FLOOR, "dashed"))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain, cycle
 
 import numpy as np
 import pandas as pd
@@ -13,10 +15,15 @@ from sealfit.config import Config
 from sealfit.report.drawing import explain
 from sealfit.report.notation import (
     ConditionNames,
+    by_number,
+    capital,
     channel_words,
     count,
     given,
+    is_number,
     is_unaged,
+    known,
+    natural,
     number,
     plain,
     short,
@@ -32,13 +39,9 @@ from sealfit.report.style import (
     Key,
     Panel,
     Plot,
-    capital,
     condition_misfits,
-    evenly,
-    in_order,
-    is_number,
+    draw_band,
     log_axis,
-    natural,
     padded,
     rms,
     shades,
@@ -47,8 +50,7 @@ from sealfit.report.style import (
 )
 from sealfit.units import Units
 
-# ---------------------------------------------------------------- figures speed
-# Force against speed: a panel per series, every condition with its model, band and run means.
+# ---------------------------------------------------------------- force against speed
 
 MOST_CURVES = 24  # in one panel
 MOST_FILES = 4  # named under the pointer
@@ -74,34 +76,17 @@ class Line:
 def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool = False) -> None:
     """Draw force against speed of several conditions: model with its band, declared model dotted, run means.
 
-    Parameters
-    ----------
-    ax : Axes
-        Drawn on; the caller owns the figure.
-    lines : sequence of Line
-        The conditions.
-    units : Units
-        Give the labels their true units.
-    log : bool
-        Whether the speed axis is logarithmic.
+    With `log` the speed axis is logarithmic.
     """
     dense = sum(len(line.points) for line in lines) > MOST_MARKS
     for line in lines:
         for curve in line.curves:
-            ax.fill_between(
-                curve["speed"], curve["lo"], curve["hi"], color=line.colour, alpha=0.2, linewidth=0
-            )
+            speed = curve["speed"]
+            draw_band(ax, speed, curve["lo"], curve["hi"], line.colour)
             if not curve["before"].equals(curve["after"]):
-                ax.plot(
-                    curve["speed"],
-                    curve["before"],
-                    color=line.colour,
-                    linestyle=":",
-                    linewidth=0.9,
-                    alpha=0.8,
-                )
-            backward = len(curve) and curve["direction"].iloc[0] < 0
-            ax.plot(curve["speed"], curve["after"], color=line.colour, linestyle="--" if backward else "-")
+                ax.plot(speed, curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
+            backward = curve["direction"].iloc[0] < 0
+            ax.plot(speed, curve["after"], color=line.colour, linestyle="--" if backward else "-")
         for direction, points in line.points.groupby("direction") if len(line.points) else ():
             drawn, *_ = ax.errorbar(
                 points["speed"],
@@ -143,22 +128,20 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     last = "aging_days" if config.aging else config.condition[-1]
     rubber = tables["steady"].drop_duplicates("condition").set_index("condition")["rubber"].to_dict()
     unaged = [c for c in conditions if is_unaged(c)]
-    groups = _groups([c for c in conditions if not is_unaged(c)], names, last)
-    if not groups:
-        groups = {"": unaged}
+    groups = _groups([c for c in conditions if not is_unaged(c)], names, last) or {"": unaged}
     groups, note = _telling(groups, len(conditions) - len(unaged), tables, names)
-    levels = in_order({names.parts(c).get(last, "") for group in groups.values() for c in group} - {""})
+    drawn = {*unaged, *chain.from_iterable(groups.values())}
+    levels = sorted({names.parts(c).get(last, "") for c in drawn} - {""}, key=by_number)
     numeric = all(is_number(level) for level in levels)
-    colour = dict(zip(levels, shades(len(levels)) if numeric else _cycle(len(levels)), strict=True))
+    colour = dict(zip(levels, shades(len(levels)) if numeric else cycle(CYCLE), strict=False))
     speeds = pd.concat([points["speed"], curves["speed"]])
     speeds = speeds[speeds > 0].astype(float)
     log = len(speeds) > 0 and speeds.max() / speeds.min() > LOG_SPAN
     # one scale for all panels, so that conditions can be compared across them
-    shown = pd.concat([points["force"] + points["sd"].fillna(0), points["force"] - points["sd"].fillna(0)])
-    shown = pd.concat([shown, curves["after"], curves["before"]]).dropna()
-    span = padded(shown.min(), shown.max())
+    force, sd = points["force"], points["sd"].fillna(0)
+    shown = pd.concat([force + sd, force - sd, curves["after"], curves["before"]]).dropna()
     x_span = (speeds.min() / 1.2 if log else 0.0, speeds.max() * (1.2 if log else 1.06))
-    drawn = {*unaged, *(c for group in groups.values() for c in group)}
+    limits = {"xlim": x_span, "ylim": padded(shown.min(), shown.max())}
     # curves of a condition: directions and loads
     most = max(2, MOST_CURVES // max(len(group) for group in groups.values()))
     own_curves = {
@@ -178,56 +161,39 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
             )
             for c in [*shared, *group]
         ]
-        panels.append(
-            Panel(
-                short(title),
-                _force_alt(title, lines, config),
-                _force_drawer(lines, config, log, span, x_span),
-                height=HEIGHT if len(groups) > 2 else TALL,
-            )
-        )
+        draw = partial(draw_force_speed, lines=lines, units=config.units, log=log)
+        height = HEIGHT if len(groups) > 2 else TALL
+        panels.append(Panel(short(title), _force_alt(title, lines, config), draw, height, limits=limits))
     legend = [Key(short(names(c)), BLACK) for c in spread(unaged, MOST_KEYS)]
-    legend += [
-        Key(short(_level_label(last, level, names)), colour[level]) for level in spread(levels, MOST_KEYS)
-    ]
+    for level in spread(levels, MOST_KEYS):
+        legend.append(Key(short(_level_label(last, level, names)), colour[level]))
     both = points["direction"].nunique() > 1
     legend.append(Key("run means, forward" if both else "run means", FLOOR, "point"))
     if both:
         legend.append(Key("run means, backward", FLOOR, "left"))
+    band = curves["lo"].notna().any()
     if len(curves):
-        legend.append(Key("model", FLOOR) if curves["lo"].notna().any() else Key("steady fit", FLOOR))
-        if curves["direction"].nunique() > 1:
-            legend.append(Key("model, backward", FLOOR, "dashed"))
-        if curves["lo"].notna().any():
-            legend.append(Key("95 % band", FLOOR, "band"))
-        if _differ(curves):
-            legend.append(Key("declared model", FLOOR, "dotted"))
+        legend.append(Key("model" if band else "steady fit", FLOOR))
+    if curves["direction"].nunique() > 1:
+        legend.append(Key("model, backward", FLOOR, "dashed"))
+    if band:
+        legend.append(Key("95 % band", FLOOR, "band"))
+    gap = (curves["after"] - curves["before"]).abs().max()
+    if gap > 1e-9 * max(curves["after"].abs().max(), 1e-300):
+        legend.append(Key("declared model", FLOOR, "dotted"))
     quantity = config.units.quantity("force")
     title = f"{capital(quantity)} against {config.units.quantity('speed')}"
     return Plot("force_speed", title, tuple(panels), tuple(legend), note)
 
 
-def _force_drawer(lines, config: Config, log: bool, span, x_span) -> Callable[[Axes], None]:
-    def draw(ax: Axes) -> None:
-        ax.set_xlim(*x_span)
-        draw_force_speed(ax, lines, config.units, log=log)
-        ax.set_xlim(*x_span)
-        ax.set_ylim(*span)
-        if log:
-            log_axis(ax)
-
-    return draw
-
-
 def _force_alt(title: str, lines: Sequence[Line], config: Config) -> str:
-    forces = pd.concat(
-        [line.points["force"] for line in lines if len(line.points)] or [pd.Series(dtype=float)]
-    )
-    unit = config.units.unit("force")
+    forces = [force for line in lines if len(line.points) for force in line.points["force"]]
     text = f"{config.units.quantity('force')} against {config.units.quantity('speed')}"
     text += f"{', ' + title if title else ''}: {count(len(lines), 'condition')}"
-    if len(forces):
-        text += f", run means from {number(forces.min())} to {number(forces.max())} {unit}"
+    if forces:
+        text += (
+            f", run means from {number(min(forces))} to {number(max(forces))} {config.units.unit('force')}"
+        )
     return text + "."
 
 
@@ -238,17 +204,17 @@ def run_points(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
         return pd.DataFrame(columns=["condition", "direction", "speed", "force", "sd", "n"]).astype(
             {"force": float}
         )
-    sign = used["direction"].astype(float)
-    rows = used.assign(speed=used["speed_mm_s"].abs(), force=used["force_N"] * sign)
-    files = rows.groupby(["condition", "run_id", "direction", "file"], sort=False)[["speed", "force"]].mean()
-    runs = files.groupby(level=["condition", "run_id", "direction"], sort=False)
-    found = runs["speed"].mean().to_frame()
-    found["force"], found["sd"], found["n"] = runs["force"].mean(), runs["force"].std(), runs["force"].size()
-    names = files.index.to_frame(index=False).groupby(["condition", "run_id", "direction"], sort=False)[
-        "file"
-    ]
-    found["files"] = names.agg(lambda own: ", ".join(spread(list(own), MOST_FILES)))
-    return found.reset_index()
+    rows = used.assign(speed=used["speed_mm_s"].abs(), force=used["force_N"] * used["direction"])
+    run = ["condition", "run_id", "direction"]
+    files = rows.groupby([*run, "file"], sort=False)[["speed", "force"]].mean().reset_index()
+    return (
+        files.groupby(run, sort=False)
+        .agg(
+            speed=("speed", "mean"), force=("force", "mean"), sd=("force", "std"), n=("force", "size"),
+            files=("file", lambda own: ", ".join(spread(list(own), MOST_FILES))),
+        )
+        .reset_index()
+    )  # fmt: skip
 
 
 def curve_lines(tables: Mapping[str, pd.DataFrame], config: Config) -> pd.DataFrame:
@@ -257,10 +223,7 @@ def curve_lines(tables: Mapping[str, pd.DataFrame], config: Config) -> pd.DataFr
     if curves.empty:
         return _steady_curves(tables["steady_fit"], tables["steady"])
     sign = np.sign(curves["speed_mm_s"]).replace(0.0, 1.0)
-    ends = np.sort(
-        np.stack([curves["force_after_lo95_N"] * sign, curves["force_after_hi95_N"] * sign]).astype(float),
-        axis=0,
-    )
+    ends = curves[["force_after_lo95_N", "force_after_hi95_N"]].mul(sign, axis=0)
     return pd.DataFrame(
         {
             "condition": curves["condition"],
@@ -269,8 +232,8 @@ def curve_lines(tables: Mapping[str, pd.DataFrame], config: Config) -> pd.DataFr
             "speed": curves["speed_mm_s"].abs(),
             "before": curves["force_before_N"] * sign,
             "after": curves["force_after_N"] * sign,
-            "lo": ends[0],
-            "hi": ends[1],
+            "lo": ends.min(axis=1),
+            "hi": ends.max(axis=1),
         }
     ).sort_values(["condition", "direction", "speed"])
 
@@ -283,26 +246,18 @@ def _steady_curves(fit: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
     for condition, rows in fit[fit["quantity"] == "steady"].groupby("condition", sort=False):
         values = rows.set_index("parameter")["value"].to_dict()
         here = steady[(steady["condition"] == condition) & steady["used"].astype(bool)]
-        load = here["load_N"].mean() if here["load_N"].notna().any() else np.nan
-        top = {"mu_s": values.get("mu_s", values.get("F_s")), "mu_c": values.get("mu_c", values.get("F_c"))}
-        top |= {"v_s": values.get("v_s"), "sigma_2": values.get("sigma_2")}
-        if (
-            here.empty
-            or any(value is None or not np.isfinite(value) for value in top.values())
-            or top["v_s"] <= 0
-        ):
+        load = here["load_N"].mean()
+        top = {f"mu_{end}": values.get(f"mu_{end}", values.get(f"F_{end}")) for end in "sc"}
+        top |= {name: values.get(name) for name in ("v_s", "sigma_2")}
+        if here.empty or not all(map(known, top.values())) or top["v_s"] <= 0:
             continue
-        speed = np.geomspace(
-            max(here["speed_mm_s"].abs().min(), 1e-6) / 1.2, here["speed_mm_s"].abs().max() * 1.05, 80
-        )
+        speeds = here["speed_mm_s"].abs()
+        speed = np.geomspace(max(speeds.min(), 1e-6) / 1.2, speeds.max() * 1.05, 80)
         force = stribeck_force(speed, 1.0 if np.isnan(load) else load, **top)
         found.append(pd.DataFrame({"condition": condition, "direction": 1.0, "load": load, "speed": speed,
                                    "before": force, "after": force, "lo": np.nan, "hi": np.nan}))  # fmt: skip
-    return (
-        pd.concat(found, ignore_index=True)
-        if found
-        else pd.DataFrame(columns=columns).astype({"speed": float})
-    )
+    empty = pd.DataFrame(columns=columns).astype({"speed": float})
+    return pd.concat(found, ignore_index=True) if found else empty
 
 
 def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict[str, list[str]]:
@@ -312,13 +267,12 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
         others = {name: value for name, value in names.parts(condition).items() if name != last}
         title = names(", ".join(f"{name}={value}" for name, value in others.items())) if others else ""
         groups.setdefault(title, []).append(condition)
-    groups = {
-        t: in_order(g, key=lambda c: names.parts(c).get(last, ""))
-        for t, g in sorted(groups.items(), key=natural)
-    }
+    level = {c: names.parts(c).get(last, "") for c in conditions}
+    titles = sorted(groups, key=natural)
+    groups = {title: sorted(groups[title], key=lambda c: by_number(level[c])) for title in titles}
     if all(len(group) <= MOST_COLOURS for group in groups.values()):
         return groups
-    if len(conditions) > MOST_PANELS and all(is_number(names.parts(c).get(last, "")) for c in conditions):
+    if len(conditions) > MOST_PANELS and all(map(is_number, level.values())):
         # numbers have an order
         return {title: spread(group, MOST_COLOURS) for title, group in groups.items()}
     return {names(c): [c] for group in groups.values() for c in group}
@@ -342,23 +296,14 @@ def _telling(
     return groups, f"{note} steady.parquet and curves.parquet have all." if note else ""
 
 
-def _differ(curves: pd.DataFrame) -> bool:
-    gap = (curves["after"] - curves["before"]).abs().max()
-    return bool(gap > 1e-9 * max(curves["after"].abs().max(), 1e-300))
-
-
-def _cycle(n: int) -> list[str]:
-    return [CYCLE[k % len(CYCLE)] for k in range(n)]
-
-
 def _level_label(name: str, level: str, names: ConditionNames) -> str:
     if name == "aging_days":
         return f"{level} d"
     return names(f"{name}={level}") if names.units.of(name) else f"{channel_words(name, names.units)} {level}"
 
 
-# ---------------------------------------------------------------- figures dynamic
-# The pre-sliding rise: the mean force from the start of motion at selected speeds, and the dynamic model.
+# ---------------------------------------------------------------- the pre-sliding rise
+# The mean force from the start of motion at selected speeds, and the dynamic model.
 
 MOST_START_PANELS = 6
 MOST_SPEEDS = 3
@@ -369,33 +314,19 @@ BEYOND = 1.5  # of that distance is shown
 def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], units: Units) -> None:
     """Draw a condition's mean pre-sliding force over the distance slid, its standard error, and the model.
 
-    Parameters
-    ----------
-    ax : Axes
-        Drawn on; the caller owns the figure.
-    curves : DataFrame
-        Rows of table `dynamic_curves`.
-    colours : mapping
-        Of each commanded speed.
-    units : Units
-        Give the labels their true units.
+    `curves` are rows of table `dynamic_curves`, `colours` those of the commanded speeds.
     """
     for (speed, direction), curve in curves.groupby(["speed_set_mm_s", "direction"], dropna=False, sort=True):
         curve = curve.sort_values("distance_mm")
         colour = colours.get(speed, BLACK)
-        error = curve["force_se_N"].fillna(0.0)
-        ax.fill_between(
-            curve["distance_mm"], curve["force_N"] - error, curve["force_N"] + error, color=colour, alpha=0.2,
-            linewidth=0,
-        )  # fmt: skip
+        x, force, error = curve["distance_mm"], curve["force_N"], curve["force_se_N"].fillna(0.0)
+        marker, face, line = ("o", colour, "-") if direction > 0 else ("<", "white", "--")
+        draw_band(ax, x, force - error, force + error, colour)
         ax.plot(
-            curve["distance_mm"], curve["force_N"], linestyle="", marker="o" if direction > 0 else "<",
-            markersize=2.6, color=colour, markerfacecolor=colour if direction > 0 else "white",
+            x, force, linestyle="", marker=marker, markersize=2.6, color=colour, markerfacecolor=face,
             markeredgewidth=0.7,
         )  # fmt: skip
-        ax.plot(
-            curve["distance_mm"], curve["model_N"], color=colour, linestyle="-" if direction > 0 else "--"
-        )
+        ax.plot(x, curve["model_N"], color=colour, linestyle=line)
     ax.set_xlim(0.0, _reach(curves))
     ax.set_xlabel(plain(units.label("distance_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
@@ -417,13 +348,9 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     if curves.empty:
         return None
     names, units = ConditionNames.of(config), config.units
-    ordered = sorted(
-        curves["condition"].unique(), key=lambda c: (not is_unaged(c), natural((names(c), None)))
-    )
-    picked = [ordered[k] for k in evenly(len(ordered), min(len(ordered), MOST_START_PANELS))]
-    speeds = np.sort(curves["speed_set_mm_s"].dropna().unique())
-    speeds = speeds[evenly(len(speeds), min(len(speeds), MOST_SPEEDS))]
-    colours = dict(zip(speeds.tolist(), shades(len(speeds)), strict=True))
+    picked = spread(sorted(curves["condition"].unique(), key=names.place), MOST_START_PANELS)
+    speeds = spread(np.sort(curves["speed_set_mm_s"].dropna().unique()).tolist(), MOST_SPEEDS)
+    colours = dict(zip(speeds, shades(len(speeds)), strict=True))
     shown = curves[curves["condition"].isin(picked)]
     shown = shown[shown["speed_set_mm_s"].isin(speeds) | shown["speed_set_mm_s"].isna()]
     span = padded(min(0.0, shown["force_N"].min()), shown["force_N"].max())
@@ -432,15 +359,11 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         own = shown[shown["condition"] == condition]
         if own.empty:
             continue
-
-        def draw(ax: Axes, own=own) -> None:
-            draw_starts(ax, own, colours, units)
-            ax.set_ylim(*span)
-
         alt = f"Pre-sliding, {names(condition)}: {units.quantity('force')} "
         alt += f"from {number(own['force_N'].min())} to {number(own['force_N'].max())} {units.unit('force')} "
         alt += f"over {number(_reach(own))} {units.unit('displacement')}."
-        panels.append(Panel(short(names(condition)), alt, draw))
+        draw = partial(draw_starts, curves=own, colours=colours, units=units)
+        panels.append(Panel(short(names(condition)), alt, draw, limits={"ylim": span}))
     legend = [Key(f"{given(speed)} {units.unit('speed')}", colour) for speed, colour in colours.items()]
     legend.append(Key("mean of the strokes", FLOOR, "point"))
     if (shown["direction"] < 0).any():
