@@ -109,8 +109,6 @@ def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, n
         are wanted.
     strokes : mapping of str to sequence, one value per stroke
         `run_id`, `direction`.
-    settings : Bins
-        The config's `bins`.
 
     Returns
     -------
@@ -159,7 +157,6 @@ def _joined(bins: np.ndarray, least: int) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- mean traces
-# Means of traces over the repeats of a run, on cells of displacement.
 
 MAX_CELLS = 2000  # per run, in traces_mean: finer than any screen shows
 SAME_TRAVEL = 2  # cells by which strokes that are averaged before they slide steadily may differ in travel

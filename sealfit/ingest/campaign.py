@@ -26,7 +26,7 @@ from sealfit.ingest.repeat_checks import (
     reversed_strokes,
     turned_sign,
 )
-from sealfit.ingest.runs import list_traces
+from sealfit.ingest.runs import FIX, list_traces
 from sealfit.ingest.stored_parts import (
     agrees,
     common_columns,
@@ -81,15 +81,8 @@ def inputs_table(
 
 # ---------------------------------------------------------------- campaign
 
-OF_SAMPLES = (
-    "time_s",
-    "displacement_mm",
-    "distance_mm",
-    "force_N",
-    "presliding_N",
-    "force_sd_N",
-    "n",
-)  # their means are in `steady`
+# Columns of samples, and of their scatter, whose means are in `steady`.
+OF_SAMPLES = ("time_s", "displacement_mm", "distance_mm", "force_N", "presliding_N", "force_sd_N", "n")
 FAULTY = ("warning", "error")
 SHOWN = 20  # faults that a campaign without a single usable stroke lists, those that files share as one
 
@@ -318,4 +311,4 @@ def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:
     reason = f"none of {files} trace files can be used" + (
         f"; {more} more faults are not shown." if more > 0 else "."
     )
-    return [*shown, Fault("nothing_left", reason, fix="Fix what is said above; start with one file.")]
+    return [*shown, Fault("nothing_left", reason, fix=FIX)]

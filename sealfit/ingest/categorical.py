@@ -57,9 +57,8 @@ def overlaid(*columns: Columns) -> Columns:
     return whole
 
 
-def taken(columns: Columns, files: Iterable[int]) -> Columns:
+def taken(columns: Columns, files: Sequence[int]) -> Columns:
     """Return the columns of some of the files, by their numbers."""
-    files = list(files)
     return {name: [column[i] for i in files] for name, column in columns.items()}
 
 

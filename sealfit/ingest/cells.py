@@ -16,8 +16,6 @@ from sealfit.errors import Fault
 from sealfit.ingest.files import Layout, as_number, bad_file, split_line, without_strays
 
 # ---------------------------------------------------------------- rows
-# Rows of a trace on their way to a clean table: what is no measurement, or out of time, is named and left
-# out.
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +27,6 @@ class Rows:
 
     def where(self, mask: np.ndarray) -> Rows:
         """Return the rows that the mask chooses."""
-        if np.count_nonzero(mask) == len(mask):
-            return self
         return Rows({name: values[mask] for name, values in self.columns.items()}, self.line[mask])
 
 
@@ -41,8 +37,6 @@ def clean(rows: Rows, names: list[str], file: str) -> tuple[Rows, int, list[Faul
     finite = np.ones(len(rows.line), bool)
     for name in names:
         sizes = np.abs(rows.columns[name])
-        if (sizes < OVERLOAD).all():  # not so of nan
-            continue
         wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
         finite &= ~(wrong | overload)
         faults += _row_faults("not_finite", name, rows, wrong, file)

@@ -128,7 +128,6 @@ def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceForma
 
 
 # ---------------------------------------------------------------- channels
-# Further columns of a trace file: which are channels of numbers, which are labels, and which are neither.
 
 # A text column with more different values, most of them used once, is a clock or a serial number.
 MAX_LABELS = 20

@@ -30,8 +30,6 @@ from sealfit.ingest.listing import Entry, stopped
 from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- run values
-# Cells of runs.csv and of file names to values: which columns are numbers, which are labels, and what cannot
-# be.
 
 NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
 COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
@@ -226,8 +224,6 @@ def _is_below_absolute_zero(value: float | str) -> bool:
 
 
 # ---------------------------------------------------------------- derive
-# What runs.csv leaves out: conditions in words, runs, repeats, specimens, the order of the campaign.
-#
 # Everything here works on what is already known of each file, and reads none.
 
 # Share by which commanded speeds and loads of one setting differ at most; a plate or a step is more.

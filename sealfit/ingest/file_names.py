@@ -61,11 +61,10 @@ class Listing(Sequence[TraceRef]):
 
     def take(self, files: np.ndarray) -> Listing:
         """Return some of the files, by their numbers, with the columns in which any of them has a value."""
-        chosen = files.tolist()
-        columns = taken(self.columns, chosen)
+        columns = taken(self.columns, files)
         filled = {name: c for name, c in columns.items() if any(value is not None for value in c)}
-        own = [self.files[i] for i in chosen]
-        return Listing(own, filled, [self.conditions[i] for i in chosen], self.cut.intersection(own))
+        own = [self.files[i] for i in files]
+        return Listing(own, filled, [self.conditions[i] for i in files], self.cut.intersection(own))
 
 
 # ---------------------------------------------------------------- names

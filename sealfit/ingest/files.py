@@ -151,8 +151,6 @@ def _similar(path: Path) -> str:
 
 
 # ---------------------------------------------------------------- text
-# Bytes of a file to clean UTF-8 text, and where its header ends: encodings, byte-order marks, line ends,
-# names.
 
 HEAD_BYTES = 65_536  # a header longer than this is no header
 _BOMS = (  # UTF-32 first: its mark begins with that of UTF-16

@@ -192,11 +192,9 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
         if column is not None and len(column) == rows:
             kept[name] = column
             continue
-        reason = (
-            "holds neither numbers nor text"
-            if column is None
-            else f"has {len(values)} values where others have {rows}"
-        )
+        reason = f"has {len(values)} values where others have {rows}"
+        if column is None:
+            reason = "holds neither numbers nor text"
         if name in needed:
             fix = "Export all channels at one rate." if column is not None else "Export it as numbers."
             raise bad_file(file, "column_shape", f"{reason}.", fix, column=name)

@@ -73,7 +73,11 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, 
         raise stopped("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
     cells: Columns = {}
     if table := _runs_table(campaign, config):
-        entries, cells, faults = _read_runs(campaign, config, table)
+        lines, cells, faults = read_table(campaign, table, config, needed="file")
+        files = [_posix(campaign, file) for file in cells.pop("file", [])]
+        if not files and not any(fault.severity == "error" for fault in faults):
+            raise stopped("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
+        entries = [Entry(file, line, table) for file, line in zip(files, lines, strict=True)]
     elif config.files.glob is not None:
         entries, faults = _by_glob(campaign, config)
     else:
@@ -107,15 +111,6 @@ def _runs_table(campaign: Path, config: Config) -> str | None:
         reason = "does not exist, but files.runs_table names it."
         raise stopped("missing_file", reason, "Check its path.", file=named)
     return found[0] if found else None
-
-
-def _read_runs(campaign: Path, config: Config, table: str) -> tuple[list[Entry], Columns, list[Fault]]:
-    lines, columns, faults = read_table(campaign, table, config, needed="file")
-    files = [_posix(campaign, file) for file in columns.pop("file", [])]
-    if not files and not any(fault.severity == "error" for fault in faults):
-        raise stopped("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
-    entries = [Entry(file, line, table) for file, line in zip(files, lines, strict=False)]
-    return entries, columns, faults
 
 
 def read_table(

@@ -24,22 +24,13 @@ from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_strokes
 from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints
 from sealfit.store.parquet import as_dictionary, to_arrow
-from sealfit.tables import BINS, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
+from sealfit.tables import BINS, BOOL, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
 
 # ---------------------------------------------------------------- shaped
-# A frame brought into the columns and types of its schema.
 
-INNER = (
-    "several",
-    "several_speeds",
-    "left",
-    "equal",
-    "extreme",
-    "run",
-    "sliding",
-    "row",
-    "by_itself",
-)  # serve the ingest only
+# Columns that serve the ingest only.
+INNER = ("several", "several_speeds", "left", "equal", "extreme", "run", "sliding", "row", "by_itself")
+IN_PANDAS = {FLOAT: float, INT: np.int64, TEXT: "str", BOOL: bool}
 STEADY_ONLY = tuple(
     {column.name for column in STEADY.columns}
     - {column.name for column in RUNS.columns}
@@ -49,29 +40,17 @@ STEADY_ONLY = tuple(
 
 def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.DataFrame:
     """Return the schema's columns in order with their types, then the open ones but `drop` and `INNER`."""
-    fixed = {}
+    fixed, missing = {}, pd.Series(None, index=table.index, dtype=object)
     for column in schema.columns:
-        values = (
-            table[column.name]
-            if column.name in table.columns
-            else pd.Series(None, index=table.index, dtype=object)
-        )
+        values = table.get(column.name, missing)
         if column.dtype == FLOAT:
-            fixed[column.name] = pd.to_numeric(values, errors="coerce").astype(float)
-        elif column.dtype == INT:
-            fixed[column.name] = values.astype(np.int64)
-        elif column.dtype == TEXT:
-            fixed[column.name] = values.astype("str")
-        else:
-            fixed[column.name] = values.astype(bool)
+            values = pd.to_numeric(values, errors="coerce")
+        fixed[column.name] = values.astype(IN_PANDAS[column.dtype])
     taken = {*fixed, *INNER, *(name for name in drop if name not in fixed)}
     return pd.DataFrame({**fixed, **{name: table[name] for name in table.columns if name not in taken}})
 
 
 # ---------------------------------------------------------------- parts
-# A campaign cut into parts of whole runs: what is read at once, by one process, and stored in one file a
-# table.
-#
 # Where a cut lies depends on the runs beside it alone (content-defined chunking), so files that are added to
 # a campaign change the part they belong to and, at most, its neighbours; everything else stays as it is on
 # the disk.
@@ -133,8 +112,6 @@ def _cut(name: str, weight: float) -> bool:
 
 
 # ---------------------------------------------------------------- part
-# One part of a campaign: its files read, their strokes in one table, and the tables that grow with the
-# samples.
 
 SAMPLED = ("traces", "traces_mean", "bins")  # tables that are made, and stored, part by part
 

@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 import pandas as pd
+from scipy.special import bdtrc
 
 from sealfit.config import Config, Quality
 from sealfit.errors import KEPT, NOTED, STROKE_OUT, ConfigError, Fault
@@ -142,8 +143,6 @@ def _piled_up(size_N: np.ndarray) -> bool:
     than a share of 1 / (k + 1) is expected at the extreme; a binomial tail says how many more chance may make
     it.
     """
-    from scipy.special import bdtrc  # here, as scipy takes its time to load and few strokes come so far
-
     away = np.rint((size_N.max() - size_N) / resolution(size_N))  # levels below the extreme
     levels = np.arange(NEXT_LEVELS + 1)
     # Samples at the extreme and the k levels next to it.

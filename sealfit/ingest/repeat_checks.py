@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.special import stdtr
 
 from sealfit.config import Config
 from sealfit.errors import KEPT, NOTED, STROKE_OUT, Fault
@@ -81,7 +82,7 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
         taken, kept, apart = _take_out(layout, force, fit, kept, _furthest(layout, fit, kept, most))
         if apart.scatter.df < 3:
             break
-        for judged in _judge(fit, apart, taken, tests, level, tiny):
+        for judged in _judge(fit, apart, taken, tests, tiny):
             found.append(judged)
             over = judged.p >= level and abs(judged.t) < 3.0  # nothing further out remains
             if over:
@@ -140,7 +141,7 @@ def _less(kept: np.ndarray, taken: list[np.ndarray]) -> np.ndarray:
 
 
 def _judge(
-    fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: int, level: float, tiny: float
+    fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: int, tiny: float
 ) -> list[_Judged]:
     """Return t and p of each that was taken out, by the scatter without it and without those before it.
 
@@ -158,7 +159,7 @@ def _judge(
         (1.0 - n) * fit.df_at(f) + n * apart.df_at(f)
         for n, f in zip(number.tolist(), force.tolist(), strict=True)
     ]
-    p_one = _two_sided_p(t, df, beyond_doubt=NEAR * level / tests)
+    p_one = 2.0 * stdtr(df, -np.abs(t))
     judged = []
     for k, rows in enumerate(taken):
         p = -np.expm1((tests - (len(rows) - 1)) * np.log1p(-min(p_one[k], 1.0 - 1e-16)))
@@ -166,21 +167,6 @@ def _judge(
         judged.append(_Judged(rows, float(t[k]), float(p), tests, float(mean)))
         tests -= len(rows)
     return judged
-
-
-def _two_sided_p(t: np.ndarray, df: list[float], *, beyond_doubt: float) -> np.ndarray:
-    """Return the chance of Student's t so far out, shape (n,).
-
-    It is the normal distribution's, which is less, if all of those are larger than what is beyond doubt: then
-    nothing lies outside, and scipy, which takes long to load, is not wanted.
-    """
-    least = np.array([math.erfc(size / math.sqrt(2.0)) for size in np.abs(t).tolist()])
-    # Twice, as many tests together are a little less likely than their sum.
-    if np.all(least > 2.0 * beyond_doubt):
-        return least
-    from scipy.special import stdtr
-
-    return 2.0 * stdtr(df, -np.abs(t))
 
 
 def _outliers(
@@ -194,7 +180,7 @@ def _outliers(
             with_it, without = (
                 fit_scatter(layout, force_N, rows) for rows in (kept, _less(kept, [one.rows]))
             )
-            one = _judge(with_it, without, [one.rows], one.tests, level, tiny)[0]
+            one = _judge(with_it, without, [one.rows], one.tests, tiny)[0]
         if one.p < level:
             return [*found[: last - 1], one]
     return []
@@ -213,11 +199,6 @@ def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     negative against its peers (the other strokes of its run, else those of the same direction), it is left
     out: a sensor or a sign was turned round. Where most strokes of a direction have it negative, an offset or
     the sign convention is the cause: said once per file, and kept.
-
-    Parameters
-    ----------
-    strokes : DataFrame
-        One row per stroke: file, stroke, several (more strokes in the file), run, direction, force_N, used.
     """
     keep = np.ones(len(strokes), bool)
     force = (strokes["force_N"] * strokes["direction"]).to_numpy(float)

@@ -61,6 +61,8 @@ from sealfit.ingest.trace_checks import measured_speed, speed_factor
 
 # Columns that are taken from a constant column of a trace where nothing else gives them.
 FROM_TRACES = ("run_id", "repeat", "specimen_id", "started_at", "speed_mm_s")
+FIX = "Fix what is said above; start with one file."
+NOTHING_LEFT = Fault("nothing_left", "no trace file can be used.", fix=FIX)
 
 
 def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
@@ -79,7 +81,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     if any(fault.check in ("path_outside", "missing_file") for fault in faults):
         _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
     if not entries:
-        raise CampaignError([*faults, _nothing_left()])
+        raise CampaignError([*faults, NOTHING_LEFT])
     require_libraries([entry.file for entry in entries], config.trace)
     kept, named, found = _named(entries, config)
     faults += found
@@ -95,7 +97,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     columns, measured, left_out, found = _from_traces(campaign, entries, columns, config)
     kept = [i for i in range(len(entries)) if i not in left_out]
     if not kept:
-        raise CampaignError([*faults, *found, _nothing_left()])
+        raise CampaignError([*faults, *found, NOTHING_LEFT])
     entries, columns = _kept(kept, entries, columns)
     columns, measured = in_order(columns), [measured[i] for i in kept]
     faults += found + _missing(entries, columns, config) + out_of_range(entries, columns)
@@ -116,11 +118,6 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
 
 def _kept(files: list[int], entries: list[Entry], columns: Columns) -> tuple[list[Entry], Columns]:
     return [entries[i] for i in files], taken(columns, files)
-
-
-def _nothing_left() -> Fault:
-    fix = "Fix what is said above; start with one file."
-    return Fault("nothing_left", "no trace file can be used.", fix=fix)
 
 
 def _set_speed(columns: Columns) -> Columns:

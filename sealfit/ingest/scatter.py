@@ -53,15 +53,7 @@ def repeat_means(steady: pd.DataFrame) -> pd.DataFrame:
 def repeat_scatter(steady: pd.DataFrame) -> Scatter:
     """Return the scatter of repeats within their runs, pooled over runs, as a function of the force.
 
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady` (file, run_id, repeat, force_N, and `used` if it has it).
-
-    Returns
-    -------
-    Scatter
-        s0 in the force's unit, g without unit, and the degrees of freedom they rest on.
+    s0 is in the force's unit, g without unit.
 
     Notes
     -----
@@ -208,10 +200,7 @@ def _variance(
 def two_nonnegative(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     """Return a, b >= 0 of the weighted least squares y = a + b x, exactly; b = 0 where x does not vary.
 
-    Parameters
-    ----------
-    x, y, weight : ndarray, shape (n,)
-        x >= 0, the values, and 1/variance up to a factor.
+    x is >= 0, the weight is 1/variance up to a factor; all are of shape (n,).
     """
     w, wx, wy, wxx, wxy = weight.sum(), weight @ x, weight @ y, weight @ (x * x), weight @ (x * y)
     determinant = w * wxx - wx * wx

@@ -26,7 +26,6 @@ from sealfit.store import parquet
 from sealfit.store.staged_writes import PARQUET, disk, file_size, sync
 
 # ---------------------------------------------------------------- trace access
-# Samples of traces as table `traces` holds them, those of a stroke one after the other.
 
 
 @dataclass(frozen=True)
@@ -105,9 +104,6 @@ def noise_from_bends(bends: np.ndarray) -> float:
 
 
 # ---------------------------------------------------------------- stored parts
-# Parts of a campaign on the disk: written by whoever reads them, and taken as they are while nothing has
-# changed.
-#
 # A part's files are named by what it was made from, so a process that does the work a second time (its first
 # answer was lost) writes the same names, and a part that is as it was keeps its files. Beside its tables a
 # part has a file of its strokes and findings: with it, the whole campaign can be judged anew without reading

@@ -87,8 +87,6 @@ def find_strokes(
     time_s, displacement_mm, force_N : ndarray, shape (n,)
         A trace in the rig's own units, finite, time rising (steps may differ, and hide gaps); displacement
         without spikes.
-    settings : Strokes
-        The config's `strokes`.
 
     Returns
     -------
@@ -196,14 +194,8 @@ def steady_speeds(
     slowest row in between. A steady speed begins after the ramp to it, but after a standstill with the ramp,
     where the force rises. A motion with one steady speed, or none, is not cut.
 
-    Parameters
-    ----------
-    time_s, along_mm : ndarray, shape (n,)
-        One motion in one direction; displacement rising with it.
-    noise_mm : float
-        Standard deviation of a displacement sample.
-    settings : Strokes
-        The config's `strokes`.
+    The arrays, shape (n,), are one motion in one direction, displacement rising with it; `noise_mm` is the
+    standard deviation of a displacement sample.
     """
     n, tolerance = len(time_s), settings.speed_tolerance
     x = np.maximum.accumulate(smoothed(along_mm, settings.smooth_samples))

@@ -16,8 +16,6 @@ from sealfit.ingest.strokes import Stroke, displacement_noise_mm
 from sealfit.units import Units
 
 # ---------------------------------------------------------------- spikes
-# Single samples that cannot be right: a displacement that jumps away and back, a force far off its
-# neighbours.
 
 # Samples of the running median. Five are blind to one or two wrong ones, and exact on any slope.
 NEIGHBOURS = 5
@@ -171,10 +169,7 @@ GROSS = 1.5
 def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
     """Return the mean speed of a trace, rests included, and its plateau speed; magnitudes, nan for none.
 
-    Parameters
-    ----------
-    time_s, displacement_mm : ndarray, shape (n,)
-        Rising time and displacement of a trace, in any unit; the speeds are in their quotient.
+    Rising time and displacement, shape (n,), are in any unit; the speeds are in their quotient.
 
     Notes
     -----

@@ -210,16 +210,8 @@ def acceleration(
     It is the change from the mean speed over `half` rows before the row to that over `half` rows after it.
     As for the speed of the window (`local_speed`), `half` is as wide as the noise asks for: here, that of the
     acceleration is `wanted`, or `half` a sixteenth of the trace. Near the ends it is that of the nearest row
-    which has so many.
-
-    Parameters
-    ----------
-    time_s, displacement_mm : ndarray, shape (n,)
-        A trace of three rows or more.
-    noise_mm : float
-        Standard deviation of a displacement sample.
-    wanted : float
-        Standard deviation of the acceleration.
+    which has so many. The trace has three rows or more. `noise_mm` is the standard deviation of a
+    displacement sample, `wanted` that of the acceleration.
     """
     n = len(time_s)
     # The SD of a second difference over `half` steps is sqrt(6) noise / (half step)^2.
