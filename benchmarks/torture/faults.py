@@ -58,7 +58,7 @@ from sealfit import cli
 from sealfit.errors import SealfitError
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.report import page
-from sealfit.report.drawing import Drawn, Image
+from sealfit.report.drawing import Drawn
 from sealfit.simulation import load_spec, simulate
 from sealfit.store import out_folder
 from sealfit.store.manifest import STATE
@@ -171,7 +171,7 @@ COMPUTED = (
 )
 
 
-NO_PANEL = Image("<svg/>", 10, 10)
+NO_PANEL = "<svg/>"
 
 
 def remember_computations() -> None:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from sealfit.errors import RequestError
 from sealfit.pipeline import report_tables
 from sealfit.report.figures import draw_all
-from sealfit.report.page import to_draw
+from sealfit.report.page import answered
 from sealfit.report.style import compose, look
 from sealfit.store.out_folder import Store
 
@@ -84,8 +84,7 @@ class Plots:
     def _drawn(self, name: str) -> Figure:
         store = self._answered()
         closure = store.read_json("closure") if store.state.properties is None else None
-        tables, closure = to_draw(report_tables(store), closure)
-        plots = draw_all(tables, closure, store.config)
+        plots = draw_all(*answered(report_tables(store), closure), store.config)
         if name not in plots:
             raise RequestError(
                 f"these results have nothing to draw in the figure '{name}'.",

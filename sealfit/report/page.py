@@ -17,8 +17,7 @@ from markupsafe import Markup
 from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
-from sealfit.report import page
-from sealfit.report.drawing import Drawn, data_uri, draw, run_traces
+from sealfit.report.drawing import Drawn, draw, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
 from sealfit.report.loop_tables import (
@@ -41,41 +40,29 @@ from sealfit.report.notation import (
     true_units,
 )
 from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
-from sealfit.report.style import Plot
+from sealfit.report.style import WIDTH, Plot
 from sealfit.report.summary import of_properties
 from sealfit.report.summary_lines import LACKING, property_sentences, values_clause
 from sealfit.report.words import left_over, undecided, verdict, with_left_channels
 from sealfit.tables import SCHEMAS
 
-# ---------------------------------------------------------------- facts
-# Campaign, data quality and provenance, as plain values for the page.
-
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
 MOST_INPUTS = 2000  # listed with their hashes; inputs.parquet has all
-SEVERITIES = ("error", "warning", "info")
+RANK = {"error": 0, "warning": 1, "info": 2}  # of a severity, in the order of the page
+CSS = 96
+"""Pixels of a page in an inch."""
 
 
 def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[str]:
     """Return the campaign in a few short phrases: files, runs, conditions, speeds, load."""
     steady, inputs, units = tables["steady"], tables["inputs"], config.units
     used = steady[steady["used"].astype(bool)] if len(steady) else steady
-    facts = [count(used["file"].nunique(), "file"), count(used["run_id"].nunique(), "run")]
-    facts.append(count(used["condition"].nunique(), "condition"))
+    columns = {"file": "file", "run_id": "run", "condition": "condition"}
+    facts = [count(used[column].nunique(), what) for column, what in columns.items()]
     if len(used):
         repeats = used.groupby("run_id")["file"].nunique()
-        low, high = int(repeats.min()), int(repeats.max())
-        facts.append(
-            "no repeats"
-            if high == 1
-            else f"{low} repeats per run"
-            if low == high
-            else f"{low} to {high} repeats per run"
-        )
-        speed = (
-            used["speed_set_mm_s"]
-            .where(used["speed_set_mm_s"].notna(), used["speed_mm_s"].abs())
-            .astype(float)
-        )
+        facts.append("no repeats" if repeats.max() == 1 else f"{_range(repeats)} repeats per run")
+        speed = used["speed_set_mm_s"].fillna(used["speed_mm_s"].abs()).astype(float)
         facts.append(f"{units.quantity('speed')} {_range(speed)} {units.unit('speed')}")
         if used["direction"].nunique() > 1:
             facts[-1] += ", both directions"
@@ -98,20 +85,12 @@ def quality_counts(quality: pd.DataFrame) -> list[dict]:
     """Return the number of findings per check, severity and action, the most severe first."""
     if quality.empty:
         return []
-    keys = quality[["check", "severity", "action"]].fillna("").astype(str)
-    grouped = keys.assign(file=quality["file"]).groupby(["check", "severity", "action"], sort=False)["file"]
-    rows = [
-        {
-            "check": check.replace("_", " "),
-            "severity": severity,
-            "action": action,
-            "findings": len(files),
-            "files": files.nunique(),
-        }
-        for (check, severity, action), files in grouped
-    ]
-    rank = {name: k for k, name in enumerate(SEVERITIES)}
-    return sorted(rows, key=lambda row: (rank.get(row["severity"], 9), -row["findings"], row["check"]))
+    names = ["check", "severity", "action"]
+    keys = quality[names].fillna("").astype(str)
+    keys["check"] = keys["check"].str.replace("_", " ")
+    found = keys.assign(file=quality["file"]).groupby(names, sort=False)["file"]
+    rows = found.agg(findings="size", files="nunique").reset_index().to_dict("records")
+    return sorted(rows, key=lambda row: (RANK.get(row["severity"], 9), -row["findings"], row["check"]))
 
 
 def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
@@ -122,10 +101,9 @@ def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict],
     if quality.empty:
         return [], 0
     told = quality[(quality["severity"] != "info") | (quality["action"].fillna("kept") != "kept")]
-    rank = told["severity"].map({name: k for k, name in enumerate(SEVERITIES)}).fillna(9)
-    ordered = told.assign(rank=rank).sort_values("rank", kind="stable").drop(columns="rank").astype(object)
-    faults = [_fault(row) for row in ordered.where(ordered.notna(), None).to_dict("records")]
-    groups = grouped(faults)
+    told = told.sort_values("severity", key=lambda names: names.map(RANK).fillna(9), kind="stable")
+    told = told.astype(object).where(told.notna(), None)
+    groups = grouped(_fault(row) for row in told.to_dict("records"))
     return [_finding(group, config) for group in groups[:MOST_FINDINGS]], len(groups)
 
 
@@ -141,61 +119,39 @@ def _finding(group: list[Fault], config: Config) -> dict:
     row |= {name: true_units(row[name], config.units) for name in ("reason", "fix")}
     row["column"] = channel_label(first.column, config.units) if first.column else ""
     row["check"] = first.check.replace("_", " ")
-    if len(group) > 1:
-        reason = row["reason"] if one_reason(group) else ""
-        return {
-            **row,
-            "reason": reason,
-            "file": how_many(group),
-            "value": None,
-            "place": "; ".join(examples(group)),
-        }
-    place = f"line {int(first.line)}" if first.line is not None else ""
-    if first.stroke is not None:
-        place = f"stroke {int(first.stroke)}{', ' + place if place else ''}"
-    return {**row, "place": place}
+    if len(group) == 1:
+        numbers = {"stroke": first.stroke, "line": first.line}
+        places = [f"{what} {int(n)}" for what, n in numbers.items() if n is not None]
+        return {**row, "place": ", ".join(places)}
+    row |= {"file": how_many(group), "value": None, "place": "; ".join(examples(group))}
+    return row if one_reason(group) else {**row, "reason": ""}
 
 
 def provenance_facts(provenance: Mapping) -> dict:
-    """Return provenance.json with every key that the page reads."""
-    config = provenance.get("config") or {}
-    campaign = str(provenance.get("campaign") or "")
-    every = provenance.get("inputs") or []
-    inputs = [
-        {"file": entry.get("file", ""), "size": entry.get("size"), "sha256": entry.get("sha256") or ""}
-        for entry in every[:MOST_INPUTS]
-    ]
-    steps = [
-        {**step, "finished_at": str(step.get("finished_at", "")).replace("T", " ").replace("+00:00", " UTC")}
-        for step in provenance.get("steps") or []
-    ]
+    """Return provenance.json with every key that the page reads, and the name of the campaign."""
+    found = {"version": "", "python": "", "system": "", "packages": {}, "campaign": "", "table": None}
+    found |= {"config": {"name": "", "path": None, "text": ""}, "inputs": [], "steps": [], **provenance}
     return {
-        "version": provenance.get("version", ""),
-        "python": provenance.get("python", ""),
-        "system": provenance.get("system", ""),
-        "packages": dict(provenance.get("packages") or {}),
-        "campaign": campaign,
-        "name": provenance.get("table") or PurePath(campaign).name or campaign,
-        "config_name": config.get("name", ""),
-        "config_path": config.get("path"),
-        "config_text": config.get("text", ""),
-        "inputs": inputs,
-        "inputs_in_all": len(every),
-        "steps": steps,
-        "bytes": sum(entry.get("size") or 0 for entry in every),
+        **found,
+        "name": found["table"] or PurePath(found["campaign"]).name or found["campaign"],
+        "inputs": found["inputs"][:MOST_INPUTS],
+        "inputs_in_all": len(found["inputs"]),
+        "bytes": sum(entry["size"] for entry in found["inputs"]),
+        "steps": [{**step, "finished_at": _instant(step["finished_at"])} for step in found["steps"]],
     }
+
+
+def _instant(text: str) -> str:
+    return text.replace("T", " ").replace("+00:00", " UTC")
 
 
 def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict[str, pd.DataFrame]:
     """Return every table of `names`; an empty one with its columns replaces a missing one."""
-    found = {}
+    found = {name: tables[name] for name in names if len(tables.get(name, ()))}
     for name in names:
-        frame = tables.get(name)
-        if frame is None or not len(frame):
-            frame = pd.DataFrame(
-                {c.name: pd.Series(dtype=c.dtype.to_pandas_dtype()) for c in SCHEMAS[name].columns}
-            )
-        found[name] = frame
+        if name not in found:
+            columns = SCHEMAS[name].columns
+            found[name] = pd.DataFrame({c.name: pd.Series(dtype=c.dtype.to_pandas_dtype()) for c in columns})
     return found
 
 
@@ -207,15 +163,8 @@ TABLES = (
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves",
 )  # fmt: skip
 FITS = (
-    "steady_fit",
-    "aging_fit",
-    "aging_curves",
-    "aging_laws",
-    "master_curve",
-    "dynamic_fit",
-    "dynamic_curves",
-)
-BEFORE = "{}_before"  # name of such a table without the loop's effects
+    "steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves",
+)  # fmt: skip
 VERDICTS = {
     "closed": "Closed",
     "nothing_missing": "Nothing missing",
@@ -241,24 +190,12 @@ def build_report(
 ) -> Report:
     """Return the report of one campaign.
 
-    Parameters
-    ----------
-    tables : mapping of str to DataFrame
-        Tables of OUT by name, as in `sealfit.tables`; they may be missing or empty.
-    closure : mapping or None
-        closure.json, or None where the loop was not run.
-    provenance : mapping
-        provenance.json.
-    config : Config
-        Names the conditions and gives every quantity its true unit.
-
-    Returns
-    -------
-    Report
-        The page loads nothing. Figures are drawn once; the page shows their panels.
+    `tables` are those of OUT by name, which may be missing or empty; `closure` and `provenance` are its JSON
+    files, `closure` None where the loop was not run. The page loads nothing. Figures are drawn once; the page
+    shows their panels.
     """
-    content = _content(*answered(tables, closure), provenance, config)
-    tables, closure = to_draw(tables, closure)
+    tables, closure = answered(tables, closure)
+    content = _content(tables, closure, provenance, config)
     if len(tables["property_values"]):
         content |= _of_properties(tables)
     plots = draw_all(tables, closure, config)
@@ -267,41 +204,18 @@ def build_report(
     images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
-    html = _environment().from_string(_text("template.html")).render(
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    environment.globals |= {"count": count, "number": number, "given": given}
+    html = environment.from_string(_text("template.html")).render(
         style=Markup(_text("style.css")), script=Markup(_text("report.js")), plots=images, runs=Markup(runs),
         script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(), **content
     )  # fmt: skip
     return Report(html, figures)
 
 
-def property_means(values: pd.DataFrame) -> pd.DataFrame:
-    """Return the means of properties per condition as rows of table `steady_fit`, for the plot of the law.
-
-    Parameters
-    ----------
-    values : DataFrame
-        Table `property_values`.
-    """
-    from sealfit.fit.aging.property import means_of
-
-    parts = []
-    for (rubber, quantity), own in values.groupby(["rubber", "quantity"]):
-        means = means_of(own)
-        half = means.half_width()
-        value = means.table["value"]
-        kept = means.table[["condition", "series", "value"]]
-        parts.append(
-            kept.assign(
-                rubber=rubber, quantity="steady", parameter=quantity, identified=True,
-                lo95=value - half, hi95=value + half,
-            )
-        )  # fmt: skip
-    return pd.concat(parts, ignore_index=True)
-
-
 def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
     """Return what the page says of properties in place of the campaign and the loop."""
-    properties = of_properties(*(tables[name] for name in ("property_values", "aging_fit", "aging_laws")))
+    properties = of_properties(tables["property_values"], tables["aging_fit"], tables["aging_laws"])
     known = [p for one in properties if (p := one["lack_of_fit_p"]) is not None]
     fits = not known or min(known) >= LACKING
     return {
@@ -310,16 +224,6 @@ def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
         "verdict": " ".join(map(property_sentences, properties)),
         "facts": [f"{one['quantity']}: {values_clause(one)}" for one in properties],
     }
-
-
-def to_draw(
-    tables: Mapping[str, pd.DataFrame], closure: Mapping | None
-) -> tuple[dict[str, pd.DataFrame], Mapping | None]:
-    """Return tables and closure.json as the figures use them, properties as the means of conditions."""
-    tables, closure = answered(tables, closure)
-    if len(tables["property_values"]):
-        tables["steady_fit"] = property_means(tables["property_values"])
-    return tables, closure
 
 
 def answered(
@@ -337,12 +241,11 @@ def with_after_fits(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFram
 
     Those before then have the suffix `_before`.
     """
-    complete = page.complete(tables, TABLES)
-    if not len(tables.get("steady_fit_after", ())):
-        return complete
-    before = {BEFORE.format(name): complete[name] for name in FITS}
-    after = page.complete({name: tables[f"{name}_after"] for name in FITS}, FITS)
-    return {**complete, **after, **before}
+    found = complete(tables, TABLES)
+    if len(tables.get("steady_fit_after", ())):
+        before = {f"{name}_before": found[name] for name in FITS}
+        found |= complete({name: tables[f"{name}_after"] for name in FITS}, FITS) | before
+    return found
 
 
 def _content(
@@ -351,15 +254,14 @@ def _content(
     provenance: Mapping,
     config: Config,
 ) -> dict:
-    before = {name: tables.get(BEFORE.format(name)) for name in FITS}
+    before = {name: tables.get(f"{name}_before") for name in FITS}
     fitted = parameter_tables(tables["steady_fit"], "condition", config, before["steady_fit"])
     fitted += parameter_tables(tables["aging_fit"], "series", config, before["aging_fit"])
     dynamic = tables["dynamic_fit"]
-    fitted += parameter_tables(
-        dynamic[dynamic["quantity"] == "dynamic"], "condition", config, before["dynamic_fit"]
-    )
+    rises = dynamic[dynamic["quantity"] == "dynamic"]
+    fitted += parameter_tables(rises, "condition", config, before["dynamic_fit"])
     break_aways, break_aways_in_all = break_away_rows(dynamic, config)
-    findings, in_all = page.quality_findings(tables["quality"], config)
+    findings, in_all = quality_findings(tables["quality"], config)
     return {
         "of_properties": False,
         "closure": closure,
@@ -367,7 +269,7 @@ def _content(
         "fit": fit_badge(closure),
         "verdict": verdict(closure, tables["shapes"], config),
         "undecided": undecided(closure, config),
-        "facts": page.campaign_facts(tables, config),
+        "facts": campaign_facts(tables, config),
         "errors": error_rows(closure, config) if closure else [],
         "cards": effect_cards(closure, config) if closure else [],
         "scatter": scatter_rows(closure, config) if closure else [],
@@ -389,10 +291,10 @@ def _content(
         "unit": config.units.unit("force"),
         "speed_unit": config.units.unit("speed"),
         "force": config.units.quantity("force"),
-        "counts": page.quality_counts(tables["quality"]),
+        "counts": quality_counts(tables["quality"]),
         "findings": findings,
         "findings_in_all": in_all,
-        "provenance": page.provenance_facts(provenance),
+        "provenance": provenance_facts(provenance),
     }
 
 
@@ -412,25 +314,19 @@ def _images(plot: Plot, drawn: Drawn) -> dict:
     """Return a plot for the template: every panel a separate image."""
     panels = [
         {
-            "src": data_uri(image.svg),
+            "src": "data:image/svg+xml;base64," + b64encode(svg.encode()).decode(),
             "alt": panel.alt,
             "effect": panel.effect,
-            "width": image.width,
-            "height": image.height,
+            "width": round(CSS * WIDTH),
+            "height": round(CSS * panel.height),
         }
-        for panel, image in zip(plot.panels, drawn.panels, strict=True)
+        for panel, svg in zip(plot.panels, drawn.panels, strict=True)
     ]
     legend = [
         {"label": symbol_html(key.label) if key.symbol else key.label, "colour": key.colour, "mark": key.mark}
         for key in plot.legend
     ]
     return {"title": plot.title, "panels": panels, "legend": legend, "note": plot.note}
-
-
-def _environment() -> Environment:
-    environment = Environment(autoescape=True, undefined=StrictUndefined)
-    environment.globals |= {"count": count, "number": number, "given": given}
-    return environment
 
 
 def _text(name: str) -> str:

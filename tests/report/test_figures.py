@@ -314,15 +314,12 @@ def test_the_same_tables_give_the_same_bytes(made):
 def test_a_panel_of_the_page_holds_all_that_it_uses_and_nothing_of_its_neighbours(made):
     drawn = draw(draw_all(made.tables, made.closure, made.config)["aging"])
     assert len(drawn.panels) == 2
-    for image in drawn.panels:
-        names = [
-            element.get("id") for element in ElementTree.fromstring(image.svg).iter() if element.get("id")
-        ]
-        used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', image.svg))
+    for svg in drawn.panels:
+        names = [element.get("id") for element in ElementTree.fromstring(svg).iter() if element.get("id")]
+        used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', svg))
         assert used <= set(names)
         assert sum(name.startswith("axes") for name in names) == 1
-        assert (image.width, image.height) == (341, 245)
-    assert drawn.panels[0].svg != drawn.panels[1].svg
+    assert drawn.panels[0] != drawn.panels[1]
     assert drawn.png.startswith(b"\x89PNG")
 
 

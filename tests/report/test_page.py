@@ -106,8 +106,10 @@ def test_the_page_asks_for_nothing(name, reports, pages):
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_every_image_says_what_it_shows(name, pages):
+def test_every_image_says_what_it_shows_and_has_a_size(name, pages):
     assert all(len(image["alt"]) > 20 for image in pages[name].images)
+    assert {image["width"] for image in pages[name].images} == {"341"}
+    assert "245" in {image["height"] for image in pages[name].images}
     assert pages[name].images
 
 

@@ -101,7 +101,10 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         return None
     names = ConditionNames.of(config)
     quantities = list(dict.fromkeys(curves["quantity"]))
-    points = aging_points(tables["steady_fit"], quantities, names)
+    values = tables.get("property_values", ())
+    of_property = len(values) > 0
+    fits = property_means(values) if of_property else tables["steady_fit"]
+    points = aging_points(fits, quantities, names)
     series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural(names(s)))
     misfit = _law_misfits(points, curves) if len(series) > MOST_PANELS else {}
     series, note = telling(
@@ -114,7 +117,6 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         note += " steady_fit.parquet and aging_curves.parquet have all."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
     before = tables.get("aging_curves_before", curves.iloc[:0])
-    of_property = len(tables.get("property_values", ())) > 0
     ends = [points["lo95"], points["hi95"]] if of_property else []  # of means, never without bound
     shown = pd.concat(
         [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"], *ends]
@@ -150,6 +152,24 @@ def _law_misfits(points: pd.DataFrame, curves: pd.DataFrame) -> dict[str, float]
             days, values = own["aging_days"].astype(float), own["value"].astype(float)
             gaps.setdefault(name, []).extend(values - np.interp(days, law["aging_days"], law["value"]))
     return {name: rms(values) for name, values in gaps.items()}
+
+
+def property_means(values: pd.DataFrame) -> pd.DataFrame:
+    """Return the means of table `property_values` per condition as rows of table `steady_fit`."""
+    from sealfit.fit.aging.property import means_of
+
+    parts = []
+    for (rubber, quantity), own in values.groupby(["rubber", "quantity"]):
+        means = means_of(own)
+        half, value = means.half_width(), means.table["value"]
+        kept = means.table[["condition", "series", "value"]]
+        parts.append(
+            kept.assign(
+                rubber=rubber, quantity="steady", parameter=quantity, identified=True,
+                lo95=value - half, hi95=value + half,
+            )
+        )  # fmt: skip
+    return pd.concat(parts, ignore_index=True)
 
 
 def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: ConditionNames) -> pd.DataFrame:
