@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import pandas as pd
 from markupsafe import Markup
@@ -11,8 +11,8 @@ from sealfit.config import Config
 from sealfit.report.figures.residual import LEVELS
 from sealfit.report.notation import (
     NOTHING,
-    ConditionNames,
     by_gain,
+    capital,
     channel_label,
     channel_words,
     effect_label,
@@ -43,6 +43,7 @@ FREE = {
 def error_rows(closure: Mapping, config: Config) -> list[dict]:
     """Return the rows of the table before and after: label, note, before, after, change."""
     unit, held = config.units.unit("force"), closure.get("heldout_unit") or "run"
+    floor, stages = closure.get("noise_floor_N"), ("before", "after")
     rows = (
         ("heldout_rmse_N", f"rms error, held-out {held}s", unit),
         ("rmse_N", "rms error of all bins, in sample", unit),
@@ -52,18 +53,16 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
     )
     found = []
     for key, label, of in rows:
-        before, after = closure["before"].get(key), closure["after"].get(key)
-        texts = together(
-            [before, after, closure.get("noise_floor_N") if key in ("rmse_N", "heldout_rmse_N") else None]
-        )
+        before, after = (closure[stage].get(key) for stage in stages)
+        texts = together([before, after, floor if key in ("rmse_N", "heldout_rmse_N") else None])
         change = _change(before, after) if known(before) and known(after) and before else NOTHING
         found.append({"label": label, "unit": of, "before": texts[0], "after": texts[1], "change": change})
-    p = [closure[stage].get("lack_of_fit_p") for stage in ("before", "after")]
-    texts = [p_value(value).removeprefix("= ") if known(value) else NOTHING for value in p]
-    return [
-        *found,
-        {"label": "lack of fit, p", "unit": "", "before": texts[0], "after": texts[1], "change": ""},
-    ]
+    p = {stage: _p(closure[stage].get("lack_of_fit_p")) for stage in stages}
+    return [*found, {"label": "lack of fit, p", "unit": "", **p, "change": ""}]
+
+
+def _p(value: float | None) -> str:
+    return p_value(value).removeprefix("= ") if known(value) else NOTHING
 
 
 def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
@@ -73,29 +72,32 @@ def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
         {
             "variable": channel_label(entry["variable"], config.units),
             "level": level_words(entry["level"]),
-            "smallest": of_unit(number(entry["smallest_N"], 2), unit)
-            if known(entry["smallest_N"])
-            else "none",
-            "share": of_unit(number(entry["smallest_pct"], 2), "%")
-            if known(entry["smallest_pct"])
-            else NOTHING,
+            "smallest": _sized(entry["smallest_N"], unit, "none"),
+            "share": _sized(entry["smallest_pct"], "%", NOTHING),
             "files": f"{entry['files_needed']:,}" if known(entry["files_needed"]) else NOTHING,
         }
         for entry in closure.get("sensitivity") or ()
     ]
 
 
+def _sized(value: float | None, unit: str, unknown: str = "") -> str:
+    return of_unit(number(value, 2), unit) if known(value) else unknown
+
+
 def refused_rows(closure: Mapping, config: Config) -> list[dict]:
     """Return the significant effects that were not accepted: label, p-value and reason."""
     return [
         {
-            "label": f"{entry['id']} along "
-            f"{joined([channel_label(c, config.units) for c in entry['channels']])}",
+            "label": f"{entry['id']} along {_labels(entry['channels'], config)}",
             "p": p_value(entry["p_value"]),
             "reason": entry["reason"],
         }
         for entry in closure.get("refused") or ()
     ]
+
+
+def _labels(channels: Sequence[str], config: Config) -> str:
+    return joined([channel_label(name, config.units) for name in channels])
 
 
 def _change(before: float, after: float) -> str:
@@ -105,34 +107,28 @@ def _change(before: float, after: float) -> str:
 
 def effect_cards(closure: Mapping, config: Config) -> list[dict]:
     """Return every effect, added or candidate, with the content of its card; the largest gain first."""
-    cards = []
+    cards, unit = [], config.units.unit("force")
     for effect in by_gain(closure["effects"]):
-        label = effect_label(effect, config.units)
-        channels = joined([channel_label(name, config.units) for name in effect["channels"]])
         gain, left = effect.get("heldout_gain_N"), effect.get("heldout_rmse_N")
-        unit = config.units.unit("force")
+        rivals = [_rival(rival, config) for rival in effect.get("alternatives") or []]
         cards.append(
             {
                 "index": closure["effects"].index(effect),
-                "title": label[:1].upper() + label[1:],
+                "title": capital(effect_label(effect, config.units)),
                 "named": effect["named"],
                 "candidate": effect["candidate"],
                 "note": effect.get("note") or "",
                 "acts": acts(effect, config),
-                "given": "factor minus one"
-                if effect["operation"] == "multiply"
-                else f"added {_added(effect, config)}",
+                "given": _given(effect, config),
                 "form": effect["form"],
                 "reference": effect.get("reference") or "",
                 "level": level_words(effect["level"]),
-                "channels": channels,
+                "channels": _labels(effect["channels"], config),
                 "parameters": [_parameter(p, effect) for p in effect["parameters"]],
                 "p": p_value(effect.get("p_value")),
-                "gain": of_unit(number(gain, 2), unit) if known(gain) else "",
+                "gain": _sized(gain, unit),
                 "left": of_unit(number(left), unit) if known(left) else "",
-                "rivals": list(
-                    dict.fromkeys(_rival(rival, config) for rival in effect.get("alternatives") or [])
-                ),
+                "rivals": list(dict.fromkeys(rivals)),
             }
         )
     return cards
@@ -147,12 +143,11 @@ def references(closure: Mapping, config: Config) -> list[dict]:
     ]
 
 
-def _added(effect: Mapping, config: Config) -> str | Markup:
-    return (
-        config.units.quantity("force")
-        if effect["acts_on"] == "force"
-        else Markup("to {}").format(symbol_html(effect["acts_on"]))
-    )
+def _given(effect: Mapping, config: Config) -> str:
+    if effect["operation"] == "multiply":
+        return "factor minus one"
+    force = effect["acts_on"] == "force"
+    return f"added {config.units.quantity('force') if force else 'to ' + symbol_html(effect['acts_on'])}"
 
 
 def _parameter(p: Mapping, effect: Mapping) -> dict:
@@ -164,21 +159,16 @@ def _parameter(p: Mapping, effect: Mapping) -> dict:
 def _rival(rival: Mapping, config: Config) -> Markup:
     from sealfit.effects import EFFECTS
 
-    known_effect = EFFECTS.get(rival["id"])
-    channels = joined([channel_words(name, config.units) for name in rival.get("channels") or []])
-    label = FREE.get(rival["id"], str(rival["id"]).replace("_", " "))
-    if known_effect is not None:
-        names = [channel_words(name, config.units) for name in rival.get("channels") or [""]]
-        pair = "{z}" in known_effect.label
-        label = known_effect.label.replace("{x}", names[0] if pair else channels).replace("{z}", names[-1])
-    target = target_html(rival["acts_on"], config)
-    text = Markup("{}, acting on {}").format(label, target)
+    names = [channel_words(name, config.units) for name in rival.get("channels") or []]
+    channels, label = joined(names), FREE.get(rival["id"], str(rival["id"]).replace("_", " "))
+    if effect := EFFECTS.get(rival["id"]):
+        first = names[0] if "{z}" in effect.label else channels
+        label = effect.label.replace("{x}", first).replace("{z}", names[-1] if names else "")
+    text = Markup("{}, acting on {}").format(label, target_html(rival["acts_on"], config))
     if channels and channels not in label:
         text += Markup(" along {}").format(channels)
-    if known(rival.get("heldout_rmse_N")):
-        text += Markup(" (held-out error {})").format(
-            of_unit(number(rival["heldout_rmse_N"]), config.units.unit("force"))
-        )
+    if known(error := rival.get("heldout_rmse_N")):
+        text += Markup(" (held-out error {})").format(of_unit(number(error), config.units.unit("force")))
     return text
 
 
@@ -189,7 +179,7 @@ def scatter_rows(closure: Mapping, config: Config) -> list[dict]:
             "level": level_words(entry["level"]),
             "sd": number(entry.get("sd_N"), 2),
             "share": f"{number(100 * entry['sd_rel'], 2)} %" if known(entry.get("sd_rel")) else NOTHING,
-            "df": number(entry.get("df"), 2) if known(entry.get("df")) else NOTHING,
+            "df": number(entry.get("df"), 2),
         }
         for entry in closure.get("scatter") or []
     ]
@@ -197,12 +187,9 @@ def scatter_rows(closure: Mapping, config: Config) -> list[dict]:
 
 def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config: Config) -> list[dict]:
     """Return the part of the residual each variable explains, before and after, most significant first."""
-    tested = levels[levels["channel"].notna()]
-    if tested.empty:
-        return []
     rows: dict[tuple, dict] = {}
     names = set(known_channels) | {"direction"}
-    for row in tested.itertuples():
+    for row in levels[levels["channel"].notna()].itertuples():
         words = joined([channel_words(part, config.units) for part in split_channels(row.channel, names)])
         entry = rows.setdefault(
             (row.channel, row.level),
@@ -210,7 +197,7 @@ def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config:
             | {f"{what}_{stage}": NOTHING for what in ("sd", "p") for stage in ("before", "after")},
         )
         entry[f"sd_{row.stage}"] = number(row.sd_N, 2)
-        entry[f"p_{row.stage}"] = p_value(row.p_value).removeprefix("= ") if known(row.p_value) else NOTHING
+        entry[f"p_{row.stage}"] = _p(row.p_value)
         if row.stage == "before" and known(row.p_value):
             entry["rank"] = row.p_value
     order = {level: k for k, level in enumerate(reversed(LEVELS))}
@@ -220,28 +207,20 @@ def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config:
 
 def next_runs(closure: Mapping, config: Config) -> list[dict]:
     """Return the recommended runs: the reason and the conditions."""
-    names, found = ConditionNames.of(config), []
-    for entry in closure.get("next_runs") or []:
-        wanted = entry.get("conditions")
-        wanted = wanted if isinstance(wanted, list) else [wanted] if wanted else []
-        why = true_units(str(entry.get("why", "")), config.units)
-        found.append(
-            {"why": why[:1].upper() + why[1:], "conditions": [_wanted(one, names, config) for one in wanted]}
-        )
-    return found
+    return [
+        {
+            "why": capital(true_units(entry["why"], config.units)),
+            "conditions": _wanted(entry["conditions"], config),
+        }
+        for entry in closure["next_runs"]
+    ]
 
 
-def _wanted(one: object, names: ConditionNames, config: Config) -> str:
-    """Return a condition to measure at, e.g. "aging temperature 60 °C, sliding speed 5 mm/s"."""
-    if not isinstance(one, Mapping):
-        return names(one)
+def _wanted(conditions: Mapping, config: Config) -> str:
+    """Return the conditions to measure at, e.g. "aging temperature 60 °C, sliding speed 5 mm/s"."""
     parts = []
-    for name, value in one.items():
-        text = (
-            given(float(value))
-            if isinstance(value, int | float) and not isinstance(value, bool)
-            else str(value)
-        )
+    for name, value in conditions.items():
+        text = given(value) if known(value) else str(value)
         if name == "direction" and text in ("1", "−1"):
             text = "forward" if text == "1" else "backward"
         unit = config.units.of(name)

@@ -207,10 +207,6 @@ _SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])(?:_?([0-9]+)|_([A-Za-z0-9]{
 _SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displacement_mm", "distance_mm",
           "speed_mm_s", "force_N", "load_N")  # fmt: skip
 _SLOT = re.compile(rf"\b(?:{'|'.join(_SLOTS)})\b")
-_STATISTICS = {"rmse_N": "rms error", "reduced_chi2": "χ² / df", "lack_of_fit_p": "lack of fit, p",
-               "n_runs": "runs", "n_files": "files", "n_speeds": "speeds", "n_days": "days tested",
-               "last_day": "last day", "rmse": "rms error", "max_error_pct": "largest error",
-               "specimen_sd_pct": "specimen scatter"}  # fmt: skip
 
 
 def symbol_html(name: str) -> Markup:
@@ -351,11 +347,6 @@ def effect_label(effect: Mapping, units: Units) -> str:
         rf", (?:added to|factor on) {re.escape(str(effect.get('acts_on')))}$", "", str(effect["label"])
     )
     return _SLOT.sub(lambda found: channel_words(found[0], units), label)
-
-
-def quantity_words(name: str) -> str:
-    """Return the name of a statistic of a fit."""
-    return _STATISTICS.get(name, name.removesuffix("_N").replace("_", " "))
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import pandas as pd
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from sealfit.config import Config
 from sealfit.report.notation import (
@@ -17,14 +17,10 @@ from sealfit.report.notation import (
     known,
     measured,
     number,
-    quantity_words,
     symbol_html,
     true_units,
 )
 from sealfit.report.style import MOST_ROWS, spread
-
-# ---------------------------------------------------------------- law tables
-# Rows of the joint aging laws: form, parameters and evidence.
 
 MOST_LAWS = 4  # listed per quantity
 
@@ -32,16 +28,11 @@ MOST_LAWS = 4  # listed per quantity
 def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> list[dict]:
     """Return each quantity's laws with the lowest BIC, and the separate laws, as plain values for the page.
 
-    Parameters
-    ----------
-    aging_laws : DataFrame
-        Table `aging_laws`, perhaps empty.
-    before : DataFrame, optional
-        The same without the loop's effects; its best law follows that of `aging_laws`.
+    `before` is table `aging_laws` without the loop's effects; its best law follows that of `aging_laws`.
     """
     found = []
     earlier = {} if before is None else {row["key"]: row for row in law_rows(before) if row["chosen"]}
-    several = aging_laws["rubber"].nunique() > 1 if len(aging_laws) else False
+    several = aging_laws["rubber"].nunique() > 1
     for (rubber, quantity), own in aging_laws.groupby(["rubber", "quantity"], sort=False):
         last = own["rank"].max()
         for rank, law in own.groupby("rank", sort=True):
@@ -58,22 +49,16 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
                     "criterion": number(first["criterion"]) if rank > 1 else "0",
                     "energy": _with_interval(by, "E"),
                     "kappa": _with_interval(by, "kappa"),
-                    "heldout_series": number(first["heldout_series"])
-                    if known(first["heldout_series"])
-                    else NOTHING,
-                    "heldout_last_day": number(first["heldout_last_day"])
-                    if known(first["heldout_last_day"])
-                    else NOTHING,
+                    "heldout_series": number(first["heldout_series"]),
+                    "heldout_last_day": number(first["heldout_last_day"]),
                     "lack_of_fit": number(first["lack_of_fit_p"], 2) if known(first["lack_of_fit_p"]) else "",
                     "chosen": rank == 1,
                     "before": False,
                     "key": (rubber, quantity),
                 }
             )
-            if rank == 1 and (rubber, quantity) in earlier:
-                found.append(
-                    {**earlier[rubber, quantity], "criterion": NOTHING, "chosen": False, "before": True}
-                )
+            if rank == 1 and (old := earlier.get((rubber, quantity))):
+                found.append({**old, "criterion": NOTHING, "chosen": False, "before": True})
     return found
 
 
@@ -89,13 +74,13 @@ def _with_interval(by: pd.DataFrame, name: str) -> str:
 
 
 # ---------------------------------------------------------------- parameters
-# Tables of the fitted parameters: a row per condition or series, each parameter with its interval and u_sys.
 
-STATISTICS = (
-    "rmse_N", "rmse", "max_error_pct", "specimen_sd_pct", "reduced_chi2",
-    "lack_of_fit_p", "df",
-    "n_runs", "n_files", "n_speeds", "n_days", "last_day",
-)  # fmt: skip
+STATISTICS = {
+    "rmse_N": "rms error", "rmse": "rms error", "max_error_pct": "largest error",
+    "specimen_sd_pct": "specimen scatter", "reduced_chi2": "χ² / df", "lack_of_fit_p": "lack of fit, p",
+    "df": "df", "n_runs": "runs", "n_files": "files", "n_speeds": "speeds", "n_days": "days tested",
+    "last_day": "last day",
+}  # fmt: skip
 ENDS = ("value", "lo95", "hi95")
 MOST_BREAK_AWAYS = 600
 # not shown: for programs that read the Parquet tables
@@ -137,32 +122,23 @@ class ParameterTable:
 
 
 def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
-    """Return the break-away forces above the sliding force, as plain values for the page, and their number.
-
-    Parameters
-    ----------
-    dynamic_fit : DataFrame
-        Table `dynamic_fit`, perhaps empty.
-    config : Config
-        Names the conditions and gives the true units.
-    """
+    """Return the break-away forces above the sliding force, as rows for the page, and their number."""
     names, found = ConditionNames.of(config), []
     keys = ("condition", "speed_set_mm_s", "direction")
     groups: dict[tuple, dict[str, dict]] = {}
     for row in _records(dynamic_fit[dynamic_fit["quantity"] == "break_away"], *keys):
         groups.setdefault(tuple(row[name] for name in keys), {})[row["parameter"]] = row
-    ratios = {place: by["F_ba/F"] for place, by in groups.items()}
-    above = [place for place, ratio in ratios.items() if ratio["identified"] and not ratio["reason"]]
-    for condition, speed, direction in spread(above, MOST_BREAK_AWAYS):
-        by, ratio = groups[condition, speed, direction], ratios[condition, speed, direction]
-        force, interval = measured(*(by["F_ba"][name] for name in ENDS))
+    ratios = [(by["F_ba/F"], by["F_ba"]) for by in groups.values()]
+    above = [(ratio, force) for ratio, force in ratios if ratio["identified"] and not ratio["reason"]]
+    for ratio, broken in spread(above, MOST_BREAK_AWAYS):
+        force, interval = measured(*(broken[name] for name in ENDS))
         percents = (None if ratio[name] is None else 100.0 * (ratio[name] - 1.0) for name in ENDS)
         share, share_interval = measured(*percents)
         found.append(
             {
-                "condition": names(condition),
-                "speed": given(speed) if known(speed) else NOTHING,
-                "direction": "forward" if direction > 0 else "backward",
+                "condition": names(ratio["condition"]),
+                "speed": given(ratio["speed_set_mm_s"]),
+                "direction": "forward" if ratio["direction"] > 0 else "backward",
                 "force": force,
                 "force_interval": interval,
                 "share": share,
@@ -178,18 +154,8 @@ def parameter_tables(
     """Return the tables of `steady_fit` (key "condition") or `aging_fit` (key "series").
 
     Quantities with the same parameters share a table; units stand in the head, and where a parameter has
-    another unit than in the head's row it has a column of its own.
-
-    Parameters
-    ----------
-    fit : DataFrame
-        Table `steady_fit` or `aging_fit`, perhaps empty.
-    key : str
-        Column that tells the rows apart.
-    config : Config
-        Names the conditions and gives the true units.
-    before : DataFrame, optional
-        The same table without the loop's effects, for its values beside those of `fit`.
+    another unit than in the head's row it has a column of its own. `before` is the same table without the
+    loop's effects, for its values beside those of `fit`.
     """
     fit = fit[~fit["quantity"].isin(HIDDEN)]
     if fit.empty:
@@ -211,23 +177,14 @@ def parameter_tables(
     return [replace(table, note=note) for table in tables]
 
 
-def _values(fit: pd.DataFrame, key: str) -> dict[tuple[str, str, str], dict]:
-    """Return the rows of a fit table by condition or series, quantity and parameter."""
-    return {(row[key], row["quantity"], row["parameter"]): row for row in _records(fit, key, "quantity")}
-
-
 def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.DataFrame, str]:
     """Return the rows of at most `MOST_ROWS` conditions or series, and a note on the selection."""
     every = sorted(fit[key].unique(), key=names.place)
     if len(every) <= MOST_ROWS:
         return fit, ""
-    stored = (
-        "aging_fit"
-        if key == "series"
-        else "dynamic_fit"
-        if "dynamic" in set(fit["quantity"])
-        else "steady_fit"
-    )
+    stored = "dynamic_fit" if "dynamic" in set(fit["quantity"]) else "steady_fit"
+    if key == "series":
+        stored = "aging_fit"
     note = f"{MOST_ROWS} of {count(len(every), key, key if key == 'series' else None)}, selected evenly; "
     return fit[fit[key].isin(spread(every, MOST_ROWS))], f"{note}{stored}.parquet has all."
 
@@ -240,20 +197,19 @@ def _table(
     before: pd.DataFrame | None,
 ) -> ParameterTable:
     names, quantities = ConditionNames.of(config), list(dict.fromkeys(fit["quantity"]))
-    earlier = _values(before, key) if before is not None else None
+    compared = before is not None
+    records = _records(before, key, "quantity") if compared else ()
+    earlier = {(row[key], row["quantity"], row["parameter"]): row for row in records}
     several = len(quantities) > 1 or key == "series"
     found = []
     for (name, quantity), by in _rows_of(fit, key, "quantity", names):
-        cells = tuple(_cell(by.get(parameter)) for parameter in parameters)
-        if earlier is not None:
-            olds = [_before(earlier.get((name, quantity, parameter))) for parameter, _ in parameters]
-            cells = tuple(replace(cell, before=old) for cell, old in zip(cells, olds, strict=True))
+        cells = tuple(_cell(by.get(p), earlier.get((name, quantity, p[0]))) for p in parameters)
         keys = (names(name), symbol_html(quantity)) if several else (names(name),)
         found.append((keys, cells, _note(by, config)))
     heads = (key, "quantity") if several else (key,)
     groups = tuple((symbol_html(p), u) for p, u in parameters)
-    title = _title(key, quantities, after=earlier is not None)
-    return ParameterTable(title, heads, groups, tuple(found), compared=earlier is not None)
+    title = _title(key, quantities, after=compared)
+    return ParameterTable(title, heads, groups, tuple(found), compared=compared)
 
 
 def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Config) -> ParameterTable:
@@ -269,12 +225,9 @@ def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Conf
         lack = {p: row for p, row in by.items() if p[0] == "lack_of_fit_p"}
         keys = (names(name), symbol_html(of)) if several else (names(name),)
         found.append((keys, cells, _note(lack, config, named=False)))
-    groups = tuple((Markup("{}").format(quantity_words(p)), u) for p, u in shown)
-    title = (
-        "Goodness of fit, per condition"
-        if key == "condition"
-        else "Goodness of fit of the aging law, per series"
-    )
+    words = {p: STATISTICS.get(p, p.removesuffix("_N").replace("_", " ")) for p, _ in shown}
+    groups = tuple((escape(words[p]), u) for p, u in shown)
+    title = f"Goodness of fit{' of the aging law' if key == 'series' else ''}, per {key}"
     heads = (key, "quantity") if several else (key,)
     return ParameterTable(title, heads, groups, tuple(found), single=True)
 
@@ -292,9 +245,8 @@ def _rows_of(
 
 def _records(rows: pd.DataFrame, *keys: str) -> list[dict]:
     """Return rows as dictionaries, with None for missing values."""
-    plain = rows[
-        [*keys, "parameter", "unit", "value", "lo95", "hi95", "u_sys", "identified", "reason"]
-    ].astype(object)
+    columns = [*keys, "parameter", "unit", *ENDS, "u_sys", "identified", "reason"]
+    plain = rows[columns].astype(object)
     return plain.where(plain.notna(), None).to_dict("records")
 
 
@@ -304,33 +256,27 @@ def _statistic(row: Mapping) -> str:
     return given(row["value"], 9) if whole else number(row["value"])
 
 
-def _cell(row: Mapping | None) -> Cell:
+def _cell(row: Mapping | None, earlier: Mapping | None) -> Cell:
+    """Return the cell of a row; that without the loop's effects has the digits of its own interval."""
+    before = measured(*(earlier[name] for name in ENDS))[0] if earlier and earlier["identified"] else NOTHING
     if row is None:
-        return Cell()
+        return Cell(before=before)
     if not row["identified"]:
-        return Cell(words="not identified")
-    value, interval = measured(row["value"], row["lo95"], row["hi95"])
-    return Cell(value, interval, number(row["u_sys"], 2) if known(row["u_sys"]) else NOTHING)
-
-
-def _before(row: Mapping | None) -> str:
-    """Return a value without the loop's effects, in the digits of its own interval."""
-    if row is None or not row["identified"]:
-        return NOTHING
-    return measured(row["value"], row["lo95"], row["hi95"])[0]
+        return Cell(words="not identified", before=before)
+    return Cell(*measured(*(row[name] for name in ENDS)), number(row["u_sys"], 2), before=before)
 
 
 def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: bool = True) -> Markup:
     """Return the reasons and remarks of a row, each once, with its parameters."""
-    about: dict[tuple[bool, str], list[str]] = {}
+    about: dict[tuple[bool, str], list[Markup]] = {}
     for (parameter, _), row in rows.items():
         why = row["reason"] or ("" if row["identified"] else "these data do not determine it")
         if why:
-            about.setdefault((bool(row["identified"]), str(why)), []).append(parameter)
+            about.setdefault((bool(row["identified"]), why), []).append(symbol_html(parameter))
     said = []
-    for (identified, why), parameters in about.items():
-        lead = Markup(", ").join([symbol_html(p) for p in parameters]) if named else Markup("")
-        lead += Markup("" if identified else " not identified")
+    for (identified, why), symbols in about.items():
+        lead = Markup(", ").join(symbols if named else [])
+        lead += "" if identified else " not identified"
         said.append(Markup("{}{}{}").format(lead, ": " if lead else "", true_units(why, config.units)))
     return Markup("<br>").join(said)
 
@@ -340,8 +286,6 @@ def _title(key: str, quantities: Sequence[str], *, after: bool) -> str:
         return "Pre-sliding stiffness and damping, per condition"
     if key == "condition":
         return "Steady friction, per condition"
-    return (
-        ("Aging law per series, from the joint fit" if after else "Aging law per series")
-        if set(quantities) <= {"mu_s", "mu_c", "F_s", "F_c"}
-        else f"Aging law per series: {', '.join(quantities)}"
-    )
+    if set(quantities) <= {"mu_s", "mu_c", "F_s", "F_c"}:
+        return "Aging law per series, from the joint fit" if after else "Aging law per series"
+    return f"Aging law per series: {', '.join(quantities)}"

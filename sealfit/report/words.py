@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -11,6 +13,7 @@ from markupsafe import Markup, escape
 from sealfit.config import Config
 from sealfit.report.notation import (
     NOTHING,
+    capital,
     channel_label,
     channel_words,
     effect_label,
@@ -28,6 +31,9 @@ from sealfit.report.notation import (
 )
 from sealfit.report.summary import level_words, outlier_clause, power_clause, quality_clause, untold_clause
 
+if TYPE_CHECKING:
+    from sealfit.effects.contract import Parameter
+
 # A shape that crosses zero by at most this share of its span counts as one of constant sign. 0.02 is about
 # the resolution of a plot.
 FLAT = 0.02
@@ -37,17 +43,7 @@ DETAILED = 2
 
 
 def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Markup:
-    """Return the verdict in a few sentences.
-
-    Parameters
-    ----------
-    closure : mapping or None
-        closure.json, or None where the loop was not run.
-    shapes : DataFrame
-        Table `shapes`, for the sizes of the effects.
-    config : Config
-        Gives the true units.
-    """
+    """Return the verdict in a few sentences; table `shapes` gives the sizes of the effects."""
     if closure is None:
         return Markup("The loop has not been run, so the lack of fit of the declared model is not known.")
     errors = [error_clause(closure, config)]
@@ -61,44 +57,36 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
         untold = untold_clause(closure, config.units)
         return _sentences(f"these files do not decide whether an effect is missing: {untold}", *errors)
     added = [(k, e) for k, e in enumerate(closure["effects"]) if not e["candidate"]]
-    missed = _missed_effects(added, shapes, config)
-    many = COUNTED.get(len(added), str(len(added)))
-    lead = Markup("{} effects: {}").format(many, _joined(missed)) if len(added) > 1 else _joined(missed)
-    lacked = Markup("the declared model lacks {}").format(lead) if missed else ""
-    if missed:
-        errors[0] = Markup("with {} {}").format("them," if len(added) > 1 else "it,", errors[0])
-    if closure["verdict"] == "closed":
-        return _sentences(lacked, *errors)
-    left = f"a significant residual remains that no effect explains: {_where(closure['left'], config)}"
+    lacked = left = ""
+    if added:
+        many = f"{COUNTED.get(len(added), len(added))} effects: " if len(added) > 1 else ""
+        missed = Markup(joined(_missed_effects(added, shapes, config)))
+        lacked = Markup("the declared model lacks {}{}").format(many, missed)
+        errors[0] = Markup("with {}, {}").format("them" if len(added) > 1 else "it", errors[0])
+    if closure["verdict"] != "closed":
+        left = f"a significant residual remains that no effect explains: {_where(closure['left'], config)}"
     return _sentences(lacked, left, *errors)
 
 
 def undecided(closure: Mapping | None, config: Config) -> Markup:
     """Return what the files do not decide beside the effects that were found, in a sentence; may be empty."""
     untold = untold_clause(closure, config.units) if closure and closure["verdict"] == "closed" else ""
-    return (
-        _sentences(f"not decided by these files: {true_units(untold, config.units)}")
-        if untold
-        else Markup("")
-    )
+    return _sentences(f"not decided by these files: {true_units(untold, config.units)}" if untold else "")
 
 
 def _missed_effects(
     added: Sequence[tuple[int, Mapping]], shapes: pd.DataFrame, config: Config
 ) -> list[Markup]:
     """Return each effect with its size; of more than `DETAILED` effects only the names, each once."""
-    labels = [effect_label(effect, config.units) for _, effect in added]
     if len(added) <= DETAILED:
-        return [
-            _missed(label, does(k, e, shapes, config)) for label, (k, e) in zip(labels, added, strict=True)
-        ]
-    times = {label: labels.count(label) for label in labels}
-    return [Markup("{}").format(label if n == 1 else f"{label} ({n} of them)") for label, n in times.items()]
+        return [_missed(effect_label(e, config.units), does(k, e, shapes, config)) for k, e in added]
+    times = Counter(effect_label(effect, config.units) for _, effect in added)
+    return [escape(label if n == 1 else f"{label} ({n} of them)") for label, n in times.items()]
 
 
 def _missed(label: str, does: Markup) -> Markup:
     if not does:
-        return Markup("{}").format(label)
+        return escape(label)
     if label.endswith(")"):  # a second pair of parentheses would follow
         return Markup("{}; {})").format(label.removesuffix(")"), does)
     return Markup("{} ({})").format(label, does)
@@ -107,7 +95,7 @@ def _missed(label: str, does: Markup) -> Markup:
 def error_clause(closure: Mapping, config: Config) -> Markup:
     """Return the held-out error before and after, and the noise floor, in a clause."""
     unit = config.units.unit("force")
-    key, what = "heldout_rmse_N", f"rms error on held-out {_units_of(closure)}"
+    key, what = "heldout_rmse_N", f"rms error on held-out {closure.get('heldout_unit') or 'run'}s"
     if not known(closure["before"].get(key)):
         key, what = "rmse_N", "in-sample rms error (nothing could be held out)"
     before, after, floor = closure["before"].get(key), closure["after"].get(key), closure.get("noise_floor_N")
@@ -117,36 +105,32 @@ def error_clause(closure: Mapping, config: Config) -> Markup:
     else:
         way = "falls" if after < before else "rises"
         change = f"the {what} {way} from {of_unit(texts[0], unit)} to {of_unit(texts[1], unit)}"
-    end = (
-        f"noise floor: {of_unit(texts[2], unit)}"
-        if known(floor)
-        else "noise floor unknown: there are no repeats"
-    )
-    return Markup("{} ({})").format(change, end)
+    end = f": {of_unit(texts[2], unit)}" if known(floor) else " unknown: there are no repeats"
+    return Markup("{} (noise floor{})").format(change, end)
 
 
 def does(index: int, effect: Mapping, shapes: pd.DataFrame, config: Config) -> Markup:
     """Return the largest change of the target by an effect, and its other parameters, in a clause."""
     change = _change(effect, shapes[shapes["effect"] == index] if len(shapes) else shapes, config)
-    linear = _amplitudes(effect) if change else set()
-    rest = [p for p in effect["parameters"] if p["name"].rstrip("_") not in linear and p.get("unit") != "rad"]
-    return Markup(", ").join([part for part in (change, *(parameter(p, effect) for p in rest[:2])) if part])
+    rest = [p for p in effect["parameters"] if p.get("unit") != "rad"]
+    if change:  # which says how large the amplitudes are
+        found = [_catalogued(effect["id"], p["name"]) for p in rest]
+        rest = [p for p, own in zip(rest, found, strict=True) if own is None or not own.linear]
+    return Markup(", ").join(filter(None, [change, *(parameter(p, effect) for p in rest[:2])]))
 
 
 def parameter(p: Mapping, effect: Mapping) -> Markup:
     """Return "time constant τ = 4.0 s [3.6, 4.5]", in words for an effect of the catalogue."""
     words = meaning(effect["id"], p["name"])
-    text = Markup("{} = {}").format(
-        symbol_html(p["name"]), _measured(p["value"], p.get("ci95"), p.get("unit"))
-    )
+    value = _measured(p["value"], p.get("ci95"), p.get("unit"))
+    text = Markup("{} = {}").format(symbol_html(p["name"]), value)
     return Markup("{} {}").format(words, text) if words and len(words) <= 40 else text
 
 
 def _measured(value: float | None, ends: Sequence[float | None] | None, unit: str | None) -> str:
     text, interval = measured(value, *(ends or (None, None)), digits=1)
-    return of_unit(text, unit or "") + (
-        f" {interval}".replace(", ", ",\u00a0") if interval != NOTHING else ""
-    )
+    tail = f" {interval}".replace(", ", ",\u00a0") if interval != NOTHING else ""
+    return of_unit(text, unit or "") + tail
 
 
 def _change(effect: Mapping, shape: pd.DataFrame, config: Config) -> Markup:
@@ -160,66 +144,48 @@ def _change(effect: Mapping, shape: pd.DataFrame, config: Config) -> Markup:
     span = value.max() - value.min()
     if not span > 0:
         return Markup("")
-    factor = effect["operation"] == "multiply"
-    scale, unit = (
-        (100.0, "%") if factor else (1.0, next((u for u in shape["unit"] if isinstance(u, str) and u), ""))
-    )
-    what = target_html(effect["acts_on"], config)
+    scale, unit = 1.0, next((u for u in shape["unit"] if isinstance(u, str) and u), "")
+    if effect["operation"] == "multiply":
+        scale, unit = 100.0, "%"
+    size, words = of_unit(number(scale * span, 2), unit), channel_words(channel, config.units)
     if channel == "direction":
-        return Markup("{} differs by {} between directions").format(
-            what, of_unit(number(scale * span, 2), unit)
-        )
-    if max(-value.min(), 0.0) > FLAT * span and max(value.max(), 0.0) > FLAT * span:
-        size = of_unit(number(scale * span, 2), unit)
-        return Markup("{} varies by {} along {}").format(what, size, channel_words(channel, config.units))
-    # constant sign: the largest change against the model without the effect
-    k = int(np.argmax(np.abs(value)))
-    sign = 1.0 if value[k] > 0 else -1.0
-    ends = sorted((scale * sign * lo[k], scale * sign * hi[k]))
-    way = "rises" if sign > 0 else "falls"
-    size = _measured(scale * abs(value[k]), ends, unit)
-    place = of_unit(given(float(shape["x"].iloc[k])), config.units.of(channel) or "")
-    return Markup("{} {} by up to {} at {} {}").format(
-        what, way, size, channel_words(channel, config.units), place
-    )
+        change = f"differs by {size} between directions"
+    elif -value.min() > FLAT * span and value.max() > FLAT * span:
+        change = f"varies by {size} along {words}"
+    else:  # constant sign: the largest change against the model without the effect
+        k = int(np.argmax(np.abs(value)))
+        sign = 1.0 if value[k] > 0 else -1.0
+        ends = sorted((scale * sign * lo[k], scale * sign * hi[k]))
+        size = _measured(scale * abs(value[k]), ends, unit)
+        place = of_unit(given(float(shape["x"].iloc[k])), config.units.of(channel))
+        change = f"{'rises' if sign > 0 else 'falls'} by up to {size} at {words} {place}"
+    return Markup("{} {}").format(target_html(effect["acts_on"], config), change)
 
 
 def target_html(target: str, config: Config) -> Markup:
     """Return the target of an effect: a symbol, or the name of the measured force."""
-    return (
-        Markup("the {}").format(config.units.quantity("force")) if target == "force" else symbol_html(target)
-    )
+    return escape(f"the {config.units.quantity('force')}") if target == "force" else symbol_html(target)
 
 
 def acts(effect: Mapping, config: Config) -> Markup:
     """Return how an effect enters the model, in a clause."""
-    if effect["acts_on"] == "force":
-        force = config.units.quantity("force")
-        return Markup(
-            "scales the whole {}" if effect["operation"] == "multiply" else "adds to the {}"
-        ).format(force)
-    name = {"mu": Markup("the friction coefficient {}").format(symbol_html("mu"))}.get(effect["acts_on"])
-    name = name or symbol_html(effect["acts_on"])
-    return Markup("scales {}" if effect["operation"] == "multiply" else "adds to {}").format(name)
+    target, factor = effect["acts_on"], effect["operation"] == "multiply"
+    lead = {"mu": "the friction coefficient ", "force": "the whole " if factor else "the "}.get(target, "")
+    name = config.units.quantity("force") if target == "force" else symbol_html(target)
+    return Markup("{} {}{}").format("scales" if factor else "adds to", lead, name)
 
 
 def meaning(effect_id: str, name: str) -> str:
     """Return the meaning of a parameter, or "" for an effect that is not in the catalogue."""
+    found = _catalogued(effect_id, name)
+    return found.meaning if found else ""
+
+
+def _catalogued(effect_id: str, name: str) -> Parameter | None:
     from sealfit.effects import EFFECTS
 
-    effect = EFFECTS.get(effect_id)
-    return (
-        next((p.meaning for p in effect.parameters if p.name.rstrip("_") == name.rstrip("_")), "")
-        if effect
-        else ""
-    )
-
-
-def _amplitudes(effect: Mapping) -> set[str]:
-    from sealfit.effects import EFFECTS
-
-    found = EFFECTS.get(effect["id"])
-    return {name.rstrip("_") for name in found.linear} if found else set()
+    parameters = EFFECTS[effect_id].parameters if effect_id in EFFECTS else ()
+    return next((p for p in parameters if p.symbol == name.rstrip("_")), None)
 
 
 def left_over(closure: Mapping, config: Config) -> Markup:
@@ -263,15 +229,6 @@ def with_left_channels(closure: Mapping, channels: Collection[str]) -> dict:
     return {**closure, "left": {**left, "channels": split_channels(left.get("channel"), channels)}}
 
 
-def _units_of(closure: Mapping) -> str:
-    return f"{closure.get('heldout_unit') or 'run'}s"
-
-
-def _joined(parts: Sequence[Markup]) -> Markup:
-    return Markup(" and ").join([Markup(", ").join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
-
-
 def _sentences(*clauses: str | Markup) -> Markup:
     """Return the clauses that are not empty as sentences; plain text is escaped."""
-    texts = [str(escape(clause)) for clause in clauses if clause]
-    return Markup(" ".join(f"{text[:1].upper()}{text[1:]}." for text in texts))
+    return Markup(" ".join(f"{capital(str(escape(clause)))}." for clause in clauses if clause))

@@ -226,7 +226,7 @@ def closure_document(found, verdict):
     runs = [
         {
             "why": "Replicate specimens would show whether the law of aging has an induction time.",
-            "conditions": [{"temperature_C": 60, "compression_ratio_pct": 80, "aging_days": 1}],
+            "conditions": {"temperature_C": 60, "compression_ratio_pct": 80, "aging_days": 1},
         }
     ]
     return {
