@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.report.summary import NOT_PARAMETERS
+from sealfit.report.summary import NOT_PARAMETERS, verdict_sentence
 from sealfit.tables import Schema
 from sealfit.units import Units
 
@@ -24,12 +24,12 @@ ERRORS = {
     "mean_abs_pct": "mean absolute error, of the measured run mean",
 }
 FLOORED = ("rmse_N", "heldout_rmse_N")  # errors that the noise floor is compared with
-EFFECT = (
-    "id", "label", "level", "acts_on", "operation", "form", "named", "candidate", "p_value", "heldout_gain_N",
-    "heldout_rmse_N", "reference",
-)  # fmt: skip
-SCATTER = ("level", "sd_rel", "sd_N", "df")
-SENSITIVITY = ("variable", "level", "acts_on", "smallest_N", "smallest_pct", "files_needed", "cannot_tell")
+EFFECT = [
+    "effect", "id", "label", "channels", "level", "acts_on", "operation", "form", "named", "candidate",
+    "p_value", "heldout_gain_N", "heldout_rmse_N", "reference",
+]  # fmt: skip
+SCATTER = ["level", "sd_rel", "sd_N", "df"]
+SENSITIVITY = ["variable", "level", "acts_on", "smallest_N", "smallest_pct", "files_needed", "cannot_tell"]
 
 
 def with_units(frame: pd.DataFrame, units: Units, schema: Schema | None = None) -> pd.DataFrame:
@@ -40,23 +40,23 @@ def with_units(frame: pd.DataFrame, units: Units, schema: Schema | None = None) 
     >>> with_units(pd.DataFrame({"force_N": [1.0], "n": [2]}), Units({"force": ("torque", "mN m")})).attrs
     {'units': {'force_N': 'mN m'}}
     """
-    columns = {column.name: column for column in schema.columns} if schema else {}
-    found = {
-        name: units.of(name) or (columns[name].unit if name in columns else "") for name in map(str, frame)
-    }
+    columns = [column for column in schema.columns if column.name in frame] if schema else []
+    stored = {column.name: column.unit for column in columns}
+    found = {name: units.of(name) or stored.get(name, "") for name in map(str, frame)}
     frame.attrs = {"units": {name: unit for name, unit in found.items() if unit}}
     if schema:
-        frame.attrs["meaning"] = {name: columns[name].meaning for name in map(str, frame) if name in columns}
+        frame.attrs["meaning"] = {column.name: column.meaning for column in columns}
     return frame
 
 
 # ---------------------------------------------------------------- what the loop found
-def verdict(closure: Mapping, sentence: str) -> pd.DataFrame:
+# Each is made of closure.json, and takes the true units.
+def verdict(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return one row: the verdict, its sentence, how good the fit is, and what is left."""
     quality, left = closure["fit_quality"], closure["left"]
     row = {
         "verdict": closure["verdict"],
-        "sentence": sentence,
+        "sentence": verdict_sentence(closure, units),
         "effects": sum(not effect["candidate"] for effect in closure["effects"]),
         "fit_quality": quality["state"],
         "error_over_scatter": quality["ratio"],
@@ -86,48 +86,35 @@ def errors(closure: Mapping, units: Units) -> pd.DataFrame:
     return _numbers(pd.DataFrame(rows), ("before", "after", "noise_floor"))
 
 
-def effects(closure: Mapping) -> pd.DataFrame:
+def effects(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per effect, added or candidate; `effect` is its number, from 0."""
     rows = [
-        {"effect": k, **{name: effect.get(name) for name in EFFECT}, "channels": " ".join(effect["channels"])}
+        {**effect, "effect": k, "channels": " ".join(effect["channels"])}
         for k, effect in enumerate(closure["effects"])
     ]
-    frame = pd.DataFrame(rows, columns=["effect", "id", "label", "channels", *EFFECT[2:]])
-    return _numbers(frame, ("p_value", "heldout_gain_N", "heldout_rmse_N"))
+    return _numbers(pd.DataFrame(rows, columns=EFFECT), ("p_value", "heldout_gain_N", "heldout_rmse_N"))
 
 
-def effect_parameters(closure: Mapping) -> pd.DataFrame:
+def effect_parameters(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per effect and parameter, with the ends of its 95 % interval."""
+    columns = ["effect", "id", "parameter", "value", "lo95", "hi95", "unit"]
     rows = [
-        {
-            "effect": k,
-            "id": effect["id"],
-            "parameter": parameter["name"],
-            "value": parameter["value"],
-            "lo95": parameter["ci95"][0],
-            "hi95": parameter["ci95"][1],
-            "unit": parameter["unit"],
-        }
+        (k, effect["id"], own["name"], own["value"], *own["ci95"], own["unit"])
         for k, effect in enumerate(closure["effects"])
-        for parameter in effect["parameters"]
+        for own in effect["parameters"]
     ]
-    frame = pd.DataFrame(rows, columns=["effect", "id", "parameter", "value", "lo95", "hi95", "unit"])
-    return _numbers(frame, ("value", "lo95", "hi95"))
+    return _numbers(pd.DataFrame(rows, columns=columns), ("value", "lo95", "hi95"))
 
 
-def scatter(closure: Mapping) -> pd.DataFrame:
+def scatter(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per level of scatter: file, run, specimen."""
-    return _listed(closure["scatter"], SCATTER, SCATTER[1:])
+    return _numbers(pd.DataFrame(closure["scatter"], columns=SCATTER), SCATTER[1:])
 
 
-def sensitivity(closure: Mapping) -> pd.DataFrame:
+def sensitivity(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per variable, level and target: the smallest effect to be found with 80 % chance."""
-    return _listed(closure["sensitivity"], SENSITIVITY, ("smallest_N", "smallest_pct", "files_needed"))
-
-
-def _listed(entries: Iterable[Mapping], names: Sequence[str], numbers: Sequence[str]) -> pd.DataFrame:
-    rows = [{name: entry.get(name) for name in names} for entry in entries]
-    return _numbers(pd.DataFrame(rows, columns=list(names)), numbers)
+    frame = pd.DataFrame(closure["sensitivity"], columns=SENSITIVITY)
+    return _numbers(frame, ("smallest_N", "smallest_pct", "files_needed"))
 
 
 def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:

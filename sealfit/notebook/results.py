@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +21,7 @@ from sealfit.store.manifest import BATCH
 from sealfit.store.out_folder import Store
 from sealfit.store.paths import existing_out
 from sealfit.tables import SCHEMAS
+from sealfit.units import Units
 
 if TYPE_CHECKING:
     from sealfit.notebook.plots import Plots
@@ -144,27 +145,22 @@ class Results:
     @property
     def verdict(self) -> pd.DataFrame:
         """One row: the verdict, its sentence, how good the fit is, and what is left."""
-        store, closure = self._closure()
-        sentence = summary.verdict_sentence(closure, store.config.units)
-        return frames.with_units(frames.verdict(closure, sentence), store.config.units)
+        return self._of_closure(frames.verdict)
 
     @property
     def errors(self) -> pd.DataFrame:
         """A row per error: before and after the effects were added, and the noise floor."""
-        store, closure = self._closure()
-        return frames.with_units(frames.errors(closure, store.config.units), store.config.units)
+        return self._of_closure(frames.errors)
 
     @property
     def effects(self) -> pd.DataFrame:
         """A row per effect that the loop found; one that is only a candidate is not in the model."""
-        store, closure = self._closure()
-        return frames.with_units(frames.effects(closure), store.config.units)
+        return self._of_closure(frames.effects)
 
     @property
     def effect_parameters(self) -> pd.DataFrame:
         """A row per effect and parameter, with its 95 % interval and unit."""
-        store, closure = self._closure()
-        return frames.with_units(frames.effect_parameters(closure), store.config.units)
+        return self._of_closure(frames.effect_parameters)
 
     @property
     def effect_curves(self) -> pd.DataFrame:
@@ -174,14 +170,12 @@ class Results:
     @property
     def scatter(self) -> pd.DataFrame:
         """A row per level: how much specimens, runs and files scatter."""
-        store, closure = self._closure()
-        return frames.with_units(frames.scatter(closure), store.config.units)
+        return self._of_closure(frames.scatter)
 
     @property
     def sensitivity(self) -> pd.DataFrame:
         """A row per variable, level and target: the smallest effect to be found with 80 % chance."""
-        store, closure = self._closure()
-        return frames.with_units(frames.sensitivity(closure), store.config.units)
+        return self._of_closure(frames.sensitivity)
 
     # ------------------------------------------------------------ fits
     @property
@@ -341,12 +335,12 @@ class Results:
             return f"<p>Results in {html.escape(str(self.out))}: {html.escape(str(error))}</p>"
         units = store.config.units
         sentence = html.escape(summary.verdict_sentence(closure, units))
-        errors = frames.errors(closure, units)[["meaning", "before", "after", "noise_floor", "unit"]]
-        parts = [f"<p><b>{html.escape(closure['verdict'])}</b>: {sentence}.</p>", _table_html(errors)]
+        tables = [frames.errors(closure, units)[["meaning", "before", "after", "noise_floor", "unit"]]]
         if closure["effects"]:
-            parts += [_table_html(frames.effects(closure)[list(SHOWN)])]
-            parts += [_table_html(frames.effect_parameters(closure).drop(columns="effect"))]
-        return "\n".join(parts)
+            tables.append(frames.effects(closure, units)[list(SHOWN)])
+            tables.append(frames.effect_parameters(closure, units).drop(columns="effect"))
+        verdict = f"<p><b>{html.escape(closure['verdict'])}</b>: {sentence}.</p>"
+        return "\n".join([verdict, *map(_table_html, tables)])
 
     # ------------------------------------------------------------ reading
     def _open(self) -> Store:
@@ -367,9 +361,11 @@ class Results:
         store.require(store.state.order[-2])
         return store
 
-    def _closure(self) -> tuple[Store, dict]:
+    def _of_closure(self, frame: Callable[[dict, Units], pd.DataFrame]) -> pd.DataFrame:
+        """Return a frame that is made of closure.json and the true units."""
         store = self._current(ANSWERED)
-        return store, store.read_json("closure")
+        units = store.config.units
+        return frames.with_units(frame(store.read_json("closure"), units), units)
 
     @staticmethod
     def _answer(store: Store, name: str) -> pd.DataFrame:
