@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -14,10 +15,6 @@ if TYPE_CHECKING:
     from sealfit.effects.contract import Effect
     from sealfit.store.out_folder import Store
 
-
-# ---------------------------------------------------------------- summary
-# The main figures of each step as plain values, for --json; `summary_lines` puts them in words.
-
 # `quantity` of rows about the fit itself
 NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift", "effect_shift")
 
@@ -27,18 +24,14 @@ OF_INGEST = {  # columns that its summary counts
     "quality": ["action", "severity", "check", "column", "value", "reason"],
     "steady": ["condition"],
 }
+CLOSURE_KEYS = (
+    "verdict", "fit_quality", "sensitivity", "refused", "units", "noise_floor_N", "before", "after",
+    "heldout_unit", "left", "next_runs", "outlier_files",
+)  # fmt: skip
 EFFECT_KEYS = (
-    "id",
-    "label",
-    "form",
-    "acts_on",
-    "operation",
-    "channels",
-    "named",
-    "candidate",
-    "parameters",
+    "id", "label", "form", "acts_on", "operation", "channels", "named", "candidate", "parameters",
     "reference",
-)
+)  # fmt: skip
 
 
 def of_steps(store: Store, steps: Iterable[str]) -> dict:
@@ -58,43 +51,32 @@ def of_steps(store: Store, steps: Iterable[str]) -> dict:
 
 def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
     """Return how many files, runs and conditions there are, and how many faults."""
-    inputs, quality, steady = tables["inputs"], tables["quality"], tables["steady"]
-    runs = tables["runs"][tables["runs"]["used"].astype(bool)]
+    quality, runs = tables["quality"], tables["runs"]
+    files = Counter(tables["inputs"]["status"])
+    actions, severities = Counter(quality["action"]), Counter(quality["severity"])
     return {
-        "files": {
-            "used": int((inputs["status"] == "used").sum()),
-            "left_out": int((inputs["status"] == "left out").sum()),
-            "not_matched": int((inputs["status"] == "not matched").sum()),
-        },
-        "rows_left_out": int((quality["action"] == "row left out").sum()),
-        "strokes_left_out": int((quality["action"] == "stroke left out").sum()),
-        "faults": {
-            severity: int((quality["severity"] == severity).sum()) for severity in ("error", "warning")
-        },
-        "incomplete_columns": _incomplete(quality),
-        "runs": int(runs["run_id"].nunique()),
-        "conditions": int(steady["condition"].nunique()),
+        "files": {status.replace(" ", "_"): files[status] for status in ("used", "left out", "not matched")},
+        "rows_left_out": actions["row left out"],
+        "strokes_left_out": actions["stroke left out"],
+        "faults": {severity: severities[severity] for severity in ("error", "warning")},
+        "incomplete_columns": [
+            {"column": row.column, "files_without": int(float(row.value)), "reason": row.reason}
+            for row in quality[quality["check"] == "incomplete_column"].itertuples()
+        ],
+        "runs": int(runs.loc[runs["used"].astype(bool), "run_id"].nunique()),
+        "conditions": int(tables["steady"]["condition"].nunique()),
     }
-
-
-def _incomplete(quality: pd.DataFrame) -> list[dict]:
-    """Return the columns that have no value in some files, and the consequence."""
-    rows = quality[quality["check"] == "incomplete_column"]
-    return [
-        {"column": column, "files_without": int(float(value)), "reason": reason}
-        for column, value, reason in zip(rows["column"], rows["value"], rows["reason"], strict=True)
-    ]
 
 
 def of_fit(fit: pd.DataFrame, of: str) -> dict:
     """Return the range of each parameter over the conditions or series of `fit` in which it is identified."""
     rows = fit[~fit["quantity"].isin(NOT_PARAMETERS)]
     ranges = []
-    for (quantity, parameter, unit), group in rows.groupby(
-        ["quantity", "parameter", "unit"], sort=False, dropna=False
-    ):
-        known = group.loc[group["identified"].astype(bool), "value"].dropna()
-        why = group.loc[~group["identified"].astype(bool), "reason"].dropna().mode()
+    keys = ["quantity", "parameter", "unit"]
+    for (quantity, parameter, unit), group in rows.groupby(keys, sort=False, dropna=False):
+        identified = group["identified"].astype(bool)
+        known = group.loc[identified, "value"].dropna()
+        why = group.loc[~identified, "reason"].dropna().mode()
         ranges.append(
             {
                 "quantity": quantity,
@@ -177,16 +159,8 @@ def of_dynamic(fit: pd.DataFrame) -> dict:
 
 def of_closure(closure: Mapping, units: Units) -> dict:
     """Return the verdict, the errors before and after, the effects and the remaining residual."""
-    kept = (
-        "verdict", "fit_quality", "sensitivity", "refused", "units", "noise_floor_N", "before", "after",
-        "heldout_unit", "left", "next_runs", "outlier_files",
-    )  # fmt: skip
-    effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]
-    return {
-        **{key: closure[key] for key in kept},
-        "sentence": verdict_sentence(closure, units),
-        "effects": effects,
-    }
+    found = {key: closure[key] for key in CLOSURE_KEYS} | {"sentence": verdict_sentence(closure, units)}
+    return found | {"effects": [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]}
 
 
 def of_after(store: Store) -> dict:
@@ -208,17 +182,13 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
 def _verdict_clause(closure: Mapping, units: Units) -> str:
     count = sum(not effect["candidate"] for effect in closure["effects"])
     added = {0: "no effect was added", 1: "one effect was added"}.get(count, f"{count} effects were added")
-    quality = quality_clause(closure)
+    quality, untold = quality_clause(closure), untold_clause(closure, units)
     if closure["verdict"] == "nothing_missing":
         power = power_clause(closure, units)
         return "; ".join(filter(None, ["no effect beyond the declared model is significant", quality, power]))
     if closure["verdict"] == "cannot_tell":
-        return (
-            f"{quality}; these files do not decide whether an effect is missing: "
-            f"{untold_clause(closure, units)}"
-        )
+        return f"{quality}; these files do not decide whether an effect is missing: {untold}"
     if closure["verdict"] == "closed":
-        untold = untold_clause(closure, units)
         beside = f"; not decided by these files: {untold}" if untold else ""
         return f"{added}; no significant residual remains; {quality}{beside}"
     return f"{added}; a significant residual remains{_where(closure['left'], units)}; {quality}"
@@ -240,8 +210,13 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
     units = replace(units, channels={**units.channels, CHANNEL: "unit of x"})
     listed = []
     for effect in effects:
+        ways = [{"target": target, "operation": operation} for target, operation in effect.acts_on]
         target, operation = effect.acts_on[0]
         likeliest = SimpleNamespace(channels=effect.reads, acts_on=target, operation=operation)
+        parameters = [
+            {"name": p.name, "unit": parameter_unit(p.unit, likeliest, units), "meaning": p.meaning}
+            for p in effect.parameters
+        ]
         listed.append(
             {
                 "id": effect.id,
@@ -249,22 +224,16 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
                 "form": effect.form,
                 "equation": effect.equation,
                 "reads": list(effect.reads),
-                "acts_on": [
-                    {"target": target, "operation": operation} for target, operation in effect.acts_on
-                ],
+                "acts_on": ways,
                 "physical": effect.physical,
                 "source": effect.source,
-                "parameters": [
-                    {"name": p.name, "unit": parameter_unit(p.unit, likeliest, units), "meaning": p.meaning}
-                    for p in effect.parameters
-                ],
+                "parameters": parameters,
             }
         )
     return listed
 
 
-# ---------------------------------------------------------------- verdict
-# Clauses that the summary and the report share: fit quality and sensitivity.
+# ---------------------------------------------------------------- clauses that the report shares
 
 LEVEL_WORDS = {
     "trace": "along strokes", "sample": "along strokes", "stroke": "between strokes",
@@ -302,8 +271,8 @@ def quality_clause(closure: Mapping) -> str:
         return "without repeats it is not known whether the error exceeds the scatter"
     if quality["state"] == "within_scatter":
         return "the error is within the scatter of repeats"
-    times, p_value = quality["ratio"], quality["p_value"]
-    return f"the error is {times:.2g} times the scatter of repeats (lack of fit: p = {p_value:.1g})"
+    times = f"the error is {quality['ratio']:.2g} times the scatter of repeats"
+    return f"{times} (lack of fit: p = {quality['p_value']:.1g})"
 
 
 def power_clause(closure: Mapping, units: Units) -> str:
@@ -312,14 +281,11 @@ def power_clause(closure: Mapping, units: Units) -> str:
     It is empty if none is known.
     """
     known = [s for s in closure.get("sensitivity") or () if s["smallest_N"] is not None]
-    if not known:
-        return ""
-    largest = sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
     texts = [
         f"{s['smallest_pct']:.2g} % for {units.label(s['variable'])} {level_words(s['level'])}"
-        for s in largest
+        for s in sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
     ]
-    return f"the largest detection limits, in percent of the force, are {', '.join(texts)}"
+    return f"the largest detection limits, in percent of the force, are {', '.join(texts)}" if texts else ""
 
 
 def untold_clause(closure: Mapping, units: Units) -> str:
@@ -335,13 +301,10 @@ def untold_clause(closure: Mapping, units: Units) -> str:
         if item["weak"]
     ][:NAMED]
     for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
-        name, smallest, files = entry["variable"], entry["smallest_pct"], entry["files_needed"]
-        size = (
-            "no effect is detectable"
-            if smallest is None
-            else f"detection limit {smallest:.2g} % of the force"
-        )
-        more = f"; 1 % needs about {files} files" if files and smallest is not None else ""
-        more = f"; at least {files} files are needed" if files and smallest is None else more
-        texts.append(f"{units.label(name)} ({size}{more})")
+        smallest, files = entry["smallest_pct"], entry["files_needed"]
+        if smallest is None:
+            size, more = "no effect is detectable", f"; at least {files} files are needed"
+        else:
+            size, more = f"detection limit {smallest:.2g} % of the force", f"; 1 % needs about {files} files"
+        texts.append(f"{units.label(entry['variable'])} ({size}{more if files else ''})")
     return ", ".join(texts)

@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 # Level of the test for lack of fit.
 LACKING = 0.05
 
-# ---------------------------------------------------------------- summary lines
-
 
 def lines(summary: Mapping) -> list[str]:
     """Return the summary of one or more steps, as lines, the verdict first.
@@ -40,9 +38,8 @@ def ingest_lines(part: Mapping) -> list[str]:
     if files["not_matched"]:
         text += f", {files['not_matched']} not matched by the file-name pattern"
     found = [line("files", text)]
-    left_out = [
-        _count(part[f"{what}s_left_out"], what) for what in ("stroke", "row") if part[f"{what}s_left_out"]
-    ]
+    numbers = {what: part[f"{what}s_left_out"] for what in ("stroke", "row")}
+    left_out = [_count(number, what) for what, number in numbers.items() if number]
     if sum(faults.values()):
         text = f"{_count(faults['error'], 'error')}, {_count(faults['warning'], 'warning')}"
         more = f"; left out: {', '.join(left_out)}" if left_out else ""
@@ -62,17 +59,16 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
         texts = [_range(entry) for entry in ranges if entry["quantity"] == quantity]
         name = "" if len(quantities) == 1 else f"{quantity}: "
         found.append(line(title if not found else "", name + ", ".join(texts)))
-    lacking = [entry for entry in ranges if entry["identified"] < entry["of"]]
-    if lacking:
-        names = [
-            f"{e['quantity']} {e['parameter']}" if len(quantities) > 1 else e["parameter"] for e in lacking
-        ]
-        texts = [
-            f"{name} in {entry['of'] - entry['identified']} of {entry['of']}" if entry["of"] > 1 else name
-            for name, entry in zip(names, lacking, strict=True)
-        ]
-        reason = next((entry["reason"] for entry in lacking if entry["reason"]), "")
-        found.append(line("", f"not identified: {', '.join(texts)}. {reason}".rstrip()))
+    texts, reasons = [], []
+    for entry in ranges:
+        lacking = entry["of"] - entry["identified"]
+        if lacking:
+            name = f"{entry['quantity']} " if len(quantities) > 1 else ""
+            places = f" in {lacking} of {entry['of']}" if entry["of"] > 1 else ""
+            texts.append(f"{name}{entry['parameter']}{places}")
+            reasons += filter(None, [entry["reason"]])
+    if texts:
+        found.append(line("", " ".join([f"not identified: {', '.join(texts)}.", *reasons[:1]])))
     return found
 
 
@@ -147,12 +143,10 @@ def dynamic_lines(part: Mapping) -> list[str]:
 
 
 def _range(entry: Mapping) -> str:
-    unit = f" {entry['unit']}" if entry["unit"] else ""
     if entry["min"] is None:
         return f"{entry['parameter']} not identified"
-    if entry["min"] == entry["max"]:
-        return f"{entry['parameter']} {entry['min']:.4g}{unit}"
-    return f"{entry['parameter']} {entry['min']:.4g} to {entry['max']:.4g}{unit}"
+    top = f" to {entry['max']:.4g}" if entry["max"] != entry["min"] else ""
+    return f"{entry['parameter']} {entry['min']:.4g}{top} {entry['unit']}".rstrip()
 
 
 def closure_lines(part: Mapping) -> list[str]:
@@ -195,13 +189,12 @@ def _left(left: Mapping, verdict: str, unit: str) -> str:
 
 
 def _value(parameter: Mapping) -> str:
-    unit = f" {parameter['unit']}" if parameter["unit"] else ""
-    return f"{parameter['name']} {_number(parameter['value'])}{unit}"
+    return f"{parameter['name']} {_number(parameter['value'])} {parameter['unit'] or ''}".rstrip()
 
 
-def _acts(effect: Mapping) -> str:
-    how = {"add": "added to", "multiply": "a factor on"}[effect["operation"]]
-    return f"{how} {'the force' if effect['acts_on'] == 'force' else effect['acts_on']}"
+def _acts(way: Mapping) -> str:
+    how = {"add": "added to", "multiply": "a factor on"}[way["operation"]]
+    return f"{how} {'the force' if way['target'] == 'force' else way['target']}"
 
 
 def effects_lines(listed: Mapping) -> list[str]:
@@ -210,9 +203,7 @@ def effects_lines(listed: Mapping) -> list[str]:
     for effect in listed["effects"]:
         mark = "  [in the model of this OUT]" if effect["id"] in (listed.get("added") or ()) else ""
         found.append(f"{effect['id']}: {effect['label']}{mark}")
-        acts = ", ".join(_acts({**way, "acts_on": way["target"]}) for way in effect["acts_on"])
-        found.append(f"    {effect['form']}")
-        found.append(f"    {acts}")
+        found += [f"    {effect['form']}", f"    {', '.join(map(_acts, effect['acts_on']))}"]
         for p in effect["parameters"]:
             found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
     if listed.get("added", ()) is None:
@@ -226,11 +217,9 @@ def effects_lines(listed: Mapping) -> list[str]:
 
 def predict_lines(part: Mapping) -> list[str]:
     """Return the lines of a prediction."""
-    text = (
-        f"{part['answered']} of {_count(part['rows'], 'row')} predicted, {part['extrapolated']} extrapolated"
-    )
-    refused = part["rows"] - part["answered"]
-    if refused:
+    text = f"{part['answered']} of {_count(part['rows'], 'row')} predicted"
+    text += f", {part['extrapolated']} extrapolated"
+    if refused := part["rows"] - part["answered"]:
         text += f"; {_count(refused, 'row')} not predicted (reason in column note)"
     return [line("points", text), line("output", part["output"])]
 
@@ -248,8 +237,7 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3g}"
 
 
-# ---------------------------------------------------------------- summary life
-# The summary of `lifetime`.
+# ---------------------------------------------------------------- lifetime
 
 
 def lifetime_lines(part: Mapping) -> list[str]:
@@ -262,9 +250,8 @@ def lifetime_lines(part: Mapping) -> list[str]:
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
     if part.get("ci95_over_laws") and part["rivals"] and part["days"]:
-        found.append(
-            line("", f"95 % interval over all laws, weighted: {_days_between(part['ci95_over_laws'])}")
-        )
+        weighted = _days_between(part["ci95_over_laws"])
+        found.append(line("", f"95 % interval over all laws, weighted: {weighted}"))
     if part.get("before"):
         found.append(line("before", f"{_life(part['before'])}, without the effects"))
     for rival in part["rivals"]:
@@ -291,16 +278,13 @@ def _change(part: Mapping) -> str:
 def _life(part: Mapping) -> str:
     if "days" not in part:
         years, span = f"{part['years']:g} years", "from {:g} to {:g} degC".format(*part["sought_C"])
-        if part["always"] == "longer":
-            return f"it lasts longer than {years} at every temperature {span}"
-        if part["always"] == "shorter":
-            return f"it lasts less than {years} at every temperature {span}"
+        if part["always"]:
+            more = {"longer": "longer", "shorter": "less"}[part["always"]]
+            return f"it lasts {more} than {years} at every temperature {span}"
         low, high = part["tested_C"]
         beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
-        return (
-            f"it lasts {years} at {part['temperature_C']:.1f} degC"
-            f"{_degrees(part['temperature_ci95'])}{beyond}"
-        )
+        ends = _degrees(part["temperature_ci95"])
+        return f"it lasts {years} at {part['temperature_C']:.1f} degC{ends}{beyond}"
     if part["days"] is None:
         return f"{part['threshold']:.4g} is not reached within 1e9 d"
     if part["days"] == 0:

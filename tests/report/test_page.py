@@ -106,11 +106,14 @@ def test_the_page_asks_for_nothing(name, reports, pages):
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_every_image_says_what_it_shows_and_has_a_size(name, pages):
+def test_every_image_says_what_it_shows(name, pages):
     assert all(len(image["alt"]) > 20 for image in pages[name].images)
-    assert {image["width"] for image in pages[name].images} == {"341"}
-    assert "245" in {image["height"] for image in pages[name].images}
     assert pages[name].images
+
+
+def test_an_image_has_the_size_of_its_panel_in_pixels(pages):
+    first = pages["closed"].images[0]
+    assert (first["width"], first["height"]) == ("341", "245")
 
 
 @pytest.mark.parametrize("name", MADE)
