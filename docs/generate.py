@@ -79,7 +79,9 @@ def tables() -> str:
         if name.endswith("_after"):
             continue
         lines += [f"## `{name}`", ""]
-        rows = [(f"`{c.name}`", c.unit, str(c.dtype), c.meaning) for c in schema.columns]
+        rows = [
+            (f"`{c.name}`", Units().of(c.name) or c.unit, str(c.dtype), c.meaning) for c in schema.columns
+        ]
         lines += [*table(("column", "unit", "type", "meaning"), *rows), ""]
         if schema.open_:
             lines += ["The campaign's condition columns and channels are added.", ""]

@@ -28,17 +28,13 @@ if TYPE_CHECKING:
 
 INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
 CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
-AFTER = (
-    "steady_after", "steady_fit_after", "aging_fit_after", "aging_curves_after", "aging_laws_after",
-    "master_curve_after", "dynamic_fit_after", "dynamic_curves_after", "steady_covariance_after",
-    "steady_shift_after", "aging_covariance_after",
-)  # fmt: skip
 FITS = {
     "fit-steady": ("steady_fit", "steady_covariance", "steady_shift"),
     "fit-aging": ("aging_fit", "aging_covariance", "aging_curves", "aging_laws", "master_curve"),
     "fit-dynamic": ("dynamic_fit", "dynamic_curves"),
 }
 FITTED = tuple(name for names in FITS.values() for name in names)
+AFTER = tuple(f"{name}_after" for name in ("steady", *FITTED))
 MADE = {"ingest": INGESTED, **FITS, "close-loop": (*CLOSED, *AFTER)}  # tables by the step that makes them
 TABLES = tuple(name for names in MADE.values() for name in names)
 OF_PROPERTIES = ("property_values", "aging_fit", "aging_curves", "aging_laws", "master_curve")

@@ -1,4 +1,4 @@
-"""Every column of every table, once: name, unit, type and meaning.
+"""Every column of every table, once: name, meaning and type.
 
 A name such as `force_N` is a slot; `sealfit.units` says what unit it truly holds.
 """
@@ -14,12 +14,12 @@ FLOAT, INT, TEXT, BOOL = pa.float64(), pa.int64(), pa.string(), pa.bool_()
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: its name, true unit at default (empty for ratios and labels), type and meaning."""
+    """One column: its name, meaning and type; `unit` where it has one that its name does not tell."""
 
     name: str
-    unit: str
-    dtype: pa.DataType
     meaning: str
+    dtype: pa.DataType | None = FLOAT  # None: as the values are
+    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,34 +36,30 @@ class Schema:
 
 
 # ---------------------------------------------------------------- keys that several tables share
-FILE = Column("file", "", TEXT, "trace file, relative to the campaign folder")
-RUN = Column("run_id", "", TEXT, "run: one condition at one speed and direction")
-REPEAT = Column("repeat", "", INT, "number of the repeat within its run")
+FILE = Column("file", "trace file, relative to the campaign folder", TEXT)
+RUN = Column("run_id", "run: one condition at one speed and direction", TEXT)
+REPEAT = Column("repeat", "number of the repeat within its run", INT)
 STROKE = Column(
-    "stroke", "", INT, "stroke within the file, from 1; each steady speed of a motion and each turn is one"
+    "stroke", "stroke within the file, from 1; each steady speed of a motion and each turn is one", INT
 )
-DIRECTION = Column("direction", "", INT, "+1 where displacement rises, -1 where it falls")
-SPECIMEN = Column("specimen_id", "", TEXT, "piece of rubber; one per condition where not given")
-CONDITION = Column("condition", "", TEXT, "condition: the condition columns in words; 'unaged' for day 0")
-SERIES = Column("series", "", TEXT, "aging series: the condition without days; 'unaged' for day 0")
-RUBBER = Column("rubber", "", TEXT, "rubber, from the config's rubber columns; 'rubber' if there is one")
-SPEED = Column("speed_mm_s", "mm/s", FLOAT, "measured sliding speed, signed")
+DIRECTION = Column("direction", "+1 where displacement rises, -1 where it falls", INT)
+SPECIMEN = Column("specimen_id", "piece of rubber; one per condition where not given", TEXT)
+CONDITION = Column("condition", "condition: the condition columns in words; 'unaged' for day 0", TEXT)
+SERIES = Column("series", "aging series: the condition without days; 'unaged' for day 0", TEXT)
+RUBBER = Column("rubber", "rubber, from the config's rubber columns; 'rubber' if there is one", TEXT)
+SPEED = Column("speed_mm_s", "measured sliding speed, signed")
 SPEED_SET = Column(
     "speed_set_mm_s",
-    "mm/s",
-    FLOAT,
     "commanded speed, magnitude; that of the run where a stroke has several; null if not given",
 )
-LOAD = Column("load_N", "N", FLOAT, "normal load; null if not given")
-FORCE = Column("force_N", "N", FLOAT, "friction force, with the sign of the motion where it opposes it")
-PRESLIDING = Column("presliding_N", "N", FLOAT, "what is left of the pre-sliding rise, taken out of force_N")
-DISPLACEMENT = Column("displacement_mm", "mm", FLOAT, "displacement in the rig's own coordinate")
-DISTANCE = Column("distance_mm", "mm", FLOAT, "distance slid since the start of the motion")
-TIME = Column(
-    "time_s", "s", FLOAT, "time in the file; from the start of the motion in a file of several strokes"
-)
-RUN_ORDER = Column("run_order", "", FLOAT, "place of the file in the order of started_at; null if not given")
-ELAPSED = Column("elapsed_h", "h", FLOAT, "time since the campaign's first file; null if not given")
+LOAD = Column("load_N", "normal load; null if not given")
+FORCE = Column("force_N", "friction force, with the sign of the motion where it opposes it")
+PRESLIDING = Column("presliding_N", "what is left of the pre-sliding rise, taken out of force_N")
+DISPLACEMENT = Column("displacement_mm", "displacement in the rig's own coordinate")
+DISTANCE = Column("distance_mm", "distance slid since the start of the motion")
+TIME = Column("time_s", "time in the file; from the start of the motion in a file of several strokes")
+RUN_ORDER = Column("run_order", "place of the file in the order of started_at; null if not given")
+ELAPSED = Column("elapsed_h", "time since the campaign's first file; null if not given")
 
 KEYS = (FILE, RUN, REPEAT, STROKE, DIRECTION, SPECIMEN, CONDITION, SERIES, RUBBER)
 
@@ -72,12 +68,12 @@ INPUTS = Schema(
     "inputs",
     (
         FILE,
-        Column("size", "byte", INT, "size of the file"),
-        Column("mtime_ns", "ns", INT, "time of last change"),
-        Column("sha256", "", TEXT, "hash of the content"),
-        Column("rows", "", INT, "data rows read"),
-        Column("strokes", "", INT, "strokes found"),
-        Column("status", "", TEXT, "used | left out | not matched"),
+        Column("size", "size of the file", INT, unit="byte"),
+        Column("mtime_ns", "time of last change", INT, unit="ns"),
+        Column("sha256", "hash of the content", TEXT),
+        Column("rows", "data rows read", INT),
+        Column("strokes", "strokes found", INT),
+        Column("status", "used | left out | not matched", TEXT),
     ),
 )
 RUNS = Schema(
@@ -89,10 +85,8 @@ RUNS = Schema(
         LOAD,
         RUN_ORDER,
         ELAPSED,
-        Column(
-            "started_at", "", TEXT, "start of the file, ISO 8601, as given where it is; null if not given"
-        ),
-        Column("used", "", BOOL, "false where the stroke was left out; quality says why"),
+        Column("started_at", "start of the file, ISO 8601, as given where it is; null if not given", TEXT),
+        Column("used", "false where the stroke was left out; quality says why", BOOL),
     ),
     open_=True,
 )
@@ -100,15 +94,15 @@ QUALITY = Schema(
     "quality",
     (
         FILE,
-        Column("stroke", "", INT, "stroke, null for the whole file"),
-        Column("line", "", INT, "line in the file, null if not one line"),
-        Column("column", "", TEXT, "column concerned, null if none"),
-        Column("check", "", TEXT, "name of the rule"),
-        Column("value", "", TEXT, "what was found"),
-        Column("severity", "", TEXT, "info | warning | error"),
-        Column("action", "", TEXT, "kept | row left out | stroke left out | file left out"),
-        Column("reason", "", TEXT, "in a sentence"),
-        Column("fix", "", TEXT, "what to do about it"),
+        Column("stroke", "stroke, null for the whole file", INT),
+        Column("line", "line in the file, null if not one line", INT),
+        Column("column", "column concerned, null if none", TEXT),
+        Column("check", "name of the rule", TEXT),
+        Column("value", "what was found", TEXT),
+        Column("severity", "info | warning | error", TEXT),
+        Column("action", "kept | row left out | stroke left out | file left out", TEXT),
+        Column("reason", "in a sentence", TEXT),
+        Column("fix", "what to do about it", TEXT),
     ),
 )
 TRACES = Schema(
@@ -120,13 +114,8 @@ TRACES = Schema(
         TIME,
         DISPLACEMENT,
         FORCE,
-        Column(
-            "presliding_N",
-            "N",
-            FLOAT,
-            "in the steady window, what is left in force_N of the pre-sliding rise",
-        ),
-        Column("steady", "", BOOL, "true inside the steady window"),
+        Column("presliding_N", "in the steady window, what is left in force_N of the pre-sliding rise"),
+        Column("steady", "true inside the steady window", BOOL),
     ),
     open_=True,  # channels measured along the trace
 )
@@ -137,12 +126,10 @@ TRACES_MEAN = Schema(
         DIRECTION,
         CONDITION,
         DISPLACEMENT,
-        Column("force_N", "N", FLOAT, "mean force of the repeats at this displacement"),
-        Column(
-            "force_se_N", "N", FLOAT, "standard error of that mean, from the repeats; null for one repeat"
-        ),
-        Column("n", "", INT, "strokes averaged"),
-        Column("steady", "", BOOL, "true where every stroke averaged is in its steady window"),
+        Column("force_N", "mean force of the repeats at this displacement"),
+        Column("force_se_N", "standard error of that mean, from the repeats; null for one repeat"),
+        Column("n", "strokes averaged", INT),
+        Column("steady", "true where every stroke averaged is in its steady window", BOOL),
     ),
 )
 STEADY = Schema(
@@ -152,20 +139,20 @@ STEADY = Schema(
         SPEED,
         SPEED_SET,
         LOAD,
-        Column("force_N", "N", FLOAT, "friction force: mean over the steady window, without presliding_N"),
+        Column("force_N", "friction force: mean over the steady window, without presliding_N"),
         PRESLIDING,
-        Column("force_sd_N", "N", FLOAT, "standard deviation of the samples in the window"),
-        Column("force_se_N", "N", FLOAT, "standard error of the mean, autocorrelation counted in"),
-        Column("n", "", INT, "samples in the window"),
+        Column("force_sd_N", "standard deviation of the samples in the window"),
+        Column("force_se_N", "standard error of the mean, autocorrelation counted in"),
+        Column("n", "samples in the window", INT),
         DISPLACEMENT,
-        Column("displacement_from_mm", "mm", FLOAT, "start of the steady window"),
-        Column("displacement_to_mm", "mm", FLOAT, "end of the steady window"),
+        Column("displacement_from_mm", "start of the steady window"),
+        Column("displacement_to_mm", "end of the steady window"),
         DISTANCE,
         TIME,
         RUN_ORDER,
         ELAPSED,
-        Column("outlier", "", BOOL, "true where this repeat disagrees with its run beyond pooled scatter"),
-        Column("used", "", BOOL, "false where the config leaves an outlier out of the fits"),
+        Column("outlier", "true where this repeat disagrees with its run beyond pooled scatter", BOOL),
+        Column("used", "false where the config leaves an outlier out of the fits", BOOL),
     ),
     open_=True,
 )
@@ -173,20 +160,15 @@ BINS = Schema(
     "bins",
     (
         *KEYS,
-        Column("bin", "", INT, "number of the bin along its stroke, from 0"),
+        Column("bin", "number of the bin along its stroke, from 0", INT),
         SPEED,
-        Column(
-            "speed_bin_mm_s",
-            "mm/s",
-            FLOAT,
-            "sliding speed in the bin; the stroke's where no difference is seen",
-        ),
+        Column("speed_bin_mm_s", "sliding speed in the bin; the stroke's where no difference is seen"),
         SPEED_SET,
         LOAD,
-        Column("force_N", "N", FLOAT, "friction force: mean in the bin, without presliding_N"),
+        Column("force_N", "friction force: mean in the bin, without presliding_N"),
         PRESLIDING,
-        Column("force_sd_N", "N", FLOAT, "standard deviation of the samples in the bin"),
-        Column("n", "", INT, "samples in the bin"),
+        Column("force_sd_N", "standard deviation of the samples in the bin"),
+        Column("n", "samples in the bin", INT),
         DISPLACEMENT,
         DISTANCE,
         TIME,
@@ -199,29 +181,29 @@ BINS = Schema(
 # ---------------------------------------------------------------- fits (long: one row per parameter)
 # The fits before the loop are without effects. If the loop added effects, the tables with the suffix `_after`
 # have the fits after their subtraction; otherwise these are empty. Column `model` is "before" or "after".
-MODEL = Column("model", "", TEXT, "before: without effects | after: at the reference of the loop's effects")
+MODEL = Column("model", "before: without effects | after: at the reference of the loop's effects", TEXT)
 _FIT = (
     MODEL,
-    Column("quantity", "", TEXT, "what was fitted, e.g. steady, mu_s, mu_c, statistics"),
-    Column("parameter", "", TEXT, "parameter or statistic, in the field's symbol"),
-    Column("value", "", FLOAT, "estimate"),
-    Column("se", "", FLOAT, "standard error (type A)"),
-    Column("lo95", "", FLOAT, "lower end of the 95 % interval (type A)"),
-    Column("hi95", "", FLOAT, "upper end of the 95 % interval (type A)"),
-    Column("u_sys", "", FLOAT, "standard uncertainty from the sensor's accuracy (type B)"),
-    Column("unit", "", TEXT, "unit of value, se, lo95, hi95 and u_sys"),
-    Column("identified", "", BOOL, "false where these data do not determine it"),
-    Column("reason", "", TEXT, "why it is not determined, or a remark such as mu_s < mu_c"),
+    Column("quantity", "what was fitted, e.g. steady, mu_s, mu_c, statistics", TEXT),
+    Column("parameter", "parameter or statistic, in the field's symbol", TEXT),
+    Column("value", "estimate"),
+    Column("se", "standard error (type A)"),
+    Column("lo95", "lower end of the 95 % interval (type A)"),
+    Column("hi95", "upper end of the 95 % interval (type A)"),
+    Column("u_sys", "standard uncertainty from the sensor's accuracy (type B)"),
+    Column("unit", "unit of value, se, lo95, hi95 and u_sys", TEXT),
+    Column("identified", "false where these data do not determine it", BOOL),
+    Column("reason", "why it is not determined, or a remark such as mu_s < mu_c", TEXT),
 )
 STEADY_FIT = Schema("steady_fit", (CONDITION, SERIES, RUBBER, *_FIT), open_=True)
 AGING_FIT = Schema("aging_fit", (SERIES, RUBBER, *_FIT), open_=True)
-_OTHER = Column("other", "", TEXT, "the other parameter; the parameter itself for a variance")
+_OTHER = Column("other", "the other parameter; the parameter itself for a variance", TEXT)
 _COVARIANCE = (
-    Column("value", "", FLOAT, "covariance of the two estimates (type A)"),
-    Column("unit", "", TEXT, "unit of value"),
-    Column("identified", "", BOOL, "false where these data do not determine one of the two"),
+    Column("value", "covariance of the two estimates (type A)"),
+    Column("unit", "unit of value", TEXT),
+    Column("identified", "false where these data do not determine one of the two", BOOL),
 )
-_PARAMETER = Column("parameter", "", TEXT, "parameter, in the field's symbol")
+_PARAMETER = Column("parameter", "parameter, in the field's symbol", TEXT)
 STEADY_COVARIANCE = Schema(
     "steady_covariance", (CONDITION, SERIES, RUBBER, MODEL, _PARAMETER, _OTHER, *_COVARIANCE), open_=True
 )
@@ -231,7 +213,7 @@ AGING_COVARIANCE = Schema(
         SERIES,
         RUBBER,
         MODEL,
-        Column("quantity", "", TEXT, "what the law is of: mu_s, mu_c, F_s or F_c"),
+        Column("quantity", "what the law is of: mu_s, mu_c, F_s or F_c", TEXT),
         replace(_PARAMETER, meaning="mu_0, a or ln b"),
         _OTHER,
         *_COVARIANCE,
@@ -246,15 +228,12 @@ STEADY_SHIFT = Schema(
         RUBBER,
         MODEL,
         Column(
-            "source",
-            "",
-            TEXT,
-            "sensor: it reads one standard uncertainty too high | 1, 2, ...: of the effects",
+            "source", "sensor: it reads one standard uncertainty too high | 1, 2, ...: of the effects", TEXT
         ),
         _PARAMETER,
-        Column("value", "", FLOAT, "change of the parameter, common to all conditions in sign"),
-        Column("unit", "", TEXT, "unit of value"),
-        Column("identified", "", BOOL, "false where these data do not determine the parameter"),
+        Column("value", "change of the parameter, common to all conditions in sign"),
+        Column("unit", "unit of value", TEXT),
+        Column("identified", "false where these data do not determine the parameter", BOOL),
     ),
     open_=True,
 )
@@ -267,40 +246,43 @@ STEADY_AFTER = Schema(
             replace(c, meaning=f"{c.meaning}, less `effects_N`") if c.name == "force_N" else c
             for c in STEADY.columns
         ),
-        Column("effects_N", "N", FLOAT, "mean force of the subtracted effects over the steady window"),
-        Column("effects_start_N", "N", FLOAT, "force of these effects at the start of the stroke"),
+        Column("effects_N", "mean force of the subtracted effects over the steady window"),
+        Column("effects_start_N", "force of these effects at the start of the stroke"),
     ),
     # Channels, and effects_u1_N, ...: directions in which the effects are uncertain, one standard error each.
     open_=True,
 )
 
 # ---------------------------------------------------------------- the loop
+_ESTIMATE = (
+    Column("value", "estimate"),
+    Column("lo95", "lower end of the 95 % interval"),
+    Column("hi95", "upper end of the 95 % interval"),
+    Column("unit", "unit of value, lo95 and hi95", TEXT),
+)
 EFFECTS = Schema(
     "effects",
     (
-        Column("round", "", INT, "round of the loop in which it was added"),
-        Column("id", "", TEXT, "name in the catalogue, or smooth, levels, ..."),
-        Column("label", "", TEXT, "in words"),
-        Column("channels", "", TEXT, "channels it reads, separated by spaces"),
-        Column("acts_on", "", TEXT, "force, mu or a parameter of the declared model"),
-        Column("operation", "", TEXT, "add | multiply"),
-        Column("form", "", TEXT, "equation"),
-        Column("named", "", BOOL, "false where no closed form fits as well as the free shape"),
-        Column("parameter", "", TEXT, "parameter, in the field's symbol"),
-        Column("value", "", FLOAT, "estimate"),
-        Column("lo95", "", FLOAT, "lower end of the 95 % interval"),
-        Column("hi95", "", FLOAT, "upper end of the 95 % interval"),
-        Column("unit", "", TEXT, "unit of value, lo95 and hi95"),
-        Column("p_value", "", FLOAT, "adjusted over the whole search"),
+        Column("round", "round of the loop in which it was added", INT),
+        Column("id", "name in the catalogue, or smooth, levels, ...", TEXT),
+        Column("label", "in words", TEXT),
+        Column("channels", "channels it reads, separated by spaces", TEXT),
+        Column("acts_on", "force, mu or a parameter of the declared model", TEXT),
+        Column("operation", "add | multiply", TEXT),
+        Column("form", "equation", TEXT),
+        Column("named", "false where no closed form fits as well as the free shape", BOOL),
+        Column("parameter", "parameter, in the field's symbol", TEXT),
+        *_ESTIMATE,
+        Column("p_value", "adjusted over the whole search"),
     ),
 )
 _RESIDUALS = (
     *BINS.columns,
-    Column("model_N", "N", FLOAT, "force of the model, fitted to all rows"),
-    Column("residual_N", "N", FLOAT, "measured minus model"),
-    Column("heldout_model_N", "N", FLOAT, "force of the model fitted without this row's unit"),
-    Column("heldout_residual_N", "N", FLOAT, "measured minus held-out model"),
-    Column("weight", "", FLOAT, "weight in the errors: each file weighs the same"),
+    Column("model_N", "force of the model, fitted to all rows"),
+    Column("residual_N", "measured minus model"),
+    Column("heldout_model_N", "force of the model fitted without this row's unit"),
+    Column("heldout_residual_N", "measured minus held-out model"),
+    Column("weight", "weight in the errors: each file weighs the same"),
 )
 RESIDUALS_BEFORE = Schema("residuals_before", _RESIDUALS, open_=True)
 RESIDUALS_AFTER = Schema("residuals_after", _RESIDUALS, open_=True)
@@ -309,48 +291,46 @@ RESIDUALS_AFTER = Schema("residuals_after", _RESIDUALS, open_=True)
 LEVELS = Schema(
     "levels",
     (
-        Column("stage", "", TEXT, "before | after"),
-        Column("level", "", TEXT, "sample | stroke | file | run | specimen"),
-        Column("channel", "", TEXT, "null for the whole level; else the channel tested at it"),
+        Column("stage", "before | after", TEXT),
+        Column("level", "sample | stroke | file | run | specimen", TEXT),
+        Column("channel", "null for the whole level; else the channel tested at it", TEXT),
         Column(
             "sd_N",
-            "N",
-            FLOAT,
             "standard deviation of the residual at this level, or of the part that the channel explains",
         ),
-        Column("share", "", FLOAT, "share of the residual's variance"),
-        Column("df", "", FLOAT, "degrees of freedom"),
-        Column("p_value", "", FLOAT, "p-value of the channel, adjusted over the search; null for a level"),
+        Column("share", "share of the residual's variance"),
+        Column("df", "degrees of freedom"),
+        Column("p_value", "p-value of the channel, adjusted over the search; null for a level"),
     ),
 )
 CHANNELS = Schema(
     "channels",
     (
-        Column("channel", "", TEXT, "channel"),
-        Column("x", "", FLOAT, "middle of the group of channel values; null for a category"),
-        Column("label", "", TEXT, "the category, or null"),
-        Column("n", "", INT, "bins rows in the group"),
-        Column("before_N", "N", FLOAT, "mean residual before"),
-        Column("before_se_N", "N", FLOAT, "its standard error, from whole units"),
-        Column("before_run", "", TEXT, "run with the largest mean residual in the group"),
-        Column("after_N", "N", FLOAT, "mean residual after"),
-        Column("after_se_N", "N", FLOAT, "its standard error, from whole units"),
-        Column("after_run", "", TEXT, "run with the largest mean residual in the group"),
+        Column("channel", "channel", TEXT),
+        Column("x", "middle of the group of channel values; null for a category"),
+        Column("label", "the category, or null", TEXT),
+        Column("n", "bins rows in the group", INT),
+        Column("before_N", "mean residual before"),
+        Column("before_se_N", "its standard error, from whole units"),
+        Column("before_run", "run with the largest mean residual in the group", TEXT),
+        Column("after_N", "mean residual after"),
+        Column("after_se_N", "its standard error, from whole units"),
+        Column("after_run", "run with the largest mean residual in the group", TEXT),
     ),
 )
 SHAPES = Schema(
     "shapes",
     (
-        Column("effect", "", INT, "row in closure.json's effects, from 0"),
-        Column("id", "", TEXT, "effect"),
-        Column("channel", "", TEXT, "channel drawn along"),
-        Column("x", "", FLOAT, "channel value; null for a category"),
-        Column("label", "", TEXT, "the category, or null"),
-        Column("value", "", FLOAT, "added force, factor minus one, or change of the parameter"),
-        Column("lo95", "", FLOAT, "lower end of the 95 % band"),
-        Column("hi95", "", FLOAT, "upper end of the 95 % band"),
-        Column("free", "", FLOAT, "the free smooth shape at x, null where none was fitted"),
-        Column("unit", "", TEXT, "unit of value, lo95, hi95 and free"),
+        Column("effect", "row in closure.json's effects, from 0", INT),
+        Column("id", "effect", TEXT),
+        Column("channel", "channel drawn along", TEXT),
+        Column("x", "channel value; null for a category"),
+        Column("label", "the category, or null", TEXT),
+        Column("value", "added force, factor minus one, or change of the parameter"),
+        Column("lo95", "lower end of the 95 % band"),
+        Column("hi95", "upper end of the 95 % band"),
+        Column("free", "the free smooth shape at x, null where none was fitted"),
+        Column("unit", "unit of value, lo95, hi95 and free", TEXT),
     ),
 )
 CURVES = Schema(
@@ -360,10 +340,10 @@ CURVES = Schema(
         SERIES,
         SPEED,
         LOAD,
-        Column("force_before_N", "N", FLOAT, "declared model"),
-        Column("force_after_N", "N", FLOAT, "model with its effects, other channels at their means"),
-        Column("force_after_lo95_N", "N", FLOAT, "lower end of the mean's 95 % interval"),
-        Column("force_after_hi95_N", "N", FLOAT, "upper end of the mean's 95 % interval"),
+        Column("force_before_N", "declared model"),
+        Column("force_after_N", "model with its effects, other channels at their means"),
+        Column("force_after_lo95_N", "lower end of the mean's 95 % interval"),
+        Column("force_after_hi95_N", "upper end of the mean's 95 % interval"),
     ),
     open_=True,
 )
@@ -372,33 +352,25 @@ AGING_LAWS = Schema(
     (
         RUBBER,
         MODEL,
-        Column("quantity", "", TEXT, "mu_s, mu_c, F_s or F_c"),
-        Column("law", "", TEXT, "log | stretched | power | induction, for all series; or separate laws"),
+        Column("quantity", "mu_s, mu_c, F_s or F_c", TEXT),
+        Column("law", "log | stretched | power | induction, for all series; or separate laws", TEXT),
         Column(
-            "way",
-            "",
-            TEXT,
-            "what temperature and compression change: rate | loss; empty where neither varies",
+            "way", "what temperature and compression change: rate | loss; empty where neither varies", TEXT
         ),
-        Column("form", "", TEXT, "equation"),
-        Column("rank", "", INT, "1: lowest BIC"),
-        Column("rival", "", BOOL, "true where it is not distinguishable from the best law with these data"),
-        Column("criterion", "", FLOAT, "BIC minus that of the best law"),
-        Column("scatter_rel", "", FLOAT, "relative scatter between specimens about the law"),
-        Column("lack_of_fit_p", "", FLOAT, "of the law against replicates; null without them"),
+        Column("form", "equation", TEXT),
+        Column("rank", "1: lowest BIC", INT),
+        Column("rival", "true where it is not distinguishable from the best law with these data", BOOL),
+        Column("criterion", "BIC minus that of the best law"),
+        Column("scatter_rel", "relative scatter between specimens about the law"),
+        Column("lack_of_fit_p", "of the law against replicates; null without them"),
         Column(
             "heldout_series",
-            "",
-            FLOAT,
             "RMS error on held-out series (50 of them, if there are more), in the quantity's unit",
         ),
-        Column("heldout_last_day", "", FLOAT, "RMS error on the held-out last days of these series"),
-        Column("parameter", "", TEXT, "parameter; null for separate laws"),
-        Column("value", "", FLOAT, "estimate"),
-        Column("lo95", "", FLOAT, "lower end of the 95 % interval"),
-        Column("hi95", "", FLOAT, "upper end of the 95 % interval"),
-        Column("unit", "", TEXT, "unit of value, lo95 and hi95"),
-        Column("identified", "", BOOL, "false where these data do not determine it"),
+        Column("heldout_last_day", "RMS error on the held-out last days of these series"),
+        Column("parameter", "parameter; null for separate laws", TEXT),
+        *_ESTIMATE,
+        Column("identified", "false where these data do not determine it", BOOL),
     ),
 )
 PROPERTY_VALUES = Schema(
@@ -407,12 +379,12 @@ PROPERTY_VALUES = Schema(
         CONDITION,
         SERIES,
         RUBBER,
-        Column("aging_days", "d", FLOAT, "aging time"),
-        Column("quantity", "", TEXT, "property: the column's name"),
-        Column("value", "", FLOAT, "value of one specimen"),
-        Column("unit", "", TEXT, "unit of value"),
-        Column("batch", "", TEXT, "batch of the specimen; null if none is named"),
-        Column("line", "", INT, "line in the table of values"),
+        Column("aging_days", "aging time"),
+        Column("quantity", "property: the column's name", TEXT),
+        Column("value", "value of one specimen"),
+        Column("unit", "unit of value", TEXT),
+        Column("batch", "batch of the specimen; null if none is named", TEXT),
+        Column("line", "line in the table of values", INT),
     ),
     open_=True,
 )
@@ -420,24 +392,15 @@ MASTER_CURVE = Schema(
     "master_curve",
     (
         RUBBER,
-        Column("quantity", "", TEXT, "mu_s, mu_c, F_s or F_c"),
-        Column("kind", "", TEXT, "value | law"),
-        Column(
-            "scaled_days", "d", FLOAT, "aging time, by the rate where temperature and compression change that"
-        ),
-        Column(
-            "value",
-            "",
-            FLOAT,
-            "value of a condition, brought to the reference where that changes the loss; or law",
-        ),
-        Column("lo95", "", FLOAT, "lower end of the law's 95 % band"),
-        Column("hi95", "", FLOAT, "upper end of the law's 95 % band"),
-        Column("temperature_C", "°C", FLOAT, "aging temperature; null for unaged rubber and for the law"),
-        Column(
-            "compression_ratio_pct", "%", FLOAT, "height while aging; null for unaged rubber and for the law"
-        ),
-        Column("aging_days", "d", FLOAT, "aging time; null for the law"),
+        Column("quantity", "mu_s, mu_c, F_s or F_c", TEXT),
+        Column("kind", "value | law", TEXT),
+        Column("scaled_days", "aging time, by the rate where temperature and compression change that"),
+        Column("value", "value of a condition, brought to the reference where that changes the loss; or law"),
+        Column("lo95", "lower end of the law's 95 % band"),
+        Column("hi95", "upper end of the law's 95 % band"),
+        Column("temperature_C", "aging temperature; null for unaged rubber and for the law"),
+        Column("compression_ratio_pct", "height while aging; null for unaged rubber and for the law"),
+        Column("aging_days", "aging time; null for the law"),
     ),
 )
 DYNAMIC_CURVES = Schema(
@@ -446,62 +409,30 @@ DYNAMIC_CURVES = Schema(
         CONDITION,
         SPEED_SET,
         DIRECTION,
-        Column("distance_mm", "mm", FLOAT, "distance slid since the platform began to move"),
-        Column("force_N", "N", FLOAT, "mean force of the starts, in the direction of motion"),
-        Column("force_se_N", "N", FLOAT, "standard error of that mean, from the starts; null for one start"),
-        Column("n", "", INT, "starts averaged"),
-        Column(
-            "model_N",
-            "N",
-            FLOAT,
-            "mean of the fitted dynamic model over the same samples; null without a fit",
-        ),
+        Column("distance_mm", "distance slid since the platform began to move"),
+        Column("force_N", "mean force of the starts, in the direction of motion"),
+        Column("force_se_N", "standard error of that mean, from the starts; null for one start"),
+        Column("n", "starts averaged", INT),
+        Column("model_N", "mean of the fitted dynamic model over the same samples; null without a fit"),
     ),
 )
 AGING_CURVES = Schema(
     "aging_curves",
     (
         SERIES,
-        Column("quantity", "", TEXT, "mu_s or mu_c"),
-        Column("aging_days", "d", FLOAT, "aging time"),
-        Column("value", "", FLOAT, "the law's value"),
-        Column("lo95", "", FLOAT, "lower end of its 95 % interval"),
-        Column("hi95", "", FLOAT, "upper end of its 95 % interval"),
+        Column("quantity", "mu_s or mu_c", TEXT),
+        Column("aging_days", "aging time"),
+        Column("value", "the law's value"),
+        Column("lo95", "lower end of its 95 % interval"),
+        Column("hi95", "upper end of its 95 % interval"),
     ),
 )
 
+_INGESTED = (INPUTS, RUNS, QUALITY, TRACES, TRACES_MEAN, STEADY, BINS)
 _FITTED = (STEADY_FIT, AGING_FIT, AGING_CURVES, AGING_LAWS, MASTER_CURVE, DYNAMIC_FIT, DYNAMIC_CURVES)
 _BESIDE = (STEADY_COVARIANCE, STEADY_SHIFT, AGING_COVARIANCE)  # of the parameters of a fit
+_LOOP = (EFFECTS, RESIDUALS_BEFORE, RESIDUALS_AFTER, LEVELS, CHANNELS, SHAPES, CURVES)
 AFTER = (STEADY_AFTER, *(replace(fitted, name=f"{fitted.name}_after") for fitted in _FITTED))
-BESIDE_AFTER = tuple(replace(beside, name=f"{beside.name}_after") for beside in _BESIDE)
-
-SCHEMAS = {
-    schema.name: schema
-    for schema in (
-        INPUTS,
-        RUNS,
-        QUALITY,
-        TRACES,
-        TRACES_MEAN,
-        STEADY,
-        BINS,
-        STEADY_FIT,
-        AGING_FIT,
-        EFFECTS,
-        RESIDUALS_BEFORE,
-        RESIDUALS_AFTER,
-        LEVELS,
-        CHANNELS,
-        SHAPES,
-        CURVES,
-        AGING_CURVES,
-        AGING_LAWS,
-        PROPERTY_VALUES,
-        MASTER_CURVE,
-        DYNAMIC_FIT,
-        DYNAMIC_CURVES,
-        *_BESIDE,
-        *AFTER,
-        *BESIDE_AFTER,
-    )
-}
+_BESIDE_AFTER = tuple(replace(beside, name=f"{beside.name}_after") for beside in _BESIDE)
+_ALL = (*_INGESTED, *_FITTED, PROPERTY_VALUES, *_BESIDE, *_LOOP, *AFTER, *_BESIDE_AFTER)
+SCHEMAS = {schema.name: schema for schema in _ALL}

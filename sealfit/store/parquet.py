@@ -49,7 +49,7 @@ def to_arrow(frame: pd.DataFrame | Columns, schema: Schema, units: Units) -> pa.
         )
 
     arrays, fields = [], []
-    for column in (*schema.columns, *(Column(name, "", None, CHANNEL) for name in others)):
+    for column in (*schema.columns, *(Column(name, CHANNEL, None) for name in others)):
         array = _array(frame[column.name], column, schema.name)
         arrays.append(array)
         fields.append(_field(column, array.type, units))
@@ -73,7 +73,7 @@ def with_columns(table: pa.Table, columns: Mapping[str, str], units: Units) -> p
         at = table.schema.get_field_index(name)
         if at < 0:
             arrays.append(pa.nulls(table.num_rows, wanted))
-            fields.append(_field(Column(name, "", None, CHANNEL), wanted, units))
+            fields.append(_field(Column(name, CHANNEL, None), wanted, units))
             continue
         values = table.column(at)
         if wanted == TEXT and pa.types.is_dictionary(values.type):
