@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,7 +64,7 @@ def init(folder: Path, output: Path, *, force: bool = False) -> dict:
         "folder": str(folder),
         "files": made.files,
         "motion": made.motion,
-        "guesses": [guess.as_dict() for guess in made.guesses],
+        "guesses": [asdict(guess) for guess in made.guesses],
         "doubts": [doubt.as_dict() for doubt in made.doubts],
         "next": made.next_command(output),
     }

@@ -53,6 +53,10 @@ class Column:
         """How a config names it: by name, or by position where the name is missing or stands twice."""
         return self.label if self.by_name else self.position
 
+    def in_unit_of(self, role: str) -> bool:
+        """Whether its unit is one of that role."""
+        return self.unit is not None and self.unit.dimension in DIMENSION[role]
+
     def may_be(self, role: str) -> bool:
         """Whether its unit and its name leave it free to be that."""
         if self.unit is not None and self.unit.dimension not in ("none", "share", *DIMENSION[role]):
@@ -74,6 +78,7 @@ class Roles:
     both_ways: bool = False
     signs_differ: bool = False
     signed_files: int = 0
+    strength: float = 0.0  # how well the force follows, of the best file that moves both ways
 
 
 def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
@@ -122,9 +127,7 @@ def find_roles(columns: Sequence[Column]) -> Roles:
     time = _best(columns, "time", _as_time)
     counters = [c for c in columns if c.role != "displacement" and all(map(motion.is_counter, c.values))]
     rest = [column for column in columns if column is not time and column not in counters]
-    speed_named = [
-        c for c in rest if c.role == "speed" or (c.unit and c.unit.dimension in DIMENSION["speed"])
-    ]
+    speed_named = [c for c in rest if c.role == "speed" or c.in_unit_of("speed")]
     speed = speed_named[0] if speed_named else None
     rest = [column for column in rest if column not in speed_named]
     displacement = _best(rest, "displacement", _as_displacement)
@@ -146,7 +149,7 @@ def _best(columns: Sequence[Column], role: str, behaves) -> Column | None:
             continue
         behaviour = behaves(column)
         named = column.sure if column.role == role else 0
-        unit = 2.0 if column.unit is not None and column.unit.dimension in DIMENSION[role] else 0.0
+        unit = 2.0 if column.in_unit_of(role) else 0.0
         if behaviour <= 0 or (not named and not unit and behaviour < BY_BEHAVIOUR):
             continue
         points[column.position] = named + unit + 3.0 * behaviour - (0.5 if column.copy_of else 0.0)
@@ -185,9 +188,7 @@ def _load(rest: Sequence[Column]) -> Column | None:
     named = [c for c in rest if c.role == "load" and c.may_be("load")]
     if named:
         return named[0]
-    forces = [
-        c for c in rest if c.unit is not None and c.unit.dimension == "force" and c.role in ("force", "")
-    ]
+    forces = [c for c in rest if c.in_unit_of("load") and c.role in ("force", "")]
     steady = [c for c in forces if all(abs(np.mean(v)) > 5.0 * np.std(v) > 0.0 for v in c.values)]
     return steady[0] if len(steady) == 1 else None
 
@@ -204,4 +205,5 @@ def _with_sign(roles: Roles, velocities: Sequence[np.ndarray]) -> Roles:
         both_ways=sum(one.both_ways for one in found) > 0.5 * len(found),
         signs_differ=agree < len(signs),
         signed_files=agree,
+        strength=max((one.strength for one in found if one.both_ways), default=0.0),
     )

@@ -15,21 +15,9 @@ from sealfit.units import Units
 WIDTH = 110  # characters of a comment's line
 
 SECTIONS = (
-    "",
-    "files",
-    "files.columns",
-    "files.values",
-    "files.compute",
-    "files.units",
-    "files.runs_columns",
-    "trace",
-    "trace.columns",
-    "trace.header_fields",
-    "trace.compute",
-    "quantities",
-    "column_units",
-    "strokes",
-)
+    "", "files", "files.columns", "files.values", "files.compute", "files.units", "files.runs_columns",
+    "trace", "trace.columns", "trace.header_fields", "trace.compute", "quantities", "strokes",
+)  # fmt: skip
 
 Value = str | int | float | bool | list | dict
 
@@ -41,10 +29,6 @@ class Guess:
     key: str  # with its table: trace.columns.time_s
     value: Value
     evidence: str
-
-    def as_dict(self) -> dict:
-        """Return the guess as plain values."""
-        return {"key": self.key, "value": self.value, "evidence": self.evidence}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +43,6 @@ class Doubt:
     def as_dict(self) -> dict:
         """Return the doubt as plain values."""
         return {"key": self.key, "reason": self.reason, "fix": self.fix}
-
-    def __str__(self) -> str:
-        return f"{self.reason} {self.fix}"
 
 
 @dataclass
@@ -197,7 +178,7 @@ def _count(doubts: int) -> str:
 
 
 def _doubt_lines(doubt: Doubt) -> list[str]:
-    return [*_comment(f"DOUBT: {doubt}"), *(f"#     {line}" for line in doubt.lines)]
+    return [*_comment(f"DOUBT: {doubt.reason} {doubt.fix}"), *(f"#     {line}" for line in doubt.lines)]
 
 
 def _comment(text: str) -> list[str]:

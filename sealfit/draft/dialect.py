@@ -11,8 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 
 from sealfit.draft.vocabulary import column_role, unit_of
 from sealfit.ingest.files import as_number, split_line
@@ -47,7 +46,7 @@ class Dialect:
     `names_back` and `units_back` count their lines back from the header's end, 1 the last; `names_are_cells`
     is False where the reader cuts the line of names in another way, as names hold the separator. `numbers`
     are the positions (from 0) that hold numbers, `first` is the first line of data, `odd_lines` counts lines
-    between the data that are none, `footer` are the lines below.
+    between the data that are none, `footer` are the lines below. `decimal` is "" where no number has one.
     """
 
     delimiter: str
@@ -64,12 +63,7 @@ class Dialect:
     first: str
     names_are_cells: bool = True
     odd_lines: int = 0
-    footer: tuple[str, ...] = field(default=())
-
-    @property
-    def has_fractions(self) -> bool:
-        """Whether the decimal sign was seen; whole numbers do not show it."""
-        return bool(self.decimal)
+    footer: tuple[str, ...] = ()
 
 
 def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialect | None:
@@ -271,8 +265,3 @@ def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, 
         if words > most:
             best, most = i, words
     return best
-
-
-def is_unchanged(dialects: Sequence[Dialect]) -> bool:
-    """Return whether the header is as long in all files."""
-    return all(len(a.header) == len(b.header) for a, b in pairwise(dialects))

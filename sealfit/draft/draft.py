@@ -6,10 +6,8 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from sealfit.config import parse_config
-from sealfit.draft import motion, run_keys, trace_keys
+from sealfit.draft import run_keys, trace_keys
 from sealfit.draft.columns import columns_of, find_roles
 from sealfit.draft.config_text import Doubt, Guess, Notes, config_text
 from sealfit.draft.file_names import read_names
@@ -67,12 +65,10 @@ def draft(folder: Path) -> Draft:
     trace_keys.dialect_keys(found, notes)
     trace_keys.column_keys(found, roles, units, len(tables), notes)
     run_keys.condition_keys(source, header, notes)
-    text = config_text(_name(folder), shlex.quote(str(folder)), notes)
+    text = config_text(folder.resolve().name or "rig", shlex.quote(str(folder)), notes)
     # A draft that is no config is a fault of this module, and raises here.
     parse_config(text, "the drafted config")
-    column = roles.displacement
-    strokes = int(np.median([motion.stroke_count(v) for v in column.values])) if column is not None else 1
-    words = trace_keys.motion_words(roles, strokes)
+    words = trace_keys.motion_words(roles)
     return Draft(folder, text, len(found.traces), words, tuple(notes.guesses), tuple(notes.doubts))
 
 
@@ -89,7 +85,3 @@ def summary_lines(made: dict) -> list[str]:
         lines.append("could not be told:")
         lines += [f"  - {doubt['reason']} {doubt['fix']}" for doubt in made["doubts"]]
     return [*lines, f"draft: {made['config']}", f"next: {made['next']}"]
-
-
-def _name(folder: Path) -> str:
-    return folder.resolve().name or "rig"

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from sealfit.draft.dialect import MIN_ROWS, STRAYS, Dialect, sniff
-from sealfit.draft.name_parts import tokens
+from sealfit.draft.name_parts import shape_of, tokens
 from sealfit.errors import BadFile, RequestError
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
 from sealfit.ingest.listing import RUNS_CSV, natural
@@ -69,7 +69,7 @@ class Found:
     def dialect(self) -> Dialect:
         """How most of the traces are written; the first with fractions, which show the decimal sign."""
         usual = list(self.dialects.values())
-        return next((one for one in usual if one.has_fractions), usual[0])
+        return next((one for one in usual if one.decimal), usual[0])
 
 
 def look(folder: Path) -> Found:
@@ -87,8 +87,6 @@ def look(folder: Path) -> Found:
     formats = Counter(suffix for file in files if (suffix := PurePosixPath(file).suffix.lower()) in FORMATS)
     texts = [file for file in files if _may_be_text(file)]
     dialects, unreadable = _sniffed(folder, texts)
-    if not any(dialects.values()):
-        raise _no_traces(folder, files, formats, unreadable)
     tables = {file: dialect for file, dialect in dialects.items() if dialect is not None and file != RUNS_CSV}
     if not tables:
         raise _no_traces(folder, files, formats, unreadable)
@@ -128,8 +126,7 @@ def _may_be_text(file: str) -> bool:
 def _kind(file: str) -> tuple:
     """Return what files named alike have in common."""
     path = PurePosixPath(file)
-    pieces = tokens(str(path.with_suffix("")))
-    return path.suffix.lower(), tuple((p.kind, p.text if p.kind == "sep" else "") for p in pieces)
+    return path.suffix.lower(), shape_of(tokens(str(path.with_suffix(""))))
 
 
 def _sniffed(folder: Path, texts: Sequence[str]) -> tuple[dict[str, Dialect | None], dict[str, str]]:
@@ -168,12 +165,10 @@ def _text(folder: Path, file: str) -> tuple[str, bool]:
 
 def _by_form(tables: dict[str, Dialect]) -> tuple[dict[str, Dialect], dict[str, Dialect], dict[str, Dialect]]:
     """Return the files written as most are, those with further columns beside the same, and the others."""
-    forms = Counter((one.delimiter, one.names or one.width) for one in tables.values())
-    delimiter, named = forms.most_common(1)[0][0]
-    alike = {
-        f: one for f, one in tables.items() if (one.delimiter, one.names or one.width) == (delimiter, named)
-    }
-    decimals = Counter(one.decimal for one in alike.values() if one.has_fractions)
+    forms = {file: (one.delimiter, one.names or one.width) for file, one in tables.items()}
+    usual_form = Counter(forms.values()).most_common(1)[0][0]
+    alike = {file: one for file, one in tables.items() if forms[file] == usual_form}
+    decimals = Counter(one.decimal for one in alike.values() if one.decimal)
     decimal = decimals.most_common(1)[0][0] if decimals else ""
     same = {file: one for file, one in alike.items() if one.decimal in (decimal, "")}
     rest = {file: one for file, one in tables.items() if file not in same}

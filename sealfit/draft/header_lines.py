@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from sealfit.draft.vocabulary import Unit, name_and_unit, setting, unit_of
 from sealfit.ingest.files import as_number
 
-SETTINGS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
-UNIT_OF = {
+SETTINGS = {
     "temperature_C": "temperature",
     "compression_ratio_pct": "share",
     "aging_days": "time",
     "load_N": "force",
+    "speed_mm_s": "speed",
 }
-UNIT_OF |= {"speed_mm_s": "speed"}
+"""What header lines may set, and what its unit measures."""
 
 _LINE = re.compile(r'^"?(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
 _NUMBER = re.compile(r"^[-+]?\d+(?:[.,]\d+)?(?=$|[\s;,\t\"°%A-Za-zµ])")
@@ -69,7 +69,7 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
         rest = match["value"].strip()[number_found.end() :].strip(' ;,\t"')
         unit = unit or unit_of(rest)
         ours = setting(name)
-        if ours not in SETTINGS or ours in found or (unit is not None and unit.dimension != UNIT_OF[ours]):
+        if ours not in SETTINGS or ours in found or (unit is not None and unit.dimension != SETTINGS[ours]):
             continue
         pattern = rf'^"?{re.escape(match["key"])}"?[\s:=;,"]*([-+]?[\d.,]*\d)'.replace(r"\ ", " ")
         if all(any(re.search(pattern, other) for other in header) for header in headers):

@@ -134,17 +134,6 @@ def plateau_speeds(time: np.ndarray, displacement: np.ndarray) -> list[list[floa
     return strokes
 
 
-def different_speeds(speeds: list[float]) -> list[float]:
-    """Return the speeds that differ by a quarter or more, the slowest first.
-
-    Examples
-    --------
-    >>> different_speeds([5.0, 1.02, 1.0, 5.1, 4.9])
-    [1.0, 4.9]
-    """
-    return [group[0] for group in _groups(speeds)]
-
-
 def several_speeds(speeds: list[float]) -> list[float]:
     """Return the speeds of one direction in a file that holds several, none otherwise.
 
@@ -172,6 +161,7 @@ def _several(speeds: list[float]) -> list[float]:
 
 
 def _groups(speeds: list[float]) -> list[list[float]]:
+    """Return the speeds in groups that differ by a quarter or more, the slowest first."""
     found: list[list[float]] = []
     for speed in sorted(speeds):
         if not found or speed > SPEEDS_APART * found[-1][0]:

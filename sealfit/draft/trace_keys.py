@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sealfit.draft import motion
-from sealfit.draft.columns import BY_BEHAVIOUR, DIMENSION, Column, Roles
+from sealfit.draft.columns import BY_BEHAVIOUR, Column, Roles
 from sealfit.draft.config_text import Notes, column_guesses, date_lines, file_column
-from sealfit.draft.dialect import STRAYS, is_unchanged
+from sealfit.draft.dialect import STRAYS
 from sealfit.draft.files_found import Found
 from sealfit.draft.header_lines import Setting, settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
@@ -33,11 +33,15 @@ CHANNELS = ("temperature", "humidity", "pressure")
 def dialect_keys(found: Found, notes: Notes) -> None:
     """Add the keys of how the files are written."""
     one, sniffed = found.dialect, found.sniffed
-    of = _of(len(sniffed), len(found.traces))
+    of = f"{len(sniffed)} of {len(sniffed)} files"
+    if len(found.traces) > len(sniffed):
+        of += f" looked at, of {len(found.traces)}"
     if one.delimiter != ",":
         notes.guess("trace.delimiter", one.delimiter, f"the separator in {of}")
     if one.decimal == ",":
-        notes.guess("trace.decimal", ",", f"numbers such as {_a_number(one.first)} in {of}")
+        number = re.search(r"[-+]?[0-9]+,[0-9]+", one.first)
+        example = f"such as '{number.group()}'" if number else "such as with a comma"
+        notes.guess("trace.decimal", ",", f"numbers {example} in {of}")
     _header_keys(found, of, notes)
     if found.wider:
         further = sorted({name for other in found.wider.values() for name in other.names} - set(one.names))
@@ -66,18 +70,6 @@ def dialect_keys(found: Found, notes: Notes) -> None:
         )
 
 
-def _of(looked_at: int, all_files: int) -> str:
-    return f"{looked_at} of {looked_at} files" + (
-        f" looked at, of {all_files}" if all_files > looked_at else ""
-    )
-
-
-def _a_number(line: str) -> str:
-    return (
-        f"'{re.search(r'[-+]?[0-9]+,[0-9]+', line).group()}'" if re.search(r"\d,\d", line) else "with a comma"
-    )
-
-
 def _header_keys(found: Found, of: str, notes: Notes) -> None:
     """Add where the header ends and which of its lines holds the names."""
     one, count = found.dialect, len(found.dialect.header)
@@ -95,7 +87,7 @@ def _header_keys(found: Found, of: str, notes: Notes) -> None:
             f"the names are in the header's line {count - back + 1} of {count}: {_shown(one.header[-back])}"
         )
         notes.guess("trace.names_line", back, evidence)
-    if not is_unchanged(found.sniffed):
+    if len({len(other.header) for other in found.sniffed}) > 1:
         _varying_header(found, notes)
     elif count != (1 + units_row if back is not None else 0):
         notes.guess("trace.header_lines", count, f"lines above the first row of numbers in {of}")
@@ -154,7 +146,9 @@ def column_keys(
         column = getattr(roles, role)
         if column is None:
             continue
-        sign = roles.sign if role == "force" else _load_sign(column) if role == "load" else 1
+        sign = roles.sign if role == "force" else 1
+        if role == "load" and np.mean([np.mean(values) for values in column.values]) < 0:
+            sign = -1
         evidence = _evidence(column, role, roles, read)
         guesses, helper = column_guesses(slot, column, units.get(role), sign, evidence)
         notes.guesses += guesses
@@ -163,12 +157,11 @@ def column_keys(
     if roles.displacement is None and roles.speed is not None:
         helpers += _integrated(roles.speed, notes)
     _missing_slots(roles, notes)
-    if roles.force is not None and roles.force.unit is not None and _is_torque(roles.force):
-        notes.guess(
-            "quantities.force",
-            {"quantity": "torque", "unit": roles.force.unit.name},
-            f"{roles.force.place} is a torque",
-        )
+    if roles.force is not None and roles.force.unit is not None:
+        unit, words = roles.force.unit, plain(roles.force.label)
+        if unit.dimension == "torque" or "torque" in words or "moment" in words:
+            torque = {"quantity": "torque", "unit": unit.name}
+            notes.guess("quantities.force", torque, f"{roles.force.place} is a torque")
     if helpers:
         notes.guess(
             "trace.drop_columns", helpers, "read for the columns computed below, no channels of their own"
@@ -176,23 +169,11 @@ def column_keys(
     _other_columns(found, roles, notes)
 
 
-def _is_torque(column: Column) -> bool:
-    return (
-        column.unit.dimension == "torque"
-        or "torque" in plain(column.label)
-        or "moment" in plain(column.label)
-    )
-
-
-def _load_sign(column: Column) -> int:
-    return -1 if np.mean([np.mean(values) for values in column.values]) < 0 else 1
-
-
 def _evidence(column: Column, role: str, roles: Roles, read: int) -> str:
     by = []
-    if column.role == role and column.sure:
+    if column.role == role:
         by.append("its name")
-    if column.unit is not None and column.unit.dimension in DIMENSION[role]:
+    if column.in_unit_of(role):
         by.append("its unit")
     behaves = {
         "time": "it rises evenly",
@@ -200,38 +181,32 @@ def _evidence(column: Column, role: str, roles: Roles, read: int) -> str:
         "force": f"it follows the direction of motion in {roles.signed_files} of {read} files"
         + (", with the other sign" if roles.sign < 0 else ""),
     }
-    text = f"{column.place}: by {' and '.join(by)}" if by else f"{column.place}: by behaviour"
+    text = f"{column.place}: by {' and '.join(by) or 'behaviour'}"
     return f"{text}; {behaves[role]}" if role in behaves else text
 
 
 def _column_doubts(column: Column, role: str, key: str, roles: Roles, notes: Notes) -> None:
-    named = column.role == role and column.sure
-    unit_fits = column.unit is not None and column.unit.dimension in DIMENSION[role]
+    named, unit_fits = column.role == role, column.in_unit_of(role)
     if not named and not unit_fits:
         in_unit = f", and {SLOTS[role].rpartition('_')[2]} is assumed" if key.endswith(SLOTS[role]) else ""
         reason = f"neither name nor unit says that {column.place} is the {role}; its behaviour does{in_unit}."
         notes.doubt(key, reason, f"Name the right column of {role} here if it is another.")
-    if role == "force" and roles.signs_differ:
+    if role != "force":
+        return
+    if roles.signs_differ:
         reason = f"the sign of {column.place} against the motion is not the same in all files."
         notes.doubt(
             key, reason, "Check whether the sensor was turned, or the force was exported as a magnitude."
         )
-    if role == "force" and not unit_fits and column.unit is not None:
+    if not unit_fits and column.unit is not None:
         reason = f"{column.place} is not in a unit of force."
         notes.doubt(
             key, reason, "Give the factor to N under [trace.compute], or declare it under [quantities]."
         )
-    if role == "force" and roles.both_ways and named and _follows_badly(column, roles):
+    moves = roles.time is not None and roles.displacement is not None
+    if named and moves and roles.both_ways and roles.strength < BY_BEHAVIOUR / 2:
         reason = f"{column.place} has the same sign in both directions."
         notes.doubt(key, reason, "It looks like a magnitude: export the force with its sign.")
-
-
-def _follows_badly(column: Column, roles: Roles) -> bool:
-    velocities = [
-        motion.velocity(t, x) for t, x in zip(roles.time.values, roles.displacement.values, strict=True)
-    ] if roles.time is not None and roles.displacement is not None else []  # fmt: skip
-    found = [motion.follows(v, speed) for v, speed in zip(column.values, velocities, strict=False)]
-    return bool(found) and max(one.strength for one in found if one.both_ways) < BY_BEHAVIOUR / 2
 
 
 def _integrated(speed: Column, notes: Notes) -> list[str]:
@@ -290,14 +265,11 @@ def _other_columns(found: Found, roles: Roles, notes: Notes) -> None:
     if roles.speed is not None and roles.displacement is not None:
         ignored.append(roles.speed)
     if ignored or texts or found.dialect.width > len(found.dialect.numbers):
-        shown = [_ignored(column) for column in ignored]
+        same = {c.position: f", the same signal as column {c.copy_of}" for c in ignored if c.copy_of}
+        shown = [c.place + same.get(c.position, "") for c in ignored]
         shown += [f"'{name}' (text)" for name in texts]
         evidence = f"not used: {'; '.join(shown)}" if shown else "there are empty columns"
         notes.guess("trace.other_columns", "ignore", evidence)
-
-
-def _ignored(column: Column) -> str:
-    return column.place + (f", the same signal as column {column.copy_of}" if column.copy_of else "")
 
 
 def _channel(column: Column, taken: set[str]) -> str:
@@ -323,23 +295,20 @@ def settled_units(roles: Roles, notes: Notes) -> dict[str, Unit | None]:
         column = getattr(roles, role)
         if column is None:
             continue
-        unit = column.unit if column.unit is not None and column.unit.dimension in DIMENSION[role] else None
-        units[role] = None if unit is not None and unit.dimension == "torque" else unit
         if column.unit is None:
             units[role] = _assumed(column, role, slot, notes)
+        elif column.in_unit_of(role) and column.unit.dimension != "torque":
+            units[role] = column.unit
     return units
 
 
 def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
     default = slot.rpartition("_")[2]
     if role == "time":
-        step = float(np.median(np.diff(column.values[0])))
-        long = float(np.ptp(column.values[0]))
+        step, long = np.median(np.diff(column.values[0])), np.ptp(column.values[0])
         if step >= 1.0 and long > LONG_S:
-            hours = f"{long / 3600:.1f} h"
-            reason = (
-                f"{column.place} has no unit; in seconds a file would last {hours}, so it is taken as ms."
-            )
+            lasts = f"in seconds a file would last {long / 3600:.1f} h"
+            reason = f"{column.place} has no unit; {lasts}, so it is taken as ms."
             notes.doubt("trace.columns.time_s", reason, "Change the unit if it is another.")
             return UNITS["ms"]
     if column.role != role:
@@ -422,7 +391,10 @@ def _shown_speeds(several: Mapping[str, Sequence[float]], files: Sequence[str]) 
     return f"in {len(several)} of {len(files)} files read: {shown} mm/s in {file}"
 
 
-def motion_words(roles: Roles, strokes: int) -> str:
+def motion_words(roles: Roles) -> str:
     """Return what the motion is like, for the summary."""
+    strokes = 1
+    if roles.displacement is not None:
+        strokes = int(np.median([motion.stroke_count(values) for values in roles.displacement.values]))
     many = "one stroke" if strokes == 1 else f"about {strokes} strokes"
     return f"{many} in a file, {'both ways' if roles.both_ways else 'one way'}"

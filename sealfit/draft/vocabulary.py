@@ -127,14 +127,7 @@ _COLUMN_WORDS = (
     ("displacement", r"displace|position|extension|crosshead|weg|verschieb|travel|traverse|\bhub\b|stroke"
                      r"|lvdt|verfahr|\bpos\b|path|distance|auslenk|slide|schlitten"),
 )  # fmt: skip
-_LETTERS = {
-    "t": "time",
-    "x": "displacement",
-    "y": "displacement",
-    "s": "displacement",
-    "f": "force",
-    "v": "speed",
-}
+_LETTERS = {"t": "time", "f": "force", "v": "speed", **dict.fromkeys("xys", "displacement")}
 
 
 def plain(text: str) -> str:
@@ -228,36 +221,12 @@ AFTER = {
     **dict.fromkeys(("Hz",), ("frequency_Hz", "")),
 }
 UNAGED = {
-    "unaged",
-    "fresh",
-    "new",
-    "virgin",
-    "neu",
-    "ungealtert",
-    "frisch",
-    "ref",
-    "reference",
-    "rt",
-    "initial",
-}
+    "unaged", "fresh", "new", "virgin", "neu", "ungealtert", "frisch", "ref", "reference", "rt", "initial",
+}  # fmt: skip
 RUBBERS = {
-    "nbr",
-    "hnbr",
-    "xnbr",
-    "fkm",
-    "ffkm",
-    "epdm",
-    "vmq",
-    "fvmq",
-    "acm",
-    "aem",
-    "nr",
-    "sbr",
-    "cr",
-    "pu",
-    "tpu",
+    "nbr", "hnbr", "xnbr", "fkm", "ffkm", "epdm", "vmq", "fvmq", "acm", "aem", "nr", "sbr", "cr", "pu", "tpu",
     "ptfe",
-}
+}  # fmt: skip
 DIRECTIONS = {
     **dict.fromkeys(("fwd", "forward", "vor", "hin", "pos", "up", "push", "cw"), 1),
     **dict.fromkeys(("bwd", "rev", "back", "backward", "rueck", "her", "neg", "down", "pull", "ccw"), -1),

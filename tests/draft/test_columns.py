@@ -310,7 +310,7 @@ def test_separator_and_decimal_sign(delimiter, comma, found, decimal):
 
 def test_whole_numbers_do_not_show_the_decimal_sign():
     dialect = sniff("a;b\n" + "\n".join(f"{i};{2 * i}" for i in range(20)))
-    assert (dialect.delimiter, dialect.has_fractions) == (";", False)
+    assert (dialect.delimiter, dialect.decimal) == (";", "")
 
 
 def test_a_table_of_results_above_the_data_is_header():
