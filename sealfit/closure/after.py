@@ -170,12 +170,13 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
     Effects that are part of the condition (such as days) multiply or change the law; the curves include them.
     """
     rows, curves = [], []
-    open_columns = [name for name in config.series_columns if name in steady_fit.columns]
+    known = AGING_FIT.names()
+    open_columns = [name for name in config.series_columns if name in steady_fit and name not in known]
     for law in _laws(after, config) if config.aging else ():
         rows += [{"rubber": law.rubber, **row} for row in law.rows(steady_fit)]
         if law.place is not None:
             curves.append(law.curve())
-    columns = [*AGING_FIT.names(), *open_columns]
+    columns = [*known, *open_columns]
     drawn = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=AGING_CURVES.names())
     if not rows:
         return pd.DataFrame(columns=columns), drawn

@@ -392,16 +392,23 @@ def undetectable_variables(
 
     An effect is not detectable if it cannot reach the required p-value, and the variable varies along
     strokes, is the direction, or varies between fewer than five specimens; or if the units between which it
-    varies scatter strongly, and an effect that explains all of that scatter would not have been found.
+    varies scatter strongly, and an effect that explains all of that scatter would not have been found. A
+    variable of an effect that was added is not among them.
     """
     starts = selection.after.rows.groups.starts
+    found = {name for added in selection.added for name in added.proposal.term.channels}
     undetectable = []
     for entry in entries:
         if entry["variable"] == SPECIMEN:
             undetectable.append(SPECIMEN)
             continue
         channel: Channel = selection.channels[entry["variable"]]
-        if channel.grouping or channel.name in ASIDE or entry["level"] != LEVEL_NAMES[channel.unit]:
+        if (
+            channel.grouping
+            or channel.name in found
+            or channel.name in ASIDE
+            or entry["level"] != LEVEL_NAMES[channel.unit]
+        ):
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
         own = [

@@ -45,6 +45,8 @@ _SPELLINGS = {
     ("torque", "N cm"): ("Ncm", "N cm"),
     ("angle", "deg"): ("deg", "°", "rad", "turn"),
     ("temperature", "degC"): ("°C", "C", "degC", "deg C", "Grad C", "ºC"),
+    ("temperature", "degF"): ("°F", "F", "degF", "deg F", "ºF"),
+    ("temperature", "K"): ("K", "kelvin"),
     ("share", "%"): ("%", "pct", "percent", "prozent", "Prozent"),
     ("pressure", "bar"): ("bar",),
     ("pressure", "mbar"): ("mbar",),
@@ -101,8 +103,10 @@ def name_and_unit(text: str) -> tuple[str, Unit | None]:
             unit = unit_of(match["unit"]) or unit_of(match["unit"].replace("_", "/"))
             if unit is None and match["name"].endswith("_mm") and match["unit"] in ("s", "min"):
                 unit = unit_of(f"mm/{match['unit']}")
-            if unit is not None:
-                return match["name"].strip(" _,:"), unit
+            name = match["name"].strip(" _,:")
+            bare = match["unit"] in ("F", "K") and setting(name) != "temperature_C"  # Kraft F, Karte K
+            if unit is not None and not bare:
+                return name, unit
     return text.strip(), None
 
 

@@ -27,7 +27,7 @@ from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.steady.fit import fit_conditions
 from sealfit.fit.steady.shared_curve import shared_levels
 from sealfit.fit.steady.uncertainty import shifts_of
-from sealfit.tables import AFTER, STEADY_FIT
+from sealfit.tables import AFTER, AGING_FIT, STEADY_FIT
 
 SCATTER = {"setup": 0.003, "specimen": 0.005, "bins": 10}
 WARMING = (Term(EFFECTS["warming_time"], ("time_s",), "mu", "multiply"), {"A": 0.05, "tau": 3.0})
@@ -249,3 +249,11 @@ def test_nothing_is_doubled_where_nothing_was_added():
     tables = after_fits(fitted(bins), steady_of(bins), made_traces(bins), Config())
     assert list(tables) == [schema.name for schema in AFTER]
     assert all(table.empty for table in tables.values())
+
+
+def test_a_condition_may_be_called_rubber():
+    bins = make_bins(7, days=(4.0,), **SCATTER)
+    steady = fit_conditions(steady_of(bins), Config())
+    law, _ = after_laws(fitted(bins), steady, Config(condition=["rubber", "temperature_C", "aging_days"]))
+    assert list(law.columns) == [*AGING_FIT.names(), "temperature_C"]
+    assert set(law["rubber"]) == {"rubber"}

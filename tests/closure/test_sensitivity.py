@@ -1,3 +1,6 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -89,3 +92,13 @@ def test_two_specimens_of_one_condition_that_differ_cannot_be_told():
 def test_a_campaign_of_nine_specimens_can_tell():
     selection = searched(make_bins(3, repeats=2, bins=6, run_channels=OIL))
     assert undetectable_variables(selection, sensitivity(selection, 0.005), []) == []
+
+
+def test_a_variable_of_an_effect_in_the_model_is_not_said_to_be_undecided():
+    bins = make_bins(1, temperatures=(), speeds=(1.0, 4.0, 16.0, 64.0), repeats=1, bins=6)
+    selection = searched(bins)
+    found = sensitivity(selection, 0.005)
+    effect = SimpleNamespace(proposal=SimpleNamespace(term=SimpleNamespace(channels=("displacement_mm",))))
+    with_it = undetectable_variables(replace(selection, added=(effect,)), found, [])
+    assert {*with_it, "displacement_mm"} == set(undetectable_variables(selection, found, []))
+    assert "displacement_mm" not in with_it

@@ -197,11 +197,18 @@ def test_names_of_columns_in_two_languages(name, role):
         ("Weg [mm]", "Weg", "mm"), ("Kraft (kN)", "Kraft", "kN"), ("t / ms", "t", "ms"),
         ("s in µm", "s", "um"), ("Load_lbf", "Load", "lbf"), ("Position, in", "Position", "in"),
         ("Force N", "Force", "N"), ("v_mm_min", "v", "mm/min"), ("Weg_inch", "Weg", "in"),
+        ("Temp [F]", "Temp", "degF"), ("Oven_temp_F", "Oven_temp", "degF"), ("T (°F)", "T", "degF"),
+        ("Temperature / K", "Temperature", "K"),
     ],
 )  # fmt: skip
 def test_units_in_names_of_columns(text, name, unit):
     found, known = name_and_unit(text)
     assert (found, known.name) == (name, unit)
+
+
+@pytest.mark.parametrize("text", ["Kraft F", "Kanal K"])
+def test_a_letter_that_is_no_temperature(text):
+    assert name_and_unit(text) == (text, None)
 
 
 OF_DIMENSION = {
