@@ -82,6 +82,17 @@ def test_a_factor_on_the_loss_is_told_from_one_on_the_rate():
     assert (laws[0].loss.name, laws[0].acts_on) == ("log", "loss")
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_a_law_that_passes_through_nearly_all_values_is_not_compared(seed):
+    days = np.array([0.0, 3.0, 10.0, 30.0, 60.0])
+    value = 0.88 - 0.062 * np.log1p(days / 0.8)
+    value *= 1 + 0.007 * np.random.default_rng(seed).standard_normal(days.size)
+    laws = fit_laws(Aged(days, value, None, None, None))
+    assert {law.loss.name for law in laws} == {"log", "power"}
+    life = lifetime(laws[0], Goal(0.5), None, None)
+    assert 100.0 < life.days < 1500.0  # 366 d
+
+
 def test_intervals_hold_the_truth():
     hits = []
     for seed in range(30):

@@ -27,6 +27,8 @@ ROUNDING = 1e-14
 # Largest number of series that are left out in turn for held-out errors. The root mean square of their errors
 # is then known to a tenth.
 MOST_LEFT_OUT = 50
+# Fewest degrees of freedom of a law that is compared with others.
+SPARE = 2
 
 
 def _inverse(celsius):
@@ -345,6 +347,9 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
 def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw]:
     """Return every law that the values determine, acting on rate and on loss, in order of BIC.
 
+    Laws that leave fewer than `SPARE` degrees of freedom are left out if another leaves more: with one, a law
+    often passes through all values, and its scatter, and so its BIC, is far too small.
+
     Raises
     ------
     FitError
@@ -360,7 +365,8 @@ def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw
                 first = first or error  # of the law with the fewest parameters
     if not found:
         raise first
-    return sorted(found, key=lambda law: law.bic)
+    compared = [law for law in found if aged.value.size >= len(law.names) + SPARE]
+    return sorted(compared or found, key=lambda law: law.bic)
 
 
 def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
