@@ -143,11 +143,12 @@ def references(closure: Mapping, config: Config) -> list[dict]:
     ]
 
 
-def _given(effect: Mapping, config: Config) -> str:
+def _given(effect: Mapping, config: Config) -> str | Markup:
     if effect["operation"] == "multiply":
         return "factor minus one"
-    force = effect["acts_on"] == "force"
-    return f"added {config.units.quantity('force') if force else 'to ' + symbol_html(effect['acts_on'])}"
+    if effect["acts_on"] == "force":
+        return f"added {config.units.quantity('force')}"
+    return Markup("added to {}").format(symbol_html(effect["acts_on"]))
 
 
 def _parameter(p: Mapping, effect: Mapping) -> dict:

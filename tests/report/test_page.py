@@ -160,6 +160,11 @@ def test_a_card_has_target_parameters_and_alternatives(pages):
     assert "Replicate specimens would show" in text
 
 
+def test_a_card_shows_the_symbol_of_a_parameter_that_an_effect_is_added_to(small, unsaved):
+    small.closure["effects"][0] |= {"acts_on": "v_s", "operation": "add"}
+    assert "added to v s : " in Page(build_report(*small.arguments).html).text
+
+
 def test_torque_is_never_called_force_nor_its_slot(reports, pages):
     text = pages["torque"].text + " ".join(image["alt"] for image in pages["torque"].images)
     for slot in ("force_N", "displacement_mm", "speed_mm_s", "load_N", "friction force", "mm/s"):
