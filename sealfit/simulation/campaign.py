@@ -28,13 +28,13 @@ from sealfit.simulation.motion import (
     with_presliding,
 )
 from sealfit.simulation.noise import (
-    Draws,
     displacement_noise_mm,
     draw_defects,
     draw_scatter,
     quantised,
     sample_noise_N,
     spoil,
+    stream,
 )
 from sealfit.simulation.spec import Spec, plan_files
 
@@ -169,7 +169,6 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
 
 
 # ---------------------------------------------------------------- campaign
-# Writes a simulated campaign: the folder as a rig would leave it, and the truth beside it.
 
 # Decimals of the displacement in mm: 10 nm, the resolution of a linear encoder.
 DISPLACEMENT_DECIMALS = 5
@@ -198,21 +197,17 @@ def simulate(spec: Spec, out: Path) -> None:
     _refuse_foreign(out)
     part = out.with_name(f".{out.name}.part-{os.getpid()}")
     try:
-        try:
-            (part / "new" / "traces").mkdir(parents=True)
-            document = _write(spec, part / "new")
-            text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-            (part / "truth.json").write_bytes(text.encode("utf-8"))
-            if out.exists():
-                os.replace(out, part / "old")
-            os.replace(part / "new", out)
-            os.replace(part / "truth.json", truth_path(out))
-        except OSError as error:
-            raise OutError(
-                f"cannot be written ({error.strerror}).",
-                file=out,
-                fix="Check the disk and the folder's permissions.",
-            ) from error
+        (part / "new" / "traces").mkdir(parents=True)
+        document = _write(spec, part / "new")
+        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        (part / "truth.json").write_bytes(text.encode("utf-8"))
+        if out.exists():
+            os.replace(out, part / "old")
+        os.replace(part / "new", out)
+        os.replace(part / "truth.json", truth_path(out))
+    except OSError as error:
+        fix = "Check the disk and the folder's permissions."
+        raise OutError(f"cannot be written ({error.strerror}).", file=out, fix=fix) from error
     finally:
         if (part / "old").exists() and not out.exists():
             os.replace(part / "old", out)  # restore the last campaign after any interruption
@@ -240,28 +235,27 @@ def _refuse_foreign(out: Path) -> None:
 
 
 def _write(spec: Spec, folder: Path) -> dict:
-    draws = Draws(spec.seed)
-    law = steady_law(spec)
+    law, seed = steady_law(spec), spec.seed
     spec = spec.risen()
-    files = add_channels(plan_files(spec.design, draws.stream("order")), spec.channels, draws)
-    scatter = draw_scatter(spec.noise, files, draws)
-    shifts = draws.stream("start").standard_normal(len(files))
+    files = add_channels(plan_files(spec.design, stream(seed, "order")), spec.channels, seed)
+    scatter = draw_scatter(spec.noise, files, seed)
+    shifts = stream(seed, "start").standard_normal(len(files))
     starts = spec.design.start_mm + spec.design.start_scatter_mm * shifts
-    defects = draw_defects(spec.noise, len(files), draws)
-    squares, weights, known = np.zeros(len(law.effects)), 0, []
+    defects = draw_defects(spec.noise, len(files), seed)
+    squares, known = np.zeros(len(law.effects)), []
     for number, record in enumerate(files.to_dict("records")):
         speed = record["speed_mm_s"] * scatter.speed[number]
         motion = move(spec.design, speed, record["direction"], starts[number])
         along = {
-            c.name: trace_channel(c, motion.time_s, draws.stream("channel", c.name, number))
+            c.name: trace_channel(c, motion.time_s, stream(seed, "channel", c.name, number))
             for c in spec.channels
             if isinstance(c, TraceChannel)
         }
         channels = _channels(record, motion, along)
         friction, added = _forces(spec, law, motion, channels, speed)
         clean = scatter.gain[number] * friction + added + scatter.offset_N[number]
-        force = clean + sample_noise_N(spec.noise, clean, motion.time_s, speed, number, draws)
-        noise = displacement_noise_mm(spec.noise, len(force), number, draws)
+        force = clean + sample_noise_N(spec.noise, clean, motion.time_s, speed, number, seed)
+        noise = displacement_noise_mm(spec.noise, len(force), number, seed)
         columns = {
             "time_s": motion.time_s,
             "displacement_mm": np.round(motion.displacement_mm + noise, DISPLACEMENT_DECIMALS),
@@ -269,7 +263,7 @@ def _write(spec: Spec, folder: Path) -> dict:
             **along,
         }
         if number in defects:
-            columns = spoil(columns, defects[number], draws.stream("bad_data", number))
+            columns = spoil(columns, defects[number], stream(seed, "bad_data", number))
         _write_trace(columns, folder / record["file"])
         steady = _rows(channels, motion.steady)
         true = np.broadcast_to(law.force_N(steady), steady["direction"].shape)
@@ -290,9 +284,8 @@ def _write(spec: Spec, folder: Path) -> dict:
         few = slice(None, None, max(1, len(true) // RMS_ROWS))
         sample, whole = _rows(steady, few), true[few]
         squares += [np.mean((whole - law.without(k).force_N(sample)) ** 2) for k in range(len(law.effects))]
-        weights += 1
     _write_runs(files, folder / "runs.csv")
-    return truth_document(spec, pd.DataFrame(known), np.sqrt(squares / weights))
+    return truth_document(spec, pd.DataFrame(known), np.sqrt(squares / len(files)))
 
 
 def _channels(record: dict, motion: Motion, along: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from sealfit.config import Strict
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import evaluate, parse
-from sealfit.simulation.noise import Draws, remembering
+from sealfit.simulation.noise import remembering, stream
 
 Level = Literal["file", "run", "specimen", "condition"]
 GROUPS = {"file": "file", "run": "run_id", "specimen": "specimen_id", "condition": "condition"}
@@ -102,7 +102,7 @@ Channel = Annotated[
 ]
 
 
-def add_channels(files: pd.DataFrame, channels: tuple[Channel, ...], draws: Draws) -> pd.DataFrame:
+def add_channels(files: pd.DataFrame, channels: tuple[Channel, ...], seed: int) -> pd.DataFrame:
     """Return `files` with every channel that is logged once per file.
 
     Channels within the trace come from `trace_channel`.
@@ -113,7 +113,7 @@ def add_channels(files: pd.DataFrame, channels: tuple[Channel, ...], draws: Draw
         If a formula does not give a number.
     """
     for channel in channels:
-        random = draws.stream("channel", channel.name)
+        random = stream(seed, "channel", channel.name)
         match channel:
             case NumericChannel():
                 codes, groups = pd.factorize(files[GROUPS[channel.level]])

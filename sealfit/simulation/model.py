@@ -111,7 +111,6 @@ def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) 
 
 
 # ---------------------------------------------------------------- effects
-# The effects of a SPEC, bound to the catalogue.
 
 EXPRESSION = "expression"
 
@@ -150,6 +149,10 @@ class EffectEntry(Strict):
         return self
 
 
+Shape = Callable[[Mapping[str, np.ndarray]], np.ndarray]
+"""Channels -> added force, factor minus one or change."""
+
+
 @dataclass(frozen=True, slots=True)
 class BoundEffect:
     """An effect of a SPEC, resolved: its channels, its target and its shape."""
@@ -160,8 +163,7 @@ class BoundEffect:
     operation: Operation
     form: str
     parameters: Mapping[str, float]
-    # channels -> added force, factor minus one or change
-    shape: Callable[[Mapping[str, np.ndarray]], np.ndarray]
+    shape: Shape
 
 
 def resolve_effects(entries: Sequence[EffectEntry]) -> tuple[BoundEffect, ...]:
@@ -177,10 +179,10 @@ def resolve_effects(entries: Sequence[EffectEntry]) -> tuple[BoundEffect, ...]:
 
 
 def _resolve(entry: EffectEntry, place: str) -> BoundEffect:
-    if entry.formula is not None:
-        return _expression(entry)
-    if entry.id == LEVELS:
-        return _levels(entry)
+    if entry.formula is not None or entry.id == LEVELS:
+        channels, form, shape = _levels(entry) if entry.formula is None else _expression(entry)
+        acts_on, operation = entry.acts_on or "force", entry.operation or "add"
+        return BoundEffect(entry.id, channels, acts_on, operation, form, dict(entry.parameters), shape)
     effect = _catalogued(entry, place)
     channels = _bound_channels(entry, effect, place)
     _check_parameters(entry, effect, place)
@@ -256,7 +258,8 @@ def _target(entry: EffectEntry, effect: Effect, place: str) -> tuple[Target, Ope
     )
 
 
-def _expression(entry: EffectEntry) -> BoundEffect:
+def _expression(entry: EffectEntry) -> tuple[tuple[str, ...], str, Shape]:
+    """Return the channels, the form and the shape of a formula."""
     formula = parse(str(entry.formula))
     constants = {name: np.float64(value) for name, value in entry.parameters.items()}
     channels = tuple(name for name in sorted(formula.names) if name not in constants)
@@ -264,11 +267,11 @@ def _expression(entry: EffectEntry) -> BoundEffect:
     def shape(given: Mapping[str, np.ndarray]) -> np.ndarray:
         return evaluate(formula, {**given, **constants})
 
-    target, operation = entry.acts_on or "force", entry.operation or "add"
-    return BoundEffect(entry.id, channels, target, operation, formula.text, dict(entry.parameters), shape)
+    return channels, formula.text, shape
 
 
-def _levels(entry: EffectEntry) -> BoundEffect:
+def _levels(entry: EffectEntry) -> tuple[tuple[str, ...], str, Shape]:
+    """Return the channels, the form and the shape of one value per category."""
     (channel,) = entry.channels
 
     def shape(given: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -278,7 +281,4 @@ def _levels(entry: EffectEntry) -> BoundEffect:
         # 0 for a category without a value
         return np.array([entry.parameters.get(label(value), 0.0) for value in found])[codes]
 
-    target, operation = entry.acts_on or "force", entry.operation or "add"
-    return BoundEffect(
-        LEVELS, (channel,), target, operation, "value of the level", dict(entry.parameters), shape
-    )
+    return (channel,), "value of the level", shape

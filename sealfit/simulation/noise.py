@@ -20,16 +20,10 @@ from sealfit.config import Strict
 # changes no other draw, so that campaigns can be compared draw by draw.
 
 
-@dataclass(frozen=True, slots=True)
-class Draws:
-    """A SPEC's source of randomness."""
-
-    seed: int
-
-    def stream(self, *purpose: str | int) -> np.random.Generator:
-        """Return a generator for one purpose, e.g. `stream("white", 12)` for the thirteenth file."""
-        key = [crc32(part.encode("utf-8")) if isinstance(part, str) else part for part in purpose]
-        return np.random.default_rng([self.seed, *key])
+def stream(seed: int, *purpose: str | int) -> np.random.Generator:
+    """Return a generator for one purpose, e.g. `stream(seed, "white", 0, 12)` for the thirteenth file."""
+    key = [crc32(part.encode("utf-8")) if isinstance(part, str) else part for part in purpose]
+    return np.random.default_rng([seed, *key])
 
 
 def remembering(kicks: np.ndarray, memory: float) -> np.ndarray:
@@ -43,7 +37,6 @@ def remembering(kicks: np.ndarray, memory: float) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- noise
-# Scatter and noise of a SPEC.
 
 
 class White(Strict):
@@ -157,11 +150,11 @@ class Scatter:
     outlier: np.ndarray  # bool
 
 
-def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, draws: Draws) -> Scatter:
+def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> Scatter:
     """Return the scatter of `files`, their runs and specimens; gains multiply each other."""
     n = len(files)
     gain, offset, speed, outlier = np.ones(n), np.zeros(n), np.ones(n), np.zeros(n, bool)
-    for kind, random in _streams(noise, draws):
+    for kind, random in _streams(noise, seed):
         match kind:
             case RepeatGain():
                 gain *= 1.0 + kind.sd_rel * random.standard_normal(n)
@@ -188,7 +181,7 @@ def sample_noise_N(
     time_s: np.ndarray,
     speed_mm_s: float,
     file: int,
-    draws: Draws,
+    seed: int,
 ) -> np.ndarray:
     """Return the noise of one trace's samples in N, shape (n,): white, autocorrelated and proportional.
 
@@ -203,7 +196,7 @@ def sample_noise_N(
     """
     n = len(force_N)
     total = np.zeros(n)
-    for kind, random in _streams(noise, draws, file):
+    for kind, random in _streams(noise, seed, file):
         match kind:
             case White():
                 total += kind.sd_N * random.standard_normal(n)
@@ -216,10 +209,10 @@ def sample_noise_N(
     return total
 
 
-def displacement_noise_mm(noise: Sequence[Noise], n: int, file: int, draws: Draws) -> np.ndarray:
+def displacement_noise_mm(noise: Sequence[Noise], n: int, file: int, seed: int) -> np.ndarray:
     """Return the noise of one trace's displacement in mm, shape (n,)."""
     total = np.zeros(n)
-    for kind, random in _streams(noise, draws, file):
+    for kind, random in _streams(noise, seed, file):
         if isinstance(kind, DisplacementNoise):
             total += kind.sd_mm * random.standard_normal(n)
     return total
@@ -233,11 +226,11 @@ def quantised(noise: Sequence[Noise], force_N: np.ndarray) -> np.ndarray:
     return force_N
 
 
-def _streams(noise: Sequence[Noise], draws: Draws, *file: int) -> Iterator[tuple[Noise, np.random.Generator]]:
+def _streams(noise: Sequence[Noise], seed: int, *file: int) -> Iterator[tuple[Noise, np.random.Generator]]:
     """Yield every kind of noise with its generator, which its number among those of the kind names."""
     seen: Counter[str] = Counter()
     for kind in noise:
-        yield kind, draws.stream(kind.kind, seen[kind.kind], *file)
+        yield kind, stream(seed, kind.kind, seen[kind.kind], *file)
         seen[kind.kind] += 1
 
 
@@ -248,14 +241,14 @@ DEFECTS = ("missing_cells", "spikes", "gaps", "saturated", "reversed")  # keys o
 Columns = dict[str, np.ndarray]  # a trace's columns, each of shape (n,); NaN is written as an empty cell
 
 
-def draw_defects(noise: Sequence[Noise], files: int, draws: Draws) -> dict[int, str]:
+def draw_defects(noise: Sequence[Noise], files: int, seed: int) -> dict[int, str]:
     """Return the defect of each file that has one; fewer than asked if there are not enough files."""
     wanted: list[str] = []
     for kind in noise:
         if isinstance(kind, BadData):
             for defect in DEFECTS:
                 wanted += getattr(kind, defect) * [defect]
-    order = draws.stream("bad_data").permutation(files).tolist()
+    order = stream(seed, "bad_data").permutation(files).tolist()
     return dict(zip(order, wanted, strict=False))
 
 

@@ -22,7 +22,6 @@ from sealfit.simulation.model import CONDITIONS, EffectEntry, Physics, resolve_e
 from sealfit.simulation.noise import Noise
 
 # ---------------------------------------------------------------- design
-# The design of a SPEC and the table of files that it plans, in the order in which they are measured.
 
 # Number of rise lengths after which sliding counts as steady: the force has reached 1 - exp(-9) = 0.9999 of
 # its limit.
@@ -198,7 +197,6 @@ def _dated(files: pd.DataFrame, design: Design, random: np.random.Generator) -> 
 
 
 # ---------------------------------------------------------------- spec
-# What a SPEC says: rubber, rig, design, effects and scatter; checked on load, unknown keys refused.
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 TAKEN = {  # of traces, of runs.csv, derived from them, and of formulas
