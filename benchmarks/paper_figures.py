@@ -38,8 +38,8 @@ class Found:
     def line(self, at: At | None, label: str, colour: str) -> Line:
         """Return one condition for a panel of force against speed: run means and the steady fit."""
         name = condition(at)
-        curves = curve_lines({**self.tables, "curves": pd.DataFrame()}, self.config)
-        points = run_points(self.tables["steady"], self.config)
+        curves = curve_lines({**self.tables, "curves": pd.DataFrame()})
+        points = run_points(self.tables["steady"])
         return Line(
             label, colour, (curves[curves["condition"] == name],), points[points["condition"] == name]
         )
@@ -147,7 +147,7 @@ def _predicted(found: Found, name: str, title: str, at: At) -> Plot:
     values = {}
     for quantity, law in laws[laws["parameter"].isin(["mu_0", "a", "b"])].groupby("quantity"):
         values[quantity] = aging_law(day, **law.set_index("parameter")["value"].to_dict())
-    points = run_points(found.tables["steady"], found.config)
+    points = run_points(found.tables["steady"])
     points = points[points["condition"] == condition(at)]
     speed = np.geomspace(points["speed"].abs().min() / 1.5, points["speed"].abs().max() * 1.2, 200)
     load = float(found.tables["steady"]["load_N"].mean())

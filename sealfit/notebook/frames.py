@@ -50,7 +50,6 @@ def with_units(frame: pd.DataFrame, units: Units, schema: Schema | None = None) 
 
 
 # ---------------------------------------------------------------- what the loop found
-# Each is made of closure.json, and takes the true units.
 def verdict(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return one row: the verdict, its sentence, how good the fit is, and what is left."""
     quality, left = closure["fit_quality"], closure["left"]
@@ -86,7 +85,7 @@ def errors(closure: Mapping, units: Units) -> pd.DataFrame:
     return _numbers(pd.DataFrame(rows), ("before", "after", "noise_floor"))
 
 
-def effects(closure: Mapping, units: Units) -> pd.DataFrame:
+def effects(closure: Mapping) -> pd.DataFrame:
     """Return a row per effect, added or candidate; `effect` is its number, from 0."""
     rows = [
         {**effect, "effect": k, "channels": " ".join(effect["channels"])}
@@ -95,7 +94,7 @@ def effects(closure: Mapping, units: Units) -> pd.DataFrame:
     return _numbers(pd.DataFrame(rows, columns=EFFECT), ("p_value", "heldout_gain_N", "heldout_rmse_N"))
 
 
-def effect_parameters(closure: Mapping, units: Units) -> pd.DataFrame:
+def effect_parameters(closure: Mapping) -> pd.DataFrame:
     """Return a row per effect and parameter, with the ends of its 95 % interval."""
     columns = ["effect", "id", "parameter", "value", "lo95", "hi95", "unit"]
     rows = [
@@ -106,12 +105,12 @@ def effect_parameters(closure: Mapping, units: Units) -> pd.DataFrame:
     return _numbers(pd.DataFrame(rows, columns=columns), ("value", "lo95", "hi95"))
 
 
-def scatter(closure: Mapping, units: Units) -> pd.DataFrame:
+def scatter(closure: Mapping) -> pd.DataFrame:
     """Return a row per level of scatter: file, run, specimen."""
     return _numbers(pd.DataFrame(closure["scatter"], columns=SCATTER), SCATTER[1:])
 
 
-def sensitivity(closure: Mapping, units: Units) -> pd.DataFrame:
+def sensitivity(closure: Mapping) -> pd.DataFrame:
     """Return a row per variable, level and target: the smallest effect to be found with 80 % chance."""
     frame = pd.DataFrame(closure["sensitivity"], columns=SENSITIVITY)
     return _numbers(frame, ("smallest_N", "smallest_pct", "files_needed"))

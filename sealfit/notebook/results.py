@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -145,22 +145,26 @@ class Results:
     @property
     def verdict(self) -> pd.DataFrame:
         """One row: the verdict, its sentence, how good the fit is, and what is left."""
-        return self._of_closure(frames.verdict)
+        closure, units = self._closure()
+        return frames.with_units(frames.verdict(closure, units), units)
 
     @property
     def errors(self) -> pd.DataFrame:
         """A row per error: before and after the effects were added, and the noise floor."""
-        return self._of_closure(frames.errors)
+        closure, units = self._closure()
+        return frames.with_units(frames.errors(closure, units), units)
 
     @property
     def effects(self) -> pd.DataFrame:
         """A row per effect that the loop found; one that is only a candidate is not in the model."""
-        return self._of_closure(frames.effects)
+        closure, units = self._closure()
+        return frames.with_units(frames.effects(closure), units)
 
     @property
     def effect_parameters(self) -> pd.DataFrame:
         """A row per effect and parameter, with its 95 % interval and unit."""
-        return self._of_closure(frames.effect_parameters)
+        closure, units = self._closure()
+        return frames.with_units(frames.effect_parameters(closure), units)
 
     @property
     def effect_curves(self) -> pd.DataFrame:
@@ -170,12 +174,14 @@ class Results:
     @property
     def scatter(self) -> pd.DataFrame:
         """A row per level: how much specimens, runs and files scatter."""
-        return self._of_closure(frames.scatter)
+        closure, units = self._closure()
+        return frames.with_units(frames.scatter(closure), units)
 
     @property
     def sensitivity(self) -> pd.DataFrame:
         """A row per variable, level and target: the smallest effect to be found with 80 % chance."""
-        return self._of_closure(frames.sensitivity)
+        closure, units = self._closure()
+        return frames.with_units(frames.sensitivity(closure), units)
 
     # ------------------------------------------------------------ fits
     @property
@@ -337,8 +343,8 @@ class Results:
         sentence = html.escape(summary.verdict_sentence(closure, units))
         tables = [frames.errors(closure, units)[["meaning", "before", "after", "noise_floor", "unit"]]]
         if closure["effects"]:
-            tables.append(frames.effects(closure, units)[list(SHOWN)])
-            tables.append(frames.effect_parameters(closure, units).drop(columns="effect"))
+            tables.append(frames.effects(closure)[list(SHOWN)])
+            tables.append(frames.effect_parameters(closure).drop(columns="effect"))
         verdict = f"<p><b>{html.escape(closure['verdict'])}</b>: {sentence}.</p>"
         return "\n".join([verdict, *map(_table_html, tables)])
 
@@ -361,11 +367,9 @@ class Results:
         store.require(store.state.order[-2])
         return store
 
-    def _of_closure(self, frame: Callable[[dict, Units], pd.DataFrame]) -> pd.DataFrame:
-        """Return a frame that is made of closure.json and the true units."""
+    def _closure(self) -> tuple[dict, Units]:
         store = self._current(ANSWERED)
-        units = store.config.units
-        return frames.with_units(frame(store.read_json("closure"), units), units)
+        return store.read_json("closure"), store.config.units
 
     @staticmethod
     def _answer(store: Store, name: str) -> pd.DataFrame:

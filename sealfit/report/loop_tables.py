@@ -173,7 +173,7 @@ def _rival(rival: Mapping, config: Config) -> Markup:
     return text
 
 
-def scatter_rows(closure: Mapping, config: Config) -> list[dict]:
+def scatter_rows(closure: Mapping) -> list[dict]:
     """Return the variance components by level."""
     return [
         {

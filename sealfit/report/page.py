@@ -272,7 +272,7 @@ def _content(
         "facts": campaign_facts(tables, config),
         "errors": error_rows(closure, config) if closure else [],
         "cards": effect_cards(closure, config) if closure else [],
-        "scatter": scatter_rows(closure, config) if closure else [],
+        "scatter": scatter_rows(closure) if closure else [],
         "sensitivity": sensitivity_rows(closure, config) if closure else [],
         "refused": refused_rows(closure, config) if closure else [],
         "left": left_over(closure, config) if closure else "",

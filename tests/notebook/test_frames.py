@@ -106,9 +106,8 @@ def closure(**changed):
 
 
 def test_where_nothing_was_found_tables_have_their_columns():
-    units = Config().units
-    assert frames.effects(closure(), units)["id"].tolist() == []
-    assert list(frames.effect_parameters(closure(), units)) == [
+    assert frames.effects(closure())["id"].tolist() == []
+    assert list(frames.effect_parameters(closure())) == [
         "effect",
         "id",
         "parameter",
@@ -117,8 +116,8 @@ def test_where_nothing_was_found_tables_have_their_columns():
         "hi95",
         "unit",
     ]
-    assert list(frames.scatter(closure(), units)) == ["level", "sd_rel", "sd_N", "df"]
-    assert frames.verdict(closure(), units)["effects"].tolist() == [0]
+    assert list(frames.scatter(closure())) == ["level", "sd_rel", "sd_N", "df"]
+    assert frames.verdict(closure(), Config().units)["effects"].tolist() == [0]
 
 
 def test_an_unavailable_value_is_nan():

@@ -72,7 +72,7 @@ def test_run_means_average_files_and_take_the_direction_out():
             "used": [True, True, True, True],
         }
     )
-    points = run_points(steady, Config()).set_index("run_id")
+    points = run_points(steady).set_index("run_id")
     assert points.loc["r+", "force"] == 11.0
     npt.assert_allclose(points.loc["r+", "sd"], np.sqrt(2.0))
     assert points.loc["r-", ["speed", "force", "sd"]].tolist() == [5.0, 20.0, 0.0]
@@ -80,7 +80,7 @@ def test_run_means_average_files_and_take_the_direction_out():
 
 def test_what_was_left_out_of_the_fit_is_not_drawn(made):
     steady = made.tables["steady"].assign(used=made.tables["steady"]["repeat"] != 3)
-    assert (run_points(steady, made.config)["n"] == 2).all()
+    assert (run_points(steady)["n"] == 2).all()
 
 
 def test_every_series_has_a_panel_with_its_days_and_the_unaged(made):
@@ -113,7 +113,7 @@ def test_torque_rig_shows_true_units_and_no_slot_names():
 
 def test_bands_of_backward_motion_are_not_upside_down():
     made = torque_campaign()
-    curves = curve_lines(made.tables, made.config)
+    curves = curve_lines(made.tables)
     assert (curves["lo"] < curves["after"]).all()
     assert (curves["after"] < curves["hi"]).all()
     assert (curves["after"] > 0).all()
@@ -121,7 +121,7 @@ def test_bands_of_backward_motion_are_not_upside_down():
 
 def test_without_the_loop_the_steady_fit_is_drawn():
     made = not_run()
-    curves = curve_lines(made.tables, made.config)
+    curves = curve_lines(made.tables)
     fit = made.tables["steady_fit"]
     values = fit[(fit["condition"] == "unaged") & (fit["quantity"] == "steady")].set_index("parameter")[
         "value"

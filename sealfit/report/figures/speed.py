@@ -85,7 +85,7 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
             draw_band(ax, speed, curve["lo"], curve["hi"], line.colour)
             if not curve["before"].equals(curve["after"]):
                 ax.plot(speed, curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
-            backward = curve["direction"].iloc[0] < 0
+            backward = (curve["direction"] < 0).any()
             ax.plot(speed, curve["after"], color=line.colour, linestyle="--" if backward else "-")
         for direction, points in line.points.groupby("direction") if len(line.points) else ():
             drawn, *_ = ax.errorbar(
@@ -120,7 +120,7 @@ def _of_run(row: Mapping, condition: str, units: Units) -> str:
 
 def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     """Return force against speed for every condition, a panel per series, or None if nothing was measured."""
-    points, curves = run_points(tables["steady"], config), curve_lines(tables, config)
+    points, curves = run_points(tables["steady"]), curve_lines(tables)
     conditions = pd.unique(pd.concat([points["condition"], curves["condition"]], ignore_index=True))
     if not len(conditions):
         return None
@@ -187,37 +187,32 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
 
 
 def _force_alt(title: str, lines: Sequence[Line], config: Config) -> str:
-    forces = [force for line in lines if len(line.points) for force in line.points["force"]]
+    forces = [force for line in lines for force in line.points["force"].dropna()]
     text = f"{config.units.quantity('force')} against {config.units.quantity('speed')}"
     text += f"{', ' + title if title else ''}: {count(len(lines), 'condition')}"
     if forces:
-        text += (
-            f", run means from {number(min(forces))} to {number(max(forces))} {config.units.unit('force')}"
-        )
+        ends, unit = f"{number(min(forces))} to {number(max(forces))}", config.units.unit("force")
+        text += f", run means from {ends} {unit}"
     return text + "."
 
 
-def run_points(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+def run_points(steady: pd.DataFrame) -> pd.DataFrame:
     """Return mean and scatter of every run: condition, direction, speed, force (along the motion), sd, n."""
     used = steady[steady["used"].astype(bool)]
     if used.empty:
-        return pd.DataFrame(columns=["condition", "direction", "speed", "force", "sd", "n"]).astype(
-            {"force": float}
-        )
+        columns = ["condition", "direction", "speed", "force", "sd", "n"]
+        return pd.DataFrame(columns=columns).astype({"force": float})
     rows = used.assign(speed=used["speed_mm_s"].abs(), force=used["force_N"] * used["direction"])
     run = ["condition", "run_id", "direction"]
     files = rows.groupby([*run, "file"], sort=False)[["speed", "force"]].mean().reset_index()
-    return (
-        files.groupby(run, sort=False)
-        .agg(
-            speed=("speed", "mean"), force=("force", "mean"), sd=("force", "std"), n=("force", "size"),
-            files=("file", lambda own: ", ".join(spread(list(own), MOST_FILES))),
-        )
-        .reset_index()
+    found = files.groupby(run, sort=False).agg(
+        speed=("speed", "mean"), force=("force", "mean"), sd=("force", "std"), n=("force", "size"),
+        files=("file", lambda own: ", ".join(spread(list(own), MOST_FILES))),
     )  # fmt: skip
+    return found.reset_index()
 
 
-def curve_lines(tables: Mapping[str, pd.DataFrame], config: Config) -> pd.DataFrame:
+def curve_lines(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Return the loop's curves, or the steady fit's where the loop was not run, by magnitude of the speed."""
     curves = tables["curves"]
     if curves.empty:
