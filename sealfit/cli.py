@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperCommand
 
 from sealfit import __version__
@@ -22,23 +23,23 @@ from sealfit.errors import MEMORY, MORE_MEMORY, SealfitError, grouped, memory_ra
 # ---------------------------------------------------------------- options
 # Arguments and options that several commands share.
 
-Campaign = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Folder of runs.csv and trace files.")]
-Results = Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results of `ingest` or `run`.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder of results; created if it is missing.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="Rig config (TOML); else the default.")]
-Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes. [default: all cores]")]
+Campaign = Annotated[Path, Argument(metavar="CAMPAIGN", help="Folder of runs.csv and trace files.")]
+Results = Annotated[Path, Argument(metavar="OUT", help="Folder of results of `ingest` or `run`.")]
+Out = Annotated[Path, Option("--out", help="Folder of results; created if it is missing.")]
+ConfigFile = Annotated[Path | None, Option("--config", help="Rig config (TOML); else the default.")]
+Workers = Annotated[int | None, Option("--workers", min=1, help="Processes. [default: all cores]")]
 Scheduler = Annotated[
     str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler: tcp://host:port, or its file."),
+    Option("--scheduler", metavar="ADDRESS", help="Dask scheduler: tcp://host:port, or its file."),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Redo steps that are up to date, too.")]
-Strict = Annotated[bool, typer.Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
-Profile = Annotated[bool, typer.Option("--profile", help="Print seconds and rows per step.")]
+Force = Annotated[bool, Option("--force", help="Redo steps that are up to date, too.")]
+Strict = Annotated[bool, Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
+Profile = Annotated[bool, Option("--profile", help="Print seconds and rows per step.")]
 EffectsFolder = Annotated[
     Path | None,
-    typer.Option("--effects-folder", metavar="FOLDER", help="Your own effects. Python is run from it."),
+    Option("--effects-folder", metavar="FOLDER", help="Your own effects. Python is run from it."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
+Json = Annotated[bool, Option("--json", help="Print exactly one JSON object on stdout.")]
 
 
 # ---------------------------------------------------------------- ending
@@ -83,17 +84,14 @@ def exit_code(app: typer.Typer) -> int:
         return _interrupted() if code == INTERRUPTED else code
     except SealfitError as error:
         return _fail(f"sealfit: {error}", error.as_dicts(), 1)
-    except (
-        KeyboardInterrupt,
-        typer.Abort,
-    ):  # typer hands on a Ctrl-C as one of these or as the code, by version
+    except (KeyboardInterrupt, typer.Abort):  # or the code above: which one depends on typer's version
         return _interrupted()
     except BrokenPipeError:  # `sealfit effects | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
         if memory_ran_out(error):
-            return _fail(f"sealfit: {MEMORY} {MORE_MEMORY}", [{**_error(MEMORY), "fix": MORE_MEMORY}], 1)
+            return _fail(f"sealfit: {MEMORY} {MORE_MEMORY}", [_error(MEMORY, fix=MORE_MEMORY)], 1)
         if isinstance(error, PermissionError) and error.filename is not None:
             return _forbidden(error)
         # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they
@@ -118,12 +116,9 @@ def _fail(message: str, errors: list[dict], code: int) -> int:
 
 def _forbidden(error: PermissionError) -> int:
     """Report a file or folder without access, such as one in a folder that cannot be searched."""
-    file = os.fsdecode(error.filename)
-    reason, fix = (
-        f"there is no access ({error.strerror}).",
-        "Fix its rights, or those of the folders above it.",
-    )
-    return _fail(f"sealfit: {file}: {reason} {fix}", [{**_error(reason), "file": file, "fix": fix}], 1)
+    file, reason = os.fsdecode(error.filename), f"there is no access ({error.strerror})."
+    fix = "Fix its rights, or those of the folders above it."
+    return _fail(f"sealfit: {file}: {reason} {fix}", [_error(reason, file=file, fix=fix)], 1)
 
 
 def _bug(error: Exception) -> int:
@@ -131,7 +126,7 @@ def _bug(error: Exception) -> int:
     traceback.print_exception(error)
     told = " ".join("".join(traceback.format_exception_only(error)).split())
     fix = "Please report it, with the traceback on stderr."
-    return _fail(f"sealfit: this is a bug. {fix}", [{**_error(told), "kind": "bug", "fix": fix}], BUG)
+    return _fail(f"sealfit: this is a bug. {fix}", [_error(told, kind="bug", fix=fix)], BUG)
 
 
 def _interrupted() -> int:
@@ -139,8 +134,8 @@ def _interrupted() -> int:
     return _fail(f"sealfit: {text}", [_error(text)], INTERRUPTED)
 
 
-def _error(reason: str) -> dict:
-    return {"file": None, "line": None, "column": None, "value": None, "fix": "", "reason": reason}
+def _error(reason: str, **known: str) -> dict:
+    return {"file": None, "line": None, "column": None, "value": None, "fix": "", "reason": reason, **known}
 
 
 # ---------------------------------------------------------------- cli
@@ -177,7 +172,7 @@ def _print_version(wanted: bool) -> None:
 def _sealfit(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end."),
+        Option("--version", callback=_print_version, is_eager=True, help="Print the version and end."),
     ] = False,
 ) -> None:
     pass
@@ -185,9 +180,9 @@ def _sealfit(
 
 @command(epilog="Example: sealfit init my_campaign --output rig.toml")
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with the trace files of a rig.")],
-    output: Annotated[Path, typer.Option("--output", help="Config to write (TOML).")] = Path("rig.toml"),
-    force: Annotated[bool, typer.Option("--force", help="Replace a config that is there.")] = False,
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder with the trace files of a rig.")],
+    output: Annotated[Path, Option("--output", help="Config to write (TOML).")] = Path("rig.toml"),
+    force: Annotated[bool, Option("--force", help="Replace a config that is there.")] = False,
     as_json: Json = False,
 ) -> None:
     """Draft a rig config from a folder of files."""
@@ -214,19 +209,15 @@ def check(
         campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr()
     )
     if as_json:
-        print_json(
-            {"ok": not faults, "command": "check", **found, "errors": [fault.as_dict() for fault in faults]}
-        )
+        errors = [fault.as_dict() for fault in faults]
+        print_json({"ok": not faults, "command": "check", **found, "errors": errors})
     else:
         for group in grouped(faults):
             typer.echo(f"{group[0].severity}: {told(group)}")
         for line in summary_lines.ingest_lines(found) if found["files"] else ():
             typer.echo(line)
-        typer.echo(
-            f"{len(faults)} {'fault' if len(faults) == 1 else 'faults'} found."
-            if faults
-            else "No faults found."
-        )
+        number = {0: "No faults", 1: "1 fault"}.get(len(faults), f"{len(faults)} faults")
+        typer.echo(f"{number} found.")
     if faults:
         raise typer.Exit(1)
 
@@ -246,11 +237,9 @@ def run(
 ) -> None:
     """Run all out-of-date steps, in order."""
     options = _options(workers, scheduler, force=force, strict=strict, effects_folder=effects_folder)
+    from sealfit import pipeline
 
-    def work(pipeline, progress):
-        return pipeline.run(campaign, out, config, progress=progress, **options)
-
-    _do("run", profile, as_json, work)
+    _do("run", profile, as_json, partial(pipeline.run, campaign, out, config, **options))
 
 
 @command(epilog="Example: sealfit ingest my_campaign --config rig.toml --out results")
@@ -267,16 +256,15 @@ def ingest(
 ) -> None:
     """Read a campaign into tables of traces."""
     options = _options(workers, scheduler, force=force, strict=strict)
+    from sealfit import pipeline
 
-    def work(pipeline, progress):
-        return pipeline.ingest(campaign, out, config, progress=progress, **options)
-
-    _do("ingest", profile, as_json, work)
+    _do("ingest", profile, as_json, partial(pipeline.ingest, campaign, out, config, **options))
 
 
-def _fit_command(step: str) -> Callable[..., None]:
-    """Return the command of a fit; these have the same options."""
+def _fit_command(step: str, says: str) -> None:
+    """Add the command of a fit; these have the same options."""
 
+    @command(step, help=says, epilog=f"Example: sealfit {step} results")
     def fit(
         out: Results,
         workers: Workers = None,
@@ -287,29 +275,25 @@ def _fit_command(step: str) -> Callable[..., None]:
     ) -> None:
         _single(step, out, profile, as_json, **_options(workers, scheduler, force=force))
 
-    return fit
 
-
-command(
-    "fit-steady", help="Fit steady LuGre to each condition.", epilog="Example: sealfit fit-steady results"
-)(_fit_command("fit-steady"))
+_fit_command("fit-steady", "Fit steady LuGre to each condition.")
 
 
 @command("fit-aging", epilog="Example: sealfit fit-aging --values strength.csv --out results")
 def fit_aging(
     out: Annotated[
-        Path | None, typer.Argument(metavar="OUT", help="Folder of results of `ingest` or `run`.")
+        Path | None, Argument(metavar="OUT", help="Folder of results of `ingest` or `run`.")
     ] = None,
     values: Annotated[
-        Path | None, typer.Option("--values", help="Or a table of property values of specimens.")
+        Path | None, Option("--values", help="Or a table of property values of specimens.")
     ] = None,
-    new: Annotated[Path | None, typer.Option("--out", help="With --values: folder of results.")] = None,
+    new: Annotated[Path | None, Option("--out", help="With --values: folder of results.")] = None,
     config: ConfigFile = None,
     properties: Annotated[
-        list[str] | None, typer.Option("--property", metavar="COLUMN", help="Property; may be repeated.")
+        list[str] | None, Option("--property", metavar="COLUMN", help="Property; may be repeated.")
     ] = None,
     batch: Annotated[
-        str | None, typer.Option("--batch", metavar="COLUMN", help="Batch of a specimen. [default: batch]")
+        str | None, Option("--batch", metavar="COLUMN", help="Batch of a specimen. [default: batch]")
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -327,22 +311,14 @@ def fit_aging(
         return
     if (out is None) == (new is None):
         raise typer.BadParameter("give the folder of results once: --values TABLE --out OUT.")
+    from sealfit import pipeline
+
     asked = {"names": tuple(properties or ()), "force": force} | ({"batch": batch} if batch else {})
-    _do(
-        "fit-aging",
-        profile,
-        as_json,
-        lambda pipeline, progress: pipeline.fit_properties(
-            values, new or out, config, progress=progress, **asked
-        ),
-    )
+    work = partial(pipeline.fit_properties, values, new or out, config, **asked)
+    _do("fit-aging", profile, as_json, work)
 
 
-command(
-    "fit-dynamic",
-    help="Fit sigma_0 and sigma_1 to the pre-sliding part.",
-    epilog="Example: sealfit fit-dynamic results",
-)(_fit_command("fit-dynamic"))
+_fit_command("fit-dynamic", "Fit sigma_0 and sigma_1 to the pre-sliding part.")
 
 
 @command("close-loop", epilog="Example: sealfit close-loop results")
@@ -364,7 +340,7 @@ def close_loop(
 def report(
     out: Results,
     force: Force = False,
-    show: Annotated[bool, typer.Option("--open", help="Open the report in the browser.")] = False,
+    show: Annotated[bool, Option("--open", help="Open the report in the browser.")] = False,
     profile: Profile = False,
     as_json: Json = False,
 ) -> None:
@@ -377,12 +353,8 @@ def report(
 @command(epilog="Example: sealfit predict results --points points.csv --output answers.csv")
 def predict(
     out: Results,
-    points: Annotated[
-        Path, typer.Option("--points", help="CSV of points: condition columns, speed, channels.")
-    ],
-    output: Annotated[
-        Path, typer.Option("--output", help="CSV to write: the points with their predictions.")
-    ],
+    points: Annotated[Path, Option("--points", help="CSV of points: condition columns, speed, channels.")],
+    output: Annotated[Path, Option("--output", help="CSV to write: the points with their predictions.")],
     effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
@@ -397,28 +369,18 @@ def predict(
 @command(epilog="Example: sealfit lifetime results --quantity mu_s --threshold 0.70 --temperature 40")
 def lifetime(
     out: Results,
-    quantity: Annotated[
-        str, typer.Option("--quantity", help="mu_s, mu_c, F_s, F_c, or a property.")
-    ] = "mu_s",
-    threshold: Annotated[
-        float | None, typer.Option("--threshold", help="Value at which the life ends.")
-    ] = None,
+    quantity: Annotated[str, Option("--quantity", help="mu_s, mu_c, F_s, F_c, or a property.")] = "mu_s",
+    threshold: Annotated[float | None, Option("--threshold", help="Value at which the life ends.")] = None,
     loss: Annotated[
-        float | None, typer.Option("--loss", help="Or the loss at which it ends, in percent of the start.")
+        float | None, Option("--loss", help="Or the loss at which it ends, in percent of the start.")
     ] = None,
-    temperature: Annotated[
-        float | None, typer.Option("--temperature", help="Temperature in use, in degC.")
-    ] = None,
-    compression: Annotated[
-        float | None, typer.Option("--compression", help="Height in use, in percent.")
-    ] = None,
+    temperature: Annotated[float | None, Option("--temperature", help="Temperature in use, in degC.")] = None,
+    compression: Annotated[float | None, Option("--compression", help="Height in use, in percent.")] = None,
     years: Annotated[
-        float | None, typer.Option("--years", help="Find the temperature at which it lasts so many years.")
+        float | None, Option("--years", help="Find the temperature at which it lasts so many years.")
     ] = None,
-    law: Annotated[str | None, typer.Option("--law", help="log, stretched, power, induction.")] = None,
-    model: Annotated[
-        str, typer.Option("--model", help="after (with the loop's effects) or before.")
-    ] = "after",
+    law: Annotated[str | None, Option("--law", help="log, stretched, power, induction.")] = None,
+    model: Annotated[str, Option("--model", help="after (with the loop's effects) or before.")] = "after",
     as_json: Json = False,
 ) -> None:
     """Compute the days until a quantity reaches a threshold."""
@@ -431,9 +393,7 @@ def lifetime(
 
 @command(epilog="Example: sealfit effects results")
 def effects(
-    out: Annotated[
-        Path | None, typer.Argument(metavar="OUT", help="Results, for their units and effects.")
-    ] = None,
+    out: Annotated[Path | None, Argument(metavar="OUT", help="Results, for their units and effects.")] = None,
     effects_folder: EffectsFolder = None,
     as_json: Json = False,
 ) -> None:
@@ -446,9 +406,9 @@ def effects(
 
 @command(epilog="Example: sealfit simulate sample_data/simulated.spec.toml --out my_campaign")
 def simulate(
-    spec: Annotated[Path, typer.Argument(metavar="SPEC", help="What to simulate (TOML).")],
-    out: Annotated[Path, typer.Option("--out", help="Campaign folder to write; the truth goes beside it.")],
-    force: Annotated[bool, typer.Option("--force", help="Replace an earlier simulated campaign.")] = False,
+    spec: Annotated[Path, Argument(metavar="SPEC", help="What to simulate (TOML).")],
+    out: Annotated[Path, Option("--out", help="Campaign folder to write; the truth goes beside it.")],
+    force: Annotated[bool, Option("--force", help="Replace an earlier simulated campaign.")] = False,
     as_json: Json = False,
 ) -> None:
     """Write a campaign with known truth."""
@@ -461,29 +421,25 @@ def simulate(
 
 # ---------------------------------------------------------------- what the commands share
 def _single(step: str, out: Path, profile: bool, as_json: bool, **options: object) -> None:
-    _do(
-        step,
-        profile,
-        as_json,
-        lambda pipeline, progress: pipeline.single(step, out, progress=progress, **options),
-    )
+    from sealfit import pipeline
+
+    _do(step, profile, as_json, partial(pipeline.single, step, out, **options))
 
 
-def _do(command: str, profile: bool, as_json: bool, work: Callable) -> None:
+def _do(command: str, profile: bool, as_json: bool, work: Callable[..., dict]) -> None:
     """Do steps, with progress, and print what they came to."""
-    from sealfit import pipeline, progress
+    from sealfit import progress
     from sealfit.report import summary_lines
 
     with progress.profiled() as parts:
-        made = work(pipeline, progress.to_stderr())
+        made = work(progress=progress.to_stderr())
     if profile:
         made["profile"] = progress.as_dicts(parts)
-    end(
-        command,
-        made,
-        lambda made: summary_lines.lines(made) + progress.lines(made.get("profile", ())),
-        as_json,
-    )
+
+    def lines(made: dict) -> list[str]:
+        return summary_lines.lines(made) + progress.lines(made.get("profile", ()))
+
+    end(command, made, lines, as_json)
 
 
 def _options(workers: int | None, scheduler: str | None, **more: object) -> dict:
@@ -496,9 +452,8 @@ def _workers(workers: int | None, scheduler: str | None) -> int:
     from sealfit.engine import run_map
 
     if workers is not None and scheduler is not None:
-        raise typer.BadParameter(
-            "use either --workers (this computer) or --scheduler (a Dask cluster), not both."
-        )
+        either = "use either --workers (this computer) or --scheduler (a Dask cluster), not both."
+        raise typer.BadParameter(either)
     return workers or run_map.cores()
 
 
