@@ -257,10 +257,10 @@ def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict
 def _note_on_effects(store: Store) -> str | None:
     if "close-loop" in store.state.steps and (why := store.why_stale("close-loop")):
         return f"{why}: which effects the loop added is not known."
-    if store.effects is None and store.state.effects:
-        files = ", ".join(store.state.effects)
+    if store.effects is None and store.state.own_effects:
+        files = ", ".join(store.state.own_effects)
         return f"your own effects ({files}) are listed only from a folder that you name: add {OPTION} FOLDER."
-    return what_differs(store.kept_effects, store.state.effects) or None
+    return what_differs(store.kept_effects, store.state.own_effects) or None
 
 
 def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:

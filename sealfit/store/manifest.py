@@ -9,11 +9,13 @@ import os
 import platform
 import stat
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatch
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePath
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+from pydantic import AfterValidator, TypeAdapter
 
 from sealfit import __version__
 from sealfit.config import Config, Files, Loop, Sensor, parse_config, read_config
@@ -66,16 +68,18 @@ def fingerprint(path: Path | str) -> Fingerprint:
         if not stat.S_ISREG(status.st_mode):  # reading a pipe would wait for ever
             return Fingerprint()
         with open(path, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+            return _mark(status, hashlib.file_digest(file, "sha256").hexdigest())
     except OSError:
         return Fingerprint()
-    return Fingerprint(status.st_size, status.st_mtime_ns, digest, status.st_ctime_ns)
 
 
 def fingerprint_of(raw: bytes, status: os.stat_result) -> Fingerprint:
     """Return the fingerprint of a file from its bytes and its status."""
-    digest = hashlib.sha256(raw).hexdigest()
-    return Fingerprint(status.st_size, status.st_mtime_ns, digest, status.st_ctime_ns)
+    return _mark(status, hashlib.sha256(raw).hexdigest())
+
+
+def _mark(status: os.stat_result, sha256: str | None) -> Fingerprint:
+    return Fingerprint(status.st_size, status.st_mtime_ns, sha256, status.st_ctime_ns)
 
 
 def changes(folder: Path, known: Fingerprints, files: Files) -> dict[str, Fingerprint]:
@@ -87,15 +91,10 @@ def changes(folder: Path, known: Fingerprints, files: Files) -> dict[str, Finger
     place, changed = os.path.join(folder, ""), []
     for file, mark in known.items():
         try:
-            status = os.stat(place + file)
+            same = _mark(os.stat(place + file), mark.sha256) == mark
         except OSError:
-            changed.append(file)
-            continue
-        if (status.st_size, status.st_mtime_ns, status.st_ctime_ns) != (
-            mark.size,
-            mark.mtime_ns,
-            mark.ctime_ns,
-        ):
+            same = False
+        if not same:
             changed.append(file)
     changed += [file for file in glob_names(folder, files) if file not in known]
     return {file: fingerprint(place + file) for file in changed}
@@ -167,7 +166,7 @@ def provenance(state: State) -> dict:
             for name, mark in state.inputs.items()
             if mark.sha256 is not None
         ],
-        "own_effects": [{"file": name, "sha256": sha256} for name, sha256 in state.effects.items()],
+        "own_effects": [{"file": name, "sha256": sha256} for name, sha256 in state.own_effects.items()],
         "steps": [
             {"step": name, "version": done.version, "finished_at": done.finished_at, "seconds": done.seconds}
             for name, done in state.steps.items()
@@ -240,6 +239,29 @@ class ConfigCopy:
         return None if named is None else (self.path.parent if self.path else Path()) / named
 
 
+def _file_of_out(file: str) -> str:
+    """Return `file`; ValueError if it is not in OUT or a folder of it: these files are read and removed."""
+    parts = PurePath(file).parts
+    if PurePath(file).is_absolute() or ".." in parts or len(parts) > 2:
+        raise ValueError(f"{file} lies outside")
+    return file
+
+
+def _file_name(name: str) -> str:
+    if PurePath(name).name != name:
+        raise ValueError(f"{name} is no file name")
+    return name
+
+
+def _staging_folder(folder: str) -> str:
+    if not folder.startswith(STAGING):
+        raise ValueError(f"{folder} is no staging folder")
+    return _file_name(folder)
+
+
+FileOfOut = Annotated[str, AfterValidator(_file_of_out)]  # relative to OUT
+
+
 @dataclass(frozen=True, slots=True)
 class Done:
     """The last completion of a step."""
@@ -248,7 +270,7 @@ class Done:
     version: str
     finished_at: str  # ISO 8601, UTC
     seconds: float
-    files: dict[str, int]  # its files, relative to OUT, with their sizes in bytes
+    files: dict[FileOfOut, int]  # with their sizes in bytes
     checksums: dict[str, str | None]  # SHA-256 of those that are not parts of a table
 
 
@@ -266,7 +288,7 @@ class Properties:
         Column that names the batch.
     """
 
-    table: str
+    table: Annotated[str, AfterValidator(_file_name)]
     names: tuple[str, ...]
     batch: str
 
@@ -278,20 +300,22 @@ class Moving:
     `left_over` are the files of an earlier time of the step, to be removed.
     """
 
-    folder: str
-    left_over: tuple[str, ...]
+    folder: Annotated[str, AfterValidator(_staging_folder)]
+    left_over: tuple[FileOfOut, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The content of state.json; `properties` where the results are of such a table and not of traces."""
+    """The content of state.json; `properties` where the results are of such a table and not of traces.
+
+    `own_effects` has the SHA-256 of the user's own effects, by file name.
+    """
 
     campaign: Path
     config: ConfigCopy
     properties: Properties | None = None
     inputs: Fingerprints = field(default_factory=dict)
-    # SHA-256 of the user's own effects, by file name
-    effects: dict[str, str | None] = field(default_factory=dict)
+    own_effects: dict[str, str | None] = field(default_factory=dict)
     steps: dict[str, Done] = field(default_factory=dict)
     moving: Moving | None = None
 
@@ -302,17 +326,7 @@ class State:
 
     def as_dict(self) -> dict:
         """Return the state as it is written."""
-        return {
-            "program": "sealfit",
-            "format": FORMAT,
-            "campaign": str(self.campaign),
-            "config": {"path": str(self.config.path) if self.config.path else None, "text": self.config.text},
-            "properties": None if self.properties is None else asdict(self.properties),
-            "inputs": self.inputs,
-            "own_effects": self.effects,
-            "steps": {name: asdict(done) for name, done in self.steps.items()},
-            "moving": None if self.moving is None else asdict(self.moving),
-        }
+        return {"program": "sealfit", "format": FORMAT, **_STATE.dump_python(self, mode="json")}
 
     @classmethod
     def read(cls, out: Path) -> State | None:
@@ -328,18 +342,10 @@ class State:
             kept = json.loads(path.read_text("utf-8"))
             if kept["program"] != "sealfit" or kept["format"] > FORMAT:
                 raise ValueError
-            at = kept["config"]["path"]
-            belongs = Path(kept["campaign"]), ConfigCopy(Path(at) if at else None, kept["config"]["text"])
-            belongs += (_properties(kept.get("properties")),)
             if kept["format"] < FORMAT:  # of an earlier version: every step is out of date
-                return cls(*belongs)
-            return cls(
-                *belongs,
-                {name: Fingerprint(*mark) for name, mark in kept["inputs"].items()},
-                dict(kept.get("own_effects", {})),
-                {name: _inside(Done(**done)) for name, done in kept["steps"].items()},
-                _moving(kept.get("moving") if kept["steps"] else None),
-            )
+                kept = {name: kept.get(name) for name in ("campaign", "config", "properties")}
+            state = _STATE.validate_python(kept)
+            return state if state.steps else replace(state, moving=None)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
@@ -352,38 +358,7 @@ class State:
             ) from error
 
 
-def _properties(kept: dict | None) -> Properties | None:
-    """Return what is asked of a table of properties; ValueError if the table is not a file name."""
-    if kept is None:
-        return None
-    if PurePath(kept["table"]).name != kept["table"]:
-        raise ValueError(f"{kept['table']} is no file name")
-    return Properties(kept["table"], tuple(kept["names"]), kept["batch"])
-
-
-def _moving(kept: dict | None) -> Moving | None:
-    """Return what is being moved; ValueError unless it is moved from a staging folder of OUT."""
-    if kept is None:
-        return None
-    folder = kept["folder"]
-    if not folder.startswith(STAGING) or PurePath(folder).name != folder:
-        raise ValueError(f"{folder} is no staging folder")
-    return Moving(folder, tuple(map(_file_of_out, kept["left_over"])))
-
-
-def _inside(done: Done) -> Done:
-    """Return `done`; ValueError if it names a file that no step writes."""
-    for file in done.files:
-        _file_of_out(file)
-    return done
-
-
-def _file_of_out(file: str) -> str:
-    """Return `file`; ValueError if it is not in OUT or a folder of it: these files are read and removed."""
-    parts = PurePath(file).parts
-    if PurePath(file).is_absolute() or ".." in parts or len(parts) > 2:
-        raise ValueError(f"{file} lies outside")
-    return file
+_STATE = TypeAdapter(State)
 
 
 def to_json(document: object, *, indent: int | None = 1) -> str:

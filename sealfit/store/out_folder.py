@@ -107,8 +107,8 @@ class Store:
             )
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
-        hashes = effects_seen(effects, state.effects, state.config, config)
-        now = replace(state, config=config, effects=hashes)
+        hashes = effects_seen(effects, state.own_effects, state.config, config)
+        now = replace(state, config=config, own_effects=hashes)
         store = cls(out, now, known=True, kept=state, effects=effects)
         store._opened = opened
         return store
@@ -160,7 +160,7 @@ class Store:
         table = properties.table if properties else None
         former = kept.properties.table if kept and kept.properties else None
         if kept is None or (not kept.steps and (kept.campaign != campaign or former != table)):
-            state = State(campaign, source, properties, effects=hashes)
+            state = State(campaign, source, properties, own_effects=hashes)
             return cls(out, state, known=False, kept=kept, effects=effects)
         if former != table:
             what = f"the campaign {kept.campaign}" if former is None else f"the table {former}"
@@ -175,7 +175,7 @@ class Store:
                     fix="Choose another --out.",
                 )
         belongs = {"campaign": campaign, "config": source, "properties": properties}
-        state = replace(kept, **belongs, inputs=store_inputs, effects=hashes)
+        state = replace(kept, **belongs, inputs=store_inputs, own_effects=hashes)
         store = cls(out, state, known=True, kept=kept, effects=effects)
         if moved:
             store.warnings.append(
@@ -193,7 +193,7 @@ class Store:
         if same:
             self.state = replace(self.state, inputs=known | same)
         source = self.state.config if _same_config(kept.config, self.state.config) else kept.config
-        tidy = replace(self.state, config=source, effects=kept.effects)
+        tidy = replace(self.state, config=source, own_effects=kept.own_effects)
         if tidy != kept:
             staged = Staged(self.out, self.config.units, "state")
             try:
@@ -206,7 +206,7 @@ class Store:
     @property
     def kept_effects(self) -> dict[str, str | None]:
         """Hashes of the user's own effects used for the results, by file name."""
-        return self._kept.effects if self._kept is not None else {}
+        return self._kept.own_effects if self._kept is not None else {}
 
     # ------------------------------------------------------------ current or stale
     def why_stale(self, step: str) -> str:
@@ -226,7 +226,7 @@ class Store:
         return ""
 
     def _step_keys(self, inputs: Mapping[str, Fingerprint]) -> dict[str, str]:
-        return step_keys(inputs, self.config, self.state.effects, self.state.properties)
+        return step_keys(inputs, self.config, self.state.own_effects, self.state.properties)
 
     def up_to(self, step: str) -> tuple[str, ...]:
         """Return the steps up to `step`, in order.
@@ -265,7 +265,7 @@ class Store:
             return f"inputs changed ({', '.join(changed[:3])}{more})"
         if self._kept is not None and self._kept.properties != self.state.properties:
             return "other columns are asked for"
-        own = what_differs(self.kept_effects, self.state.effects)
+        own = what_differs(self.kept_effects, self.state.own_effects)
         if own and step == "close-loop":
             return own
         return f"the config ({self.state.config.name}) changed"
@@ -279,14 +279,14 @@ class Store:
 
     def require_effects(self) -> None:
         """Raise RequestError if the loop needs the user's own effects and no folder of them is given."""
-        if self.effects is None and (self._names_effects or self.state.effects):
-            raise needed("the loop is closed with", self.state.effects)
+        if self.effects is None and (self._names_effects or self.state.own_effects):
+            raise needed("the loop is closed with", self.state.own_effects)
 
     def command(self, step: str) -> str:
         """Return the command line that does `step`."""
         out = shlex.quote(str(self.out))
         if step != self.state.order[0]:
-            own = self.effects or ("FOLDER" if self._names_effects or self.state.effects else None)
+            own = self.effects or ("FOLDER" if self._names_effects or self.state.own_effects else None)
             option = f" {OPTION} {shlex.quote(str(own))}" if own and step == "close-loop" else ""
             return f"sealfit {step} {out}{option}"
         config = f" --config {shlex.quote(str(self.state.config.path))}" if self.state.config.path else ""
