@@ -90,19 +90,15 @@ def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
     A place is a line, or a file. Faults are shared that differ in the file, the line, the value and in
     numbers of their reason only.
     """
-    faults = list(faults)
-    alike: dict[tuple, list[Fault]] = {}
-    for fault in faults:
-        alike.setdefault(_shared(fault), []).append(fault)
-    together = {key for key, group in alike.items() if len({(f.file, f.line) for f in group}) > EXAMPLES}
-    found: list[list[Fault]] = []
-    for fault in faults:
-        group = alike.get(key := _shared(fault), [])
-        if key not in together:
-            found.append([fault])
-        elif fault is group[0]:
-            found.append(group)
-    return found
+    alike: dict[tuple, list[tuple[int, Fault]]] = {}
+    for place, fault in enumerate(faults):
+        alike.setdefault(_shared(fault), []).append((place, fault))
+    found = []
+    for group in alike.values():
+        shared = len({(fault.file, fault.line) for _, fault in group}) > EXAMPLES
+        found += [group] if shared else [[one] for one in group]
+    found.sort(key=lambda group: group[0][0])
+    return [[fault for _, fault in group] for group in found]
 
 
 def told(group: Sequence[Fault]) -> str:
@@ -135,18 +131,13 @@ def examples(group: Sequence[Fault]) -> list[str]:
     several = len({fault.file for fault in group}) > 1
     for fault in group:
         places.setdefault(_file(fault) if several else (fault.file, fault.line), fault)
-    return [
-        ": ".join(
-            part
-            for part in (
-                f"{fault.file or ''}{'' if fault.line is None else f':{fault.line}'}",
-                "" if fault.value is None or not whole else shortened(repr(fault.value)),
-                "" if whole else fault.reason.rstrip("."),
-            )
-            if part
-        )
-        for fault in list(places.values())[:EXAMPLES]
-    ]
+    found = []
+    for fault in list(places.values())[:EXAMPLES]:
+        place = f"{fault.file or ''}{'' if fault.line is None else f':{fault.line}'}"
+        value = "" if fault.value is None else shortened(repr(fault.value))
+        said = value if whole else fault.reason.rstrip(".")
+        found.append(": ".join(part for part in (place, said) if part))
+    return found
 
 
 def one_reason(group: Sequence[Fault]) -> bool:
@@ -160,11 +151,9 @@ def _file(fault: Fault) -> tuple:
 
 def _shared(fault: Fault) -> tuple:
     """Return what the faults of a group have in common."""
-    words = tuple(
-        re.sub(r"\d[\d.,]*", "#", text.replace(fault.file, "") if fault.file else text)
-        for text in (fault.reason, fault.fix)
-    )
-    return (fault.check, fault.severity, fault.action, fault.column, fault.file in RUNS_TABLES, *words)
+    words = f"{fault.reason}\0{fault.fix}"
+    words = re.sub(r"\d[\d.,]*", "#", words.replace(fault.file, "") if fault.file else words)
+    return (fault.check, fault.severity, fault.action, fault.column, fault.file in RUNS_TABLES, words)
 
 
 # ---------------------------------------------------------------- the nearest
@@ -198,15 +187,12 @@ def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
     except OSError:
         return ""
     likely = nearest((missing or path.absolute()).name, there)
-    return (
-        f"Did you mean {quoted(path.parent / likely if missing is None else parent / likely)}?"
-        if likely
-        else ""
-    )
+    meant = parent / likely if missing else path.parent / likely
+    return f"Did you mean {quoted(meant)}?" if likely else ""
 
 
-def quoted(path: Path) -> str:
-    """Return a path as a shell reads it."""
+def quoted(path: Path | str) -> str:
+    """Return a path or a name as a shell reads it."""
     return shlex.quote(str(path))
 
 
@@ -215,6 +201,8 @@ def quoted(path: Path) -> str:
 
 class SealfitError(Exception):
     """Something the user can fix: one line on stderr, exit code 1."""
+
+    faults: tuple[Fault, ...] = ()  # of a campaign or a file
 
     def __init__(
         self,
@@ -238,7 +226,9 @@ class SealfitError(Exception):
         return [f"{type(self).__name__}: {self}"]
 
     def as_dicts(self) -> list[dict]:
-        """Return `[{file, line, column, value, fix, reason}]`, the `errors` of `--json`."""
+        """Return `[{file, line, column, value, fix, reason}]`, the `errors` of `--json`, one per fault."""
+        if self.faults:
+            return [fault.as_dict() for fault in self.faults]
         place = {"file": self.file, "line": self.line, "column": self.column, "value": None}
         return [{**place, "fix": self.fix, "reason": self.message}]
 
@@ -253,10 +243,6 @@ class CampaignError(SealfitError):
     def __reduce__(self):
         return type(self), (self.faults,)  # so that it comes back whole from a worker process
 
-    def as_dicts(self) -> list[dict]:
-        """Return one dict per fault."""
-        return [fault.as_dict() for fault in self.faults]
-
 
 class BadFile(SealfitError):
     """A trace file that is left out; the run goes on without it. `faults` says why, the deciding one last."""
@@ -269,10 +255,6 @@ class BadFile(SealfitError):
     def fault(self) -> Fault:
         """The fault that decided."""
         return self.faults[-1]
-
-    def as_dicts(self) -> list[dict]:
-        """Return one dict per fault."""
-        return [fault.as_dict() for fault in self.faults]
 
 
 class ConfigError(SealfitError):
@@ -324,9 +306,8 @@ def memory_ran_out(error: BaseException) -> bool:
     """
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
-    if isinstance(error, ImportError | OSError | RuntimeError) and any(
-        sign in str(error) for sign in _NO_MEMORY
-    ):
+    said_by_library = isinstance(error, ImportError | OSError | RuntimeError)
+    if said_by_library and any(sign in str(error) for sign in _NO_MEMORY):
         return True
     before = error.__cause__ or error.__context__
     return before is not None and memory_ran_out(before)

@@ -12,7 +12,15 @@ from sealfit.engine import claim_memory
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.progress import Silent, timed
-from sealfit.store.manifest import BATCH, STEPS, ConfigCopy, Properties, fingerprint, glob_names
+from sealfit.store.manifest import (
+    BATCH,
+    STEPS,
+    ConfigCopy,
+    Properties,
+    fingerprint,
+    glob_names,
+    provenance,
+)
 from sealfit.store.out_folder import Store
 from sealfit.store.paths import (
     campaign_folder,
@@ -54,8 +62,6 @@ FAULTY = ("warning", "error")  # severities that count as a fault
 
 Counted = tuple[int, str]
 """How many rows a step worked on, and what they are."""
-
-Work = Callable[[Store, Staged, int, Silent], Counted]
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +191,6 @@ def _do_steps(store: Store, steps: tuple[str, ...], options: Options, progress: 
     claim_memory()
     for warning in store.warnings:
         progress.warn(warning)
-    store.anew = options.force
     done = []
     for step in steps:
         why = store.why_stale(step)
@@ -193,7 +198,7 @@ def _do_steps(store: Store, steps: tuple[str, ...], options: Options, progress: 
             if why and step in store.state.steps:
                 progress.say(why)
             with timed(step) as part, store.step(step) as staged, progress.working(step):
-                part.rows, part.of = _WORK[step](store, staged, options.workers, progress)
+                part.rows, part.of = _WORK[step](store, staged, options, progress)
             done.append(step)
         else:
             progress.say(f"{step}: current, not redone")
@@ -216,16 +221,19 @@ def faults_of(quality: pd.DataFrame) -> list[Fault]:
 # Each returns how many rows of what it saw.
 
 
-def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+def _ingest(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
     with timed("loading libraries"):
         from sealfit.ingest.campaign import Place, ingest_campaign
+        from sealfit.ingest.stored_parts import known_parts
 
     campaign, config = store.state.campaign, store.seen_config("ingest")
     # As they were when the reading began.
     runs_before = {name: fingerprint(campaign / name) for name in possible_tables(config)}
-    place = Place(staged.folder(), store.parts(), store.marks)
+    done = store.state.steps.get("ingest")
+    known = known_parts(store.out, done.files) if done and not options.force else {}
+    place = Place(staged.folder(), known, store.marks)
     with progress.counting("reading trace files") as on_file:
-        ingested = ingest_campaign(campaign, config, workers=workers, on_file=on_file, place=place)
+        ingested = ingest_campaign(campaign, config, workers=options.workers, on_file=on_file, place=place)
     progress.faults(ingested.faults)
     with timed("writing tables"):
         for name, table in ingested.tables.items():
@@ -239,7 +247,7 @@ def _ingest(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
     return int(ingested.tables["inputs"]["rows"].sum()), "samples"
 
 
-def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+def _fit_steady(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
     from sealfit.fit.steady.fit import fit_conditions
 
     steady = store.read("steady")
@@ -248,11 +256,12 @@ def _fit_steady(store: Store, staged: Staged, workers: int, progress: Silent) ->
     return len(steady), "strokes"
 
 
-def _fit_properties(store: Store, staged: Staged, asked: Properties, progress: Silent) -> Counted:
+def _fit_properties(store: Store, staged: Staged, progress: Silent) -> Counted:
     from sealfit.fit.aging.property import fit_properties
     from sealfit.ingest.property_table import read_properties
 
-    path, config = store.state.campaign / asked.table, store.seen_config("fit-aging")
+    asked, config = store.state.properties, store.seen_config("fit-aging")
+    path = store.state.campaign / asked.table
     staged.inputs = {asked.table: fingerprint(path)}  # as it was when the reading began
     specimens, faults = read_properties(path, config, asked.names, asked.batch)
     progress.faults(faults)
@@ -261,18 +270,16 @@ def _fit_properties(store: Store, staged: Staged, asked: Properties, progress: S
     return len(specimens), "values"
 
 
-def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+def _fit_aging(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
     if store.state.properties is not None:
-        return _fit_properties(store, staged, store.state.properties, progress)
+        return _fit_properties(store, staged, progress)
     from sealfit.fit.aging.all_series import joint_laws
     from sealfit.fit.aging.series import aging_curves, fit_series
     from sealfit.fit.stored_tables import whole_steady_fit
 
     config = store.seen_config("fit-aging")
-    if config.aging:
-        progress.say("fitting the aging law")
-    else:
-        progress.say("no aging_days in the condition: there is no aging law to fit")
+    no_law = "no aging_days in the condition: there is no aging law to fit"
+    progress.say("fitting the aging law" if config.aging else no_law)
     steady_fit = whole_steady_fit(store.read)
     fitted = fit_series(steady_fit, config)
     laws, curve = joint_laws(store.read("steady"), steady_fit, config)
@@ -281,30 +288,30 @@ def _fit_aging(store: Store, staged: Staged, workers: int, progress: Silent) -> 
     return int(steady_fit["condition"].nunique()), "conditions"
 
 
-def _fit_dynamic(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+def _fit_dynamic(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
     from sealfit.fit.dynamic.fit import fit_dynamic
     from sealfit.fit.stored_tables import whole_steady_fit
 
     progress.say("fitting the pre-sliding part")
     tables, config = (store.read("steady"), whole_steady_fit(store.read)), store.seen_config("fit-dynamic")
-    found = fit_dynamic(store.traces(), *tables, config, workers=workers)
+    found = fit_dynamic(store.traces(), *tables, config, workers=options.workers)
     staged.table("dynamic_fit", found.fit)
     staged.table("dynamic_curves", found.curves)
     return len(tables[0]), "strokes"
 
 
-def _close_loop(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+def _close_loop(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
     from sealfit.closure.after import after_fits
     from sealfit.closure.loop import close_loop
 
     store.require_effects()
     config = store.seen_config("close-loop")
     closure = close_loop(
-        store.read("bins"), store.traces(), config, workers=workers, on_progress=progress.say
+        store.read("bins"), store.traces(), config, workers=options.workers, on_progress=progress.say
     )
     if closure.tables["effects"].size:
         progress.say("the fits with the effects taken out")
-    after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=workers)
+    after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=options.workers)
     with timed("writing tables"):
         _write(staged, {**closure.tables, **after})
     started = store.read("runs", ["started_at"])["started_at"].dropna()
@@ -329,7 +336,7 @@ def _instant(text: str) -> datetime:
     return time if time.tzinfo else time.replace(tzinfo=UTC)
 
 
-def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Counted:
+def _report(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
     from sealfit.report.page import build_report
 
     progress.say("drawing the report")
@@ -337,7 +344,7 @@ def _report(store: Store, staged: Staged, workers: int, progress: Silent) -> Cou
         tables = report_tables(store)
     with timed("page"):
         closure = store.read_json("closure") if store.state.properties is None else None
-        report = build_report(tables, closure, store.provenance(), store.seen_config("report"))
+        report = build_report(tables, closure, provenance(store.state), store.seen_config("report"))
     with timed("writing plots", rows=len(report.figures), of="plots"):
         for name, figure in report.figures.items():
             staged.figure(name, figure)
@@ -365,7 +372,7 @@ def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
     return traces.sort_values("run_id", key=lambda names: names.map(chosen.index), kind="stable")
 
 
-_WORK: dict[str, Work] = {
+_WORK: dict[str, Callable[[Store, Staged, Options, Silent], Counted]] = {
     "ingest": _ingest,
     "fit-steady": _fit_steady,
     "fit-aging": _fit_aging,

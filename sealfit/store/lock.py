@@ -97,24 +97,17 @@ def _take(path: Path, option: str) -> int:
                 path.unlink()
             handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         except OSError as error:
-            raise OutError(
-                f"cannot be written ({error.strerror}).",
-                file=path.parent,
-                fix=f"Choose another {option}, or fix its rights.",
-            ) from error
+            fix = f"Choose another {option}, or fix its rights."
+            raise OutError(f"cannot be written ({error.strerror}).", file=path.parent, fix=fix) from error
         try:
             locked = _locked(handle)
-            if locked is not False and _same_file(handle, path):
-                _refuse_live_owner(handle, path, option, known=locked is None)
+            if _same_file(handle, path):  # otherwise its owner has just removed it: try again
+                _refuse_owner(handle, path, option, locked)
                 return handle
         except BaseException:
             os.close(handle)
             raise
-        busy = _owner(handle)
-        gone = not _same_file(handle, path)
         os.close(handle)
-        if not gone:  # otherwise its owner has just removed it: try again
-            raise _busy(path, busy, option)
 
 
 def _locked(handle: int) -> bool | None:
@@ -145,12 +138,18 @@ def _owner(handle: int) -> dict:
     return owner if isinstance(owner, dict) else {}
 
 
-def _refuse_live_owner(handle: int, path: Path, option: str, *, known: bool) -> None:
-    """Raise OutError if the file names another host or, if only the name is `known`, a process that runs."""
+def _refuse_owner(handle: int, path: Path, option: str, locked: bool | None) -> None:
+    """Raise OutError if another process holds the file, or may hold it.
+
+    It holds the file if this one could not lock it. If it runs on another host, or if there are no locks, its
+    name in the file has to do.
+    """
     owner = _owner(handle)
+    if locked is False:
+        raise _busy(path, owner, option)
     if owner and owner.get("host") != socket.gethostname():
         raise _busy(path, owner, option, f" If no sealfit runs on that host any more, delete {path}.")
-    if known and _runs(owner.get("pid")):
+    if locked is None and _runs(owner.get("pid")):
         raise _busy(path, owner, option, f" If that process is no sealfit, delete {path}.")
 
 
@@ -168,11 +167,8 @@ def _runs(pid: object) -> bool:
 
 def _busy(path: Path, owner: dict, option: str, more: str = "") -> OutError:
     host, pid = owner.get("host", "an unknown host"), owner.get("pid", "unknown")
-    return OutError(
-        f"another sealfit (host {host}, process {pid}) is writing here.",
-        file=path.parent,
-        fix=f"Wait for it to end, or choose another {option}.{more}",
-    )
+    what = f"another sealfit (host {host}, process {pid}) is writing here."
+    return OutError(what, file=path.parent, fix=f"Wait for it to end, or choose another {option}.{more}")
 
 
 def _sign(handle: int, path: Path) -> None:
@@ -182,9 +178,8 @@ def _sign(handle: int, path: Path) -> None:
         os.pwrite(handle, owner, 0)
         os.fsync(handle)
     except OSError as error:
-        raise OutError(
-            f"cannot be written ({error.strerror}).", file=path.parent, fix="Free some space."
-        ) from error
+        what = f"cannot be written ({error.strerror})."
+        raise OutError(what, file=path.parent, fix="Free some space.") from error
 
 
 # ---------------------------------------------------------------- own folder
@@ -227,11 +222,8 @@ def _make(out: Path) -> bool:
     if out.is_dir():
         strangers = [p.name for p in out.iterdir() if p.name != LOCK and not p.name.startswith(STAGING)]
         if strangers and STATE not in strangers:
-            raise OutError(
-                f"is not empty (it holds {sorted(strangers)[0]}) and was not made by sealfit.",
-                file=out,
-                fix="Choose another --out.",
-            )
+            what = f"is not empty (it holds {min(strangers)}) and was not made by sealfit."
+            raise OutError(what, file=out, fix="Choose another --out.")
         refuse_links(out)
         return False
     missing = [folder for folder in (out, *out.absolute().parents) if not folder.exists()]

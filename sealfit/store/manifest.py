@@ -351,11 +351,8 @@ class State:
         except OSError as error:
             raise OutError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise OutError(
-                "is not a state that this version of sealfit can read.",
-                file=path,
-                fix="Choose another --out.",
-            ) from error
+            what = "is not a state that this version of sealfit can read."
+            raise OutError(what, file=path, fix="Choose another --out.") from error
 
 
 _STATE = TypeAdapter(State)

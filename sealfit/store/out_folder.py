@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
-import shlex
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from sealfit import __version__
 from sealfit.config import Config, Files
-from sealfit.errors import ConfigError, OutError, RequestError, StaleError
+from sealfit.errors import ConfigError, OutError, RequestError, StaleError, quoted
 from sealfit.store.lock import held, undisturbed
 from sealfit.store.manifest import (
     BATCH,
@@ -72,7 +72,6 @@ class Store:
         self._checksums: dict[str, str | None] = {}  # of files that this process has read
         self._keys: dict[str, str] | None = None  # of every step for the present campaign
         self._opened: tuple | None = None  # status of state.json when it was opened for reading
-        self.anew = False  # whether stored results are to be recomputed
         self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
         if state.campaign.is_dir():
             files = self.config.files if state.properties is None else Files()
@@ -102,9 +101,8 @@ class Store:
                 return cls.open(out, effects)
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
-            raise OutError(
-                what, file=out, fix=f"Make them with: sealfit run CAMPAIGN --out {shlex.quote(str(out))}"
-            )
+            fix = f"Make them with: sealfit run CAMPAIGN --out {quoted(out)}"
+            raise OutError(what, file=out, fix=fix)
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
         hashes = effects_seen(effects, state.own_effects, state.config, config)
@@ -165,17 +163,13 @@ class Store:
         if former != table:
             what = f"the campaign {kept.campaign}" if former is None else f"the table {former}"
             raise OutError(f"holds the results of {what}.", file=out, fix="Choose another --out.")
-        store_inputs, moved = kept.inputs, kept.campaign != campaign
+        inputs, moved = kept.inputs, kept.campaign != campaign
         if moved:
-            store_inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
-            if any(mark.sha256 != kept.inputs[name].sha256 for name, mark in store_inputs.items()):
-                raise OutError(
-                    f"belongs to the campaign {kept.campaign}, and {campaign} holds other data.",
-                    file=out,
-                    fix="Choose another --out.",
-                )
-        belongs = {"campaign": campaign, "config": source, "properties": properties}
-        state = replace(kept, **belongs, inputs=store_inputs, own_effects=hashes)
+            inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
+            if any(mark.sha256 != kept.inputs[name].sha256 for name, mark in inputs.items()):
+                what = f"belongs to the campaign {kept.campaign}, and {campaign} holds other data."
+                raise OutError(what, file=out, fix="Choose another --out.")
+        state = State(campaign, source, properties, inputs, hashes, kept.steps)
         store = cls(out, state, known=True, kept=kept, effects=effects)
         if moved:
             store.warnings.append(
@@ -189,7 +183,7 @@ class Store:
         if kept is None:
             return
         known = self.state.inputs
-        same = {n: mark for n, mark in self._changed.items() if n in known and mark.sha256 == known[n].sha256}
+        same = {n: mark for n, mark in self._changed.items() if _same_content(mark, known.get(n))}
         if same:
             self.state = replace(self.state, inputs=known | same)
         source = self.state.config if _same_config(kept.config, self.state.config) else kept.config
@@ -213,12 +207,11 @@ class Store:
         """Return the reason why `step` is out of date, or "" if it is current."""
         if self._keys is None:
             self._keys = self._step_keys(self.marks)
-        keys = self._keys
         for name in self.up_to(step):
             done = self.state.steps.get(name)
             if done is None:
                 return f"{name} has not been done"
-            if done.key != keys[name]:
+            if done.key != self._keys[name]:
                 return f"{name} is stale: {self._what_changed(name, done)}"
             for file, size in done.files.items():
                 if file_size(f"{self.out}/{file}") != size or self._damaged(file, done):
@@ -238,11 +231,9 @@ class Store:
         """
         order = self.state.order
         if step not in order:
-            raise RequestError(
-                f"{self.out} holds the aging laws of {self.state.properties.table}, which has no traces: "
-                f"there is no {step}.",
-                fix=f"Its steps are {' and '.join(order)}; sealfit lifetime asks its laws.",
-            )
+            laws = f"the aging laws of {self.state.properties.table}, which has no traces"
+            fix = f"Its steps are {' and '.join(order)}; sealfit lifetime asks its laws."
+            raise RequestError(f"{self.out} holds {laws}: there is no {step}.", fix=fix)
         return order[: order.index(step) + 1]
 
     def _damaged(self, file: str, done: Done) -> bool:
@@ -257,9 +248,7 @@ class Store:
         if done.version != __version__:
             return f"it was made by sealfit {done.version}, this is {__version__}"
         known = self.state.inputs
-        changed = sorted(
-            n for n, mark in self._changed.items() if n not in known or mark.sha256 != known[n].sha256
-        )
+        changed = sorted(n for n, mark in self._changed.items() if not _same_content(mark, known.get(n)))
         if changed:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             return f"inputs changed ({', '.join(changed[:3])}{more})"
@@ -284,18 +273,18 @@ class Store:
 
     def command(self, step: str) -> str:
         """Return the command line that does `step`."""
-        out = shlex.quote(str(self.out))
+        out = quoted(self.out)
         if step != self.state.order[0]:
             own = self.effects or ("FOLDER" if self._names_effects or self.state.own_effects else None)
-            option = f" {OPTION} {shlex.quote(str(own))}" if own and step == "close-loop" else ""
+            option = f" {OPTION} {quoted(own)}" if own and step == "close-loop" else ""
             return f"sealfit {step} {out}{option}"
-        config = f" --config {shlex.quote(str(self.state.config.path))}" if self.state.config.path else ""
+        config = f" --config {quoted(self.state.config.path)}" if self.state.config.path else ""
         if (asked := self.state.properties) is not None:
-            names = "".join(f" --property {shlex.quote(name)}" for name in asked.names)
-            batch = f" --batch {shlex.quote(asked.batch)}" if asked.batch != BATCH else ""
-            table = shlex.quote(str(self.state.campaign / asked.table))
+            names = "".join(f" --property {quoted(name)}" for name in asked.names)
+            batch = f" --batch {quoted(asked.batch)}" if asked.batch != BATCH else ""
+            table = quoted(self.state.campaign / asked.table)
             return f"sealfit fit-aging --values {table} --out {out}{config}{names}{batch}"
-        return f"sealfit ingest {shlex.quote(str(self.state.campaign))} --out {out}{config}"
+        return f"sealfit ingest {quoted(self.state.campaign)} --out {out}{config}"
 
     # ------------------------------------------------------------ reading
     def read(self, table: str, columns: list[str] | None = None, **which: object) -> pd.DataFrame:
@@ -332,8 +321,6 @@ class Store:
 
     def read_json(self, name: str) -> dict:
         """Return `<name>.json`."""
-        import json
-
         try:
             return json.loads((self.out / f"{name}.json").read_text("utf-8"))
         finally:
@@ -342,10 +329,6 @@ class Store:
     def seen_config(self, step: str) -> Config:
         """Return the config as `step` uses it."""
         return seen_config(step, self.config)
-
-    def provenance(self) -> dict:
-        """Return the provenance of the results."""
-        return provenance(self.state)
 
     # ------------------------------------------------------------ writing
     @contextlib.contextmanager
@@ -374,16 +357,10 @@ class Store:
 
     def _commit(self, name: str, staged: Staged, seconds: float) -> None:
         inputs = self.state.inputs if staged.inputs is None else staged.inputs
-        files = dict(staged.files)
-        done = Done(
-            self._step_keys(inputs)[name],
-            __version__,
-            datetime.now(UTC).isoformat(timespec="seconds"),
-            round(seconds, 3),
-            files,
-            dict(staged.checksums),
-        )
-        steps = self.state.steps
+        # Copied, as the files below are those of no step.
+        files, checksums, steps = dict(staged.files), dict(staged.checksums), self.state.steps
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        done = Done(self._step_keys(inputs)[name], __version__, now, round(seconds, 3), files, checksums)
         earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
         ended = replace(self.state, inputs=inputs, steps={**earlier, name: done})
         old = steps[name].files if name in steps else {}
@@ -410,21 +387,8 @@ class Store:
         In the folder of a table nothing else may lie, whoever left it there: readers take all of it.
         """
         folders = {file.split("/")[0] for file in files if "/" in file and not file.startswith("plots/")}
-        lying = {
-            f"{folder}/{path.name}"
-            for folder in folders
-            if (self.out / folder).is_dir()
-            for path in (self.out / folder).iterdir()
-        }
+        lying = {f"{folder}/{path.name}" for folder in folders for path in (self.out / folder).glob("*")}
         return (old.keys() | lying) - files.keys()
-
-    # ------------------------------------------------------------ parts of a table
-    def parts(self) -> dict[str, Path]:
-        """Return the stored parts of the campaign that may be taken as they are, by their keys."""
-        from sealfit.ingest.stored_parts import known_parts
-
-        done = self.state.steps.get("ingest")
-        return known_parts(self.out, done.files) if done and not self.anew else {}
 
 
 def _status_of(out: Path) -> tuple | None:
@@ -434,6 +398,10 @@ def _status_of(out: Path) -> tuple | None:
     except OSError:
         return None
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def _same_content(mark: Fingerprint, known: Fingerprint | None) -> bool:
+    return known is not None and mark.sha256 == known.sha256
 
 
 def _same_config(kept: ConfigCopy, config: ConfigCopy) -> bool:

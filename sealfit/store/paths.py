@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sealfit.config import Config
-from sealfit.errors import CampaignError, ConfigError, Fault, RequestError, did_you_mean, quoted
+from sealfit.errors import RUNS_TABLES, CampaignError, ConfigError, Fault, RequestError, did_you_mean, quoted
 from sealfit.store.manifest import STATE, ConfigCopy, fingerprint
 
 # ---------------------------------------------------------------- places
 # The folders and files named on the command line; a missing one is refused with the closest existing name.
 
 RUNS = "runs.csv"
-RUNS_TABLES = (RUNS, "runs.xlsx", "runs.parquet")
 
 
 def possible_tables(config: Config) -> tuple[str, ...]:
@@ -38,20 +37,17 @@ def campaign_folder(path: Path, config: Config) -> Path:
         likeliest.
     """
     if path.is_file():
-        fix = (
-            f"Give its folder: {quoted(path.parent)}"
-            if path.name in RUNS_TABLES
-            else f"Give the folder that holds {RUNS}."
-        )
+        fix = f"Give the folder that holds {RUNS}."
+        if path.name in RUNS_TABLES:
+            fix = f"Give its folder: {quoted(path.parent)}"
         raise CampaignError([Fault("campaign_folder", f"{path} is a file, not a campaign folder.", fix=fix)])
     if not path.is_dir():
         raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=did_you_mean(path))])
     if config.files.glob is None and config.files.runs_table is None and not runs_tables(path, config):
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
-        fix = (
-            "It lists the trace files; or set files.glob in a config (--config). "
-            f"Files here: {_some_files(path)}"
-        )
+        names = sorted(child.name + ("/" if child.is_dir() else "") for child in path.iterdir())
+        shown = ", ".join(names[:5] or ["none"]) + (", ..." if len(names) > 5 else ".")
+        fix = f"It lists the trace files; or set files.glob in a config (--config). Files here: {shown}"
         if below:
             fix = "Did you mean " + " or ".join(quoted(folder) for folder in below[:3]) + "?"
         raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, fix=fix)])
@@ -81,13 +77,6 @@ def existing_file(path: Path, what: str) -> Path:
     if path.is_dir():
         raise RequestError(f"{path} is a folder, not a {what}.", fix="Give the file itself.")
     raise RequestError(f"there is no {what} {path}.", fix=did_you_mean(path, Path.is_file))
-
-
-def _some_files(folder: Path) -> str:
-    names = sorted(child.name + ("/" if child.is_dir() else "") for child in folder.iterdir())
-    if not names:
-        return "none."
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else ".")
 
 
 # ---------------------------------------------------------------- own effects
