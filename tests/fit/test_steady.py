@@ -386,3 +386,22 @@ def test_likelier_weights_by_hand():
 def test_units_of_parameters_are_those_of_their_numbers(speed, load, mu, sigma_2):
     units = parameter_units(Units({"speed": ("speed", speed), "load": ("load", load)}), has_load=True)
     assert (units["mu_s"], units["sigma_2"]) == (mu, sigma_2)
+
+
+@pytest.mark.parametrize("speeds, setup", [((1, 5, 25), 0.0), ((1, 5, 25), 0.01), ((0.5, 3), 0.0)])
+def test_few_speeds_give_the_mean_over_them_and_intervals_that_cover(campaign, speeds, setup):
+    """Too few speeds for a Stribeck curve: its fall, the same every day, is no scatter between runs."""
+    law = {"mu_0": 0.9, "a": 0.05, "b": 0.3}
+    lower = {**law, "mu_0": 0.63, "a": 0.035}
+    kw = {"speeds": speeds, "days": (0, 1, 4, 16), "ways": (1,), "laws": {(60.0, 80.0): (law, lower)}}
+    exact = campaign(noise=1e-9, repeats=1, **kw).assign(mu=lambda t: t.force_N / 49.03)
+    truth = exact.groupby("condition").mu.mean()
+    hits, widths = [], []
+    for seed in range(40):
+        fits = fit_conditions(campaign(seed=seed, noise=0.004, setup=setup, repeats=2, **kw), Config())
+        for condition, value in truth.items():
+            row = steady(fits, "mu_c", condition)
+            hits.append(row.lo95 <= value <= row.hi95)
+            widths.append((row.hi95 - row.lo95) / value)
+    assert np.mean(hits) > 0.9
+    assert np.median(widths) < 0.04

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from sealfit.fit.joint.declared import speed_clusters
 from sealfit.fit.least_squares import project
 from sealfit.fit.steady.stribeck import (
     NAMES,
@@ -51,9 +52,15 @@ class Condition:
 
     @cached_property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """|v|, N (1 without load), F sgn v and weight of each run, shape (n,)."""
+        """|v|, N (1 without load), F sgn v and weight of each run, shape (n,).
+
+        With too few speeds for a Stribeck curve the weights are equal, so that the coefficient is the mean
+        over these speeds whatever their scatter; the mean has the variance that it has with these weights.
+        """
         load = self.runs["load"].to_numpy(float) if self.has_load else np.ones(len(self.runs))
         speed, force, weight = (self.runs[name].to_numpy(float) for name in ("speed", "force", "weight"))
+        if self.few_speeds:
+            weight = np.full(len(weight), 1 / np.mean(1 / weight))
         return speed, load, force, weight
 
     @property
@@ -109,6 +116,18 @@ class Condition:
             return 0.0
         return float(half) if abs(half) > 4 * error else 0.0
 
+    @property
+    def few_speeds(self) -> bool:
+        """Whether the speeds are too few for a Stribeck curve."""
+        return max(len(values) for values in self.levels.values()) < FULL
+
+    def run_levels(self) -> np.ndarray:
+        """Direction and speed level of every run, shape (n, 2)."""
+        direction, speed = self.runs["direction"].to_numpy(int), self.arrays[0]
+        levels = [self.levels.get(way, self.levels[max(self.levels)]) for way in direction]
+        nearest = [own[np.argmin(np.abs(np.log(own / v)))] for own, v in zip(levels, speed, strict=True)]
+        return np.column_stack([direction, nearest])
+
     def columns(self) -> np.ndarray:
         """Columns of the model without Stribeck curve, shape (n, p)."""
         speed, load, _, _ = self.arrays
@@ -124,6 +143,39 @@ def make_condition(name: str, runs: pd.DataFrame) -> Condition:
     most = max(len(values) for values in levels.values())
     model = FULL if most >= FULL else VISCOUS if most >= VISCOUS else CONSTANT
     return Condition(str(name), kept.reset_index(drop=True), levels, has_load, len(runs) - len(kept), model)
+
+
+def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray]:
+    """Return chi-square of the run means of every condition and its degrees of freedom, each (conditions,).
+
+    Conditions with too few speeds for a Stribeck curve still show how the force changes from speed to speed,
+    which is no scatter between runs. Where several have the same speeds, the model of each is multiplied by
+    one factor per speed and direction, which is common to all of them.
+    """
+    chi2, df = (np.array([getattr(c, name) for c in conditions], float) for name in ("chi2", "df"))
+    few = [k for k, c in enumerate(conditions) if c.model == VISCOUS and c.few_speeds]
+    if not few:
+        return chi2, df
+    cells = {k: conditions[k].run_levels() for k in few}
+    slowest = [part[0] for part in speed_clusters(np.unique(np.concatenate(list(cells.values()))[:, 1]))]
+    groups: dict[frozenset, list[int]] = {}
+    for k, cell in cells.items():
+        cell[:, 1] = np.searchsorted(slowest, cell[:, 1], side="right")
+        groups.setdefault(frozenset(map(tuple, cell)), []).append(k)
+    for same, group in groups.items():
+        own = [conditions[k] for k in group]
+        free = np.array([len(c.runs) - np.count_nonzero(c.values) for c in own], float)
+        spare = free.sum() - (len(same) - 1)
+        if spare <= 0:
+            continue
+        model = np.concatenate([c.model_force() for c in own])
+        force, weight = (np.concatenate([c.arrays[k] for c in own]) for k in (2, 3))
+        _, cell = np.unique(np.concatenate([cells[k] for k in group]), axis=0, return_inverse=True)
+        factor = np.bincount(cell, weight * model * force) / np.bincount(cell, weight * model**2)
+        left = weight * (force - factor[cell] * model) ** 2
+        chi2[group] = np.bincount(np.repeat(np.arange(len(own)), [len(c.runs) for c in own]), left)
+        df[group] = free * spare / free.sum()
+    return chi2, df
 
 
 def stacked(conditions: list[Condition]) -> tuple[np.ndarray, ...]:
@@ -221,10 +273,10 @@ def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
         lone = "one speed only in each direction: these runs determine the sliding coefficient at that speed."
         verdict |= {name: (False, lone) for name in ("mu_s", "v_s", "sigma_2")}
         verdict["mu_c"] = (True, "the sliding coefficient at the one speed tested, sigma_2 v included.")
-    elif condition.model == VISCOUS and most < FULL:
+    elif condition.model == VISCOUS and condition.few_speeds:
         few = f"{most} speeds in one direction: the Stribeck curve needs four, two of them below about 2 v_s."
         verdict |= {name: (False, few) for name in ("mu_s", "v_s")}
-        verdict["mu_c"] = (True, "the sliding coefficient over these speeds, without Stribeck curve.")
+        verdict["mu_c"] = (True, "the mean coefficient over these speeds, which are too few for a Stribeck curve.")
     elif condition.model == VISCOUS:
         flat = f"mu_s = mu_c is not rejected (p = {condition.flat_p:.2g}): no Stribeck curve is seen"
         verdict |= {

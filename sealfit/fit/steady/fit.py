@@ -12,7 +12,16 @@ from scipy.special import stdtrit
 from sealfit.config import Config
 from sealfit.effects.contract import fill_unit
 from sealfit.fit.joint.rows import merge_directions
-from sealfit.fit.steady.condition import FULL, Condition, bound, drop_flat_curve, judge, make_condition, solve
+from sealfit.fit.steady.condition import (
+    FULL,
+    Condition,
+    bound,
+    drop_flat_curve,
+    judge,
+    make_condition,
+    scatter_of_runs,
+    solve,
+)
 from sealfit.fit.steady.stribeck import NAMES, linearised
 from sealfit.fit.steady.uncertainty import (
     UnitVariance,
@@ -142,7 +151,7 @@ def _more_likely_weights(even: list[Condition]) -> list[Condition]:
 
 
 def _unit_variance(conditions: list[Condition], scatter: Scatter) -> UnitVariance:
-    return unit_variance([c.chi2 for c in conditions], [c.df for c in conditions], scatter.df)
+    return unit_variance(*scatter_of_runs(conditions), scatter.df)
 
 
 def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
