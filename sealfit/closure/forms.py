@@ -68,13 +68,14 @@ def terms_of(
 def room_along(channel: Channel, fitted: Fitted) -> int:
     """Return how many parameters of an effect a channel's settings determine beside the declared model's.
 
-    Eq. 14 has up to four parameters along speed and Eq. 15 three along days; along other channels there is a
-    constant.
+    Eq. 14 has up to four parameters along speed, one less where sigma_2 is at its limit, and Eq. 15 three
+    along days; along other channels there is a constant.
     """
     declared = fitted.model.declared
     own = 1
     if channel.name == "speed_mm_s":
-        own = max(NUMBERS_ALONG_SPEED[form] for form in declared.stribeck.values())
+        held = {p.owner for p, at in zip(declared.parameters, fitted.at_limit, strict=False) if at}
+        own = max(NUMBERS_ALONG_SPEED[form] - (owner in held) for owner, form in declared.stribeck.items())
     elif channel.name == "aging_days" and any(declared.law.values()):
         own = 3
     return np.unique(channel.values).size - own

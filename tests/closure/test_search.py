@@ -11,6 +11,7 @@ from sealfit.closure.channels import (
     searched,
     unit_of,
 )
+from sealfit.closure.forms import terms_of
 from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
 from sealfit.effects import EFFECTS
@@ -228,3 +229,22 @@ def test_a_short_part_of_the_campaign_is_found_by_the_finer_shape():
     assert best.channels == ("elapsed_h",)
     assert best.p_value < 0.001
     assert best.columns.shape[1] > 6
+
+
+def test_a_speed_effect_shows_where_sigma_2_could_take_it_up_only_below_zero():
+    """Stribeck exponent 1 at four speeds: the rest lies along a negative sigma_2, which no fit may have."""
+
+    def softer(table, force):
+        speed = np.abs(table["speed_mm_s"].to_numpy())
+        fall = np.exp(-speed / 15) - np.exp(-((speed / 15) ** 2))
+        return force + 0.3 * 49.03 * fall - 0.02 * speed
+
+    bins = make_bins(speeds=(1.0, 4.0, 12.0, 40.0), bins=4, repeats=2, gain=0.002, effect=softer)
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    assert fitted.at_limit.sum() == 3  # one sigma_2 per series, and the unaged rubber
+    channels = find_channels(fitted.rows)
+    found = search(ScoreTests(fitted), channels, np.random.default_rng(0))
+    best = next(c for c in found if c.key == (("speed_mm_s",), "mu", "multiply"))
+    assert best.p_value < 0.001
+    terms = terms_of(best, {c.name: c for c in channels}, fitted, EFFECTS)
+    assert any(term.effect.id == "log_rate" for term, _ in terms)

@@ -69,8 +69,24 @@ class Fitted:
 
     @cached_property
     def basis(self) -> Tangent:
-        """Orthonormal basis of the whitened tangent space, of shape (n, rank)."""
-        return self.white_jacobian.orthonormal(1e-8)
+        """Orthonormal basis of the whitened tangent space without `at_limit`, of shape (n, rank)."""
+        free = ~self.at_limit
+        return (self.white_jacobian if free.all() else self.white_jacobian.columns(free)).orthonormal(1e-8)
+
+    @cached_property
+    def at_limit(self) -> np.ndarray:
+        """Whether each fitted number is a sigma_2 of 0 that the data would make negative, shape (p,).
+
+        The fit cannot follow the residual along it, so it does not count as one of the model's directions.
+        """
+        found = np.zeros(self.model.size, dtype=bool)
+        zero = [
+            number
+            for number, parameter in enumerate(self.model.declared.parameters)
+            if parameter.quantity == "sigma_2" and self.model.theta[number] == 0.0
+        ]
+        found[zero] = self.white_jacobian.against(self.white_residual)[zero] < 0
+        return found
 
     def refitted(self, model: Model) -> Fitted:
         """Return another model fitted to the same rows, to be compared: scatter and friction are the same."""
