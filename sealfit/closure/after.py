@@ -15,7 +15,7 @@ from sealfit.fit.aging.all_series import joint_laws
 from sealfit.fit.aging.law import search_limits
 from sealfit.fit.aging.law_profiles import CurveInterval
 from sealfit.fit.aging.law_table import Curve, Estimate, covariance_rows, law_rows, without_law
-from sealfit.fit.aging.series import CURVE_POINTS
+from sealfit.fit.aging.series import CURVE_POINTS, aging_curves, fit_series
 from sealfit.fit.dynamic.fit import fit_dynamic
 from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.estimate import Fitted
@@ -168,7 +168,11 @@ def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple
     mu_0, a and b and their standard errors are those of the joint fit. Their intervals use Student's t with
     the number of specimens less the parameters of one coefficient; that of b is symmetric in its logarithm.
     Effects that are part of the condition (such as days) multiply or change the law; the curves include them.
+    Three speeds determine no mu_s and mu_c: the laws are then those of single conditions, as before the loop.
     """
+    if "interpolated" in after.model.declared.stribeck.values():
+        law = fit_series(steady_fit, config).assign(model="after")
+        return law, aging_curves(law)
     rows, curves = [], []
     known = AGING_FIT.names()
     open_columns = [name for name in config.series_columns if name in steady_fit and name not in known]

@@ -257,3 +257,14 @@ def test_a_condition_may_be_called_rubber():
     law, _ = after_laws(fitted(bins), steady, Config(condition=["rubber", "temperature_C", "aging_days"]))
     assert list(law.columns) == [*AGING_FIT.names(), "temperature_C"]
     assert set(law["rubber"]) == {"rubber"}
+
+
+def test_three_speeds_have_laws_of_the_mean_coefficient_as_before_the_loop():
+    bins = make_bins(7, speeds=(1.0, 8.0, 32.0), effect=warm, **SCATTER)
+    after = fitted(bins, WARMING)
+    assert "interpolated" in after.model.declared.stribeck.values()
+    tables = after_fits(after, steady_of(bins), made_traces(bins), Config())
+    law = tables["aging_fit_after"]
+    assert set(law["model"]) == {"after"}
+    assert set(law.loc[law["parameter"] == "mu_0", "quantity"]) == {"mu_c"}
+    assert set(tables["aging_curves_after"]["quantity"]) == {"mu_c"}
