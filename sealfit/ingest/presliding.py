@@ -62,6 +62,8 @@ UNLIKELY = 10.0
 # Factor by which the rise on the plateau of the speed must be longer than that from rest to be the bristles'.
 # The lengths that are tried reach three times as far as the force's arrival.
 LONGER = 3.0
+# Rise lengths on the plateau of the speed after which the law is asked again where it did not hold.
+SKIPPED = (0.0, 1.0, 2.0)
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0
 # Parts of equal rows into which a steady window is cut to see whether it begins within a transient, and how
@@ -216,8 +218,13 @@ def _explained(start: Start, length_mm: float) -> float:
 
 def _on_plateau(start: Start) -> Start:
     """Return a start from where the speed has reached its plateau."""
-    rows = slice(start.ramp_end, None)
-    return Start(start.distance_mm[rows] - start.plateau_mm, start.force_N[rows], 0)
+    return _from(start, start.plateau_mm)
+
+
+def _from(start: Start, begin_mm: float) -> Start:
+    """Return a start from a distance at which its speed is constant."""
+    rows = slice(int(start.distance_mm.searchsorted(begin_mm)), None)
+    return Start(start.distance_mm[rows] - begin_mm, start.force_N[rows], 0)
 
 
 def _rise_from_rest(start: Start) -> Rise:
@@ -242,9 +249,21 @@ def _rise_from_rest(start: Start) -> Rise:
 def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
     """Return C and x_0 of F = A + B x + C exp(-x / x_0) of a start, from its rows of constant speed.
 
-    C is 0 where the force does not follow that law: where a rise that is over at some distance fits better.
+    The first rise lengths of these may still follow the changing speed; they are left out if the law holds
+    after them. C is 0 where the force does not follow the law at all: where a rise that is over at some
+    distance fits better.
     """
-    plateau = _on_plateau(start)
+    found = length_mm
+    for skipped in SKIPPED:
+        begin_mm = start.plateau_mm + skipped * found
+        left_N, found = _followed(_from(start, begin_mm), found)
+        if left_N:
+            return _before(left_N, begin_mm / found), found
+    return 0.0, length_mm
+
+
+def _followed(plateau: Start, length_mm: float) -> tuple[float, float]:
+    """Return C and x_0 of a start at constant speed; C is 0 where it does not follow the law."""
     reach = REACH * length_mm
     sloped = min(plateau.distance_mm[-1], reach) >= SLOPED * length_mm
     length = _rise_length_mm(plateau, reach, length_mm * REFINED, sloped)
@@ -256,9 +275,7 @@ def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
     rival = min(
         beside.fitted(_shape(x, end, power), force)[1] for power, end in zip(POWERS, ends, strict=True)
     )
-    if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY:
-        left = 0.0
-    return _before(left, start.plateau_mm / length), length
+    return 0.0 if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY else left, length
 
 
 def _before(left_N: float, lengths: float) -> float:

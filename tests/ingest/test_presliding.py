@@ -154,6 +154,18 @@ def test_noise_does_not_hide_the_rise_after_a_jump():
     assert steady.mean() == pytest.approx(LEVEL, abs=3 * steady.std() / np.sqrt(steady.size) + 0.1)
 
 
+@pytest.mark.parametrize("ramp_end", [4, 6, 9])
+def test_a_fast_stroke_of_few_samples_whose_force_jumps_at_its_reversal_shows_its_rise(ramp_end):
+    """Sixty samples, four of them in the ramp: damping brings the force up there, faster than the bristles."""
+    distance = np.r_[0.0, 0.007, 0.022, 0.049, 0.082 + 0.0345 * np.arange(56)]
+    force = 76.5 - 62.0 * np.exp(-distance / 0.163)
+    force[:4] = -50.0, -26.0, 0.6, 28.0
+    rise = rise_of(Start(distance, np.round(force, 2), ramp_end))
+    later = distance > rise.end_mm
+    assert later.sum() > 30
+    assert (force - rise.at(distance))[later] == pytest.approx(76.5, abs=0.15)
+
+
 def test_a_rise_far_shorter_than_the_ramp_of_the_speed_leaves_nothing():
     assert _before(-1e-3, 1e4) == 0.0
     assert _before(-1.0, np.log(2.0)) == pytest.approx(-2.0)
