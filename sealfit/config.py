@@ -210,9 +210,8 @@ class Files(Strict):
     def copies(self) -> dict[str, str]:
         """Columns that are a part as it stands, by the template "{T}" or the expression T, and that part."""
         whole = {name: text[1:-1] for name, text in self.columns.items() if re.fullmatch(r"\{[^{}]*\}", text)}
-        return {
-            name: text.strip() for name, text in self.compute.items() if text.strip().isidentifier()
-        } | whole
+        named = {name: text.strip() for name, text in self.compute.items() if text.strip().isidentifier()}
+        return named | whole
 
     @property
     def text_parts(self) -> tuple[str, ...]:
@@ -227,9 +226,8 @@ class Files(Strict):
                 day = datetime(2024, 2, 1, 9, 30, tzinfo=UTC).strftime(one)
                 datetime.strptime(day, one)
             except (ValueError, re.error) as error:
-                raise ValueError(
-                    f"{one!r} is no date format: {error}. Write for example '%d.%m.%Y %H:%M'"
-                ) from None
+                example = "Write for example '%d.%m.%Y %H:%M'"
+                raise ValueError(f"{one!r} is no date format: {error}. {example}") from None
             if not {"%d", "%j", "%x", "%c"} & set(re.findall("%.", one)):
                 raise ValueError(f"{one!r} has no day. Write for example '%d.%m.%Y %H:%M'")
         return formats
@@ -418,15 +416,23 @@ class Config(Strict):
 
     @model_validator(mode="after")
     def _units_convert(self) -> Config:
-        units = self.units
-        for table, place, name, unit in self._units_of_files():
-            # A channel of the campaign's own has no unit of ours: it keeps its numbers, and labels show its
-            # unit.
-            to = units.of(name) or self._kept_units.setdefault(name, unit)
-            try:
-                self._conversions.setdefault(table, {})[name] = conversion(unit, to)
-            except ConfigError as error:
-                raise ValueError(f"{place}.{name}: {error}") from None
+        units, parts = self.units, self.files.units
+        copies = {n: parts[p] for n, p in self.files.copies.items() if p in parts and not units.of(p)}
+        for table, place, columns in (
+            ("trace", "trace.columns", {name: column.unit for name, column in self.trace.columns.items()}),
+            ("runs", "files.runs_columns", {n: column.unit for n, column in self.files.runs_columns.items()}),
+            ("names", "files.units", copies | parts),
+        ):
+            for name, unit in columns.items():
+                if not unit:
+                    continue
+                # A channel of the campaign's own has no unit of ours: it keeps its numbers, and labels show
+                # its unit.
+                to = units.of(name) or self._kept_units.setdefault(name, unit)
+                try:
+                    self._conversions.setdefault(table, {})[name] = conversion(unit, to)
+                except ConfigError as error:
+                    raise ValueError(f"{place}.{name}: {error}") from None
         try:
             _ = self.mass
         except ConfigError as error:
@@ -440,23 +446,6 @@ class Config(Strict):
             return 0.0
         force, length, time = (self.units.unit(slot) for slot in ("force", "displacement", "time"))
         return conversion(f"kg*{length}/{time}**2", force)(self.rig.moving_mass_kg)
-
-    def _units_of_files(self) -> list[tuple[str, str, str, str]]:
-        """Return every column whose unit is given: its table, place in the config, name and unit."""
-        parts, ours = self.files.units, self.units
-        copies = {n: parts[p] for n, p in self.files.copies.items() if p in parts and not ours.of(p)}
-        tables = (
-            ("trace", "trace.columns", {name: column.unit for name, column in self.trace.columns.items()}),
-            (
-                "runs",
-                "files.runs_columns",
-                {name: column.unit for name, column in self.files.runs_columns.items()},
-            ),
-            ("names", "files.units", copies | parts),
-        )
-        return [
-            (table, place, n, unit) for table, place, units in tables for n, unit in units.items() if unit
-        ]
 
     def conversions(self, table: Literal["trace", "runs", "names"]) -> dict[str, Conversion]:
         """Return the conversion per column of traces, runs.csv or file names whose unit the config gives."""
@@ -525,9 +514,8 @@ def parse_config(text: str, name: str) -> Config:
     try:
         return Config.model_validate(tomllib.loads(text))
     except ValidationError as error:
-        raise ConfigError(
-            explain(error, Config), file=name, fix="docs/reference/config.md has every key."
-        ) from error
+        fix = "docs/reference/config.md has every key."
+        raise ConfigError(explain(error, Config), file=name, fix=fix) from error
     except (ValueError, RecursionError) as error:  # a number of thousands of digits, or lists in lists
         raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
 

@@ -23,6 +23,10 @@ _DEFAULT = {
 }
 
 
+SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
+"""Columns of the slots, under whichever units they hold."""
+
+
 @dataclass(frozen=True, slots=True)
 class Units:
     """The true unit of each slot: `Units({"force": ("torque", "mN m")})` when a config declares one.
@@ -55,26 +59,16 @@ class Units:
             return self.unit("load")
         if column.endswith("_N"):
             return self.unit("force")
-        if column in _KNOWN:
-            return _KNOWN[column]
-        for ending, unit in _ENDINGS.items():
-            if column.endswith(ending):
-                return unit
-        return ""
+        return next((unit for ending, unit in _ENDINGS.items() if column.endswith(ending)), "")
 
     def label(self, column: str) -> str:
         """Return an axis label with the true quantity and unit, e.g. "torque (mN m)"."""
-        slots = {
-            "force_N": "force",
-            "displacement_mm": "displacement",
-            "speed_mm_s": "speed",
-            "load_N": "load",
-            "time_s": "time",
-        }
-        if column in slots:
-            return f"{self.quantity(slots[column])} ({self.unit(slots[column])})"
+        slot = column.partition("_")[0]
+        if column in SLOTS:
+            return f"{self.quantity(slot)} ({self.unit(slot)})"
         unit = self.of(column)
-        words = _MEANING.get(column, column if not unit else _without_unit(column)).replace("_", " ")
+        ending = next((e for e in ("_mm_s", *_ENDINGS) if column.endswith(e)), "") if unit else ""
+        words = _MEANING.get(column, column.removesuffix(ending)).replace("_", " ")
         return f"{words} ({unit})" if unit else words
 
 
@@ -88,7 +82,6 @@ _ENDINGS = {
     "_N": "N",
     "_bar": "bar",
 }
-_KNOWN = {"aging_days": "d", "temperature_C": "°C", "compression_ratio_pct": "%", "elapsed_h": "h"}
 _MEANING = {
     "distance_mm": "sliding distance",
     "run_order": "run order",
@@ -99,13 +92,6 @@ _MEANING = {
     "speed_set_mm_s": "commanded speed",
     "power": "sliding power (load times speed)",
 }
-
-
-def _without_unit(column: str) -> str:
-    for ending in ("_mm_s", *_ENDINGS):
-        if column.endswith(ending):
-            return column.removesuffix(ending)
-    return column
 
 
 # ---------------------------------------------------------------- conversion
@@ -166,24 +152,21 @@ def conversion(unit: str, to: str) -> Conversion:
     registry = _registry()
     ours, theirs = _dimension(to), _dimension(unit)
     if ours is None:
-        raise ConfigError(
-            f"nothing can be converted to {to!r}, which is no known unit.", fix="Drop the unit."
-        )
-    if theirs is None:
-        raise ConfigError(
-            f"{unit!r} is no known unit; {_name(ours)} ({to}) is expected.", fix=_nearest(unit, ours)
-        )
+        reason = f"nothing can be converted to {to!r}, which is no known unit."
+        raise ConfigError(reason, fix="Drop the unit.")
     if theirs != ours:
-        reason = f"the unit {unit!r} is one of {_name(theirs)}; {_name(ours)} ({to}) is expected."
-        raise ConfigError(reason, fix=_nearest(unit, ours))
+        found = f"{unit!r} is no known unit"
+        if theirs is not None:
+            found = f"the unit {unit!r} is one of {_name(theirs)}"
+        raise ConfigError(f"{found}; {_name(ours)} ({to}) is expected.", fix=_nearest(unit, ours))
 
     def converted(value: float) -> float:
         return float(registry.Quantity(value, registry.Unit(unit)).m_as(registry.Unit(to)))
 
     offset = converted(0.0)
-    return (
-        Conversion(converted(1.0)) if offset == 0 else Conversion((converted(_FAR) - offset) / _FAR, offset)
-    )
+    if offset == 0:
+        return Conversion(converted(1.0))
+    return Conversion((converted(_FAR) - offset) / _FAR, offset)
 
 
 @cache
