@@ -44,9 +44,8 @@ class Column:
     def place(self) -> str:
         """The column in words: "column 4 'Weg [mm]'"."""
         unit = f" [{self.unit.name}]" if self.unit is not None and self.unit.name not in self.label else ""
-        return (
-            f"column {self.position} '{self.label}'{unit}" if self.label else f"column {self.position}{unit}"
-        )
+        label = f" '{self.label}'" if self.label else ""
+        return f"column {self.position}{label}{unit}"
 
     @property
     def key(self) -> str | int:

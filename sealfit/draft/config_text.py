@@ -93,10 +93,8 @@ def column_guesses(
     quantity, _, ours = slot.partition("_")
     helper = f"{quantity}_raw_{ours}"
     why = "with the sign of the motion" if slot == "force_N" else "as a load that presses counts above 0"
-    return [
-        Guess(f"trace.columns.{helper}", value, evidence),
-        Guess(f"trace.compute.{slot}", f"-{helper}", why),
-    ], helper
+    read = Guess(f"trace.columns.{helper}", value, evidence)
+    return [read, Guess(f"trace.compute.{slot}", f"-{helper}", why)], helper
 
 
 def date_lines(when: When) -> tuple[Guess | None, tuple[str, ...]]:
@@ -146,39 +144,29 @@ def _key(name: str) -> str:
 
 def config_text(name: str, folder: str, notes: Notes) -> str:
     """Return the whole config."""
+    count = len(notes.doubts)
+    doubted = {0: "Nothing is", 1: "One thing is"}.get(count, f"{count} things are")
     lines = _comment(f"Drafted by `sealfit init {folder}`. Each guess has its evidence above it.")
-    lines += _comment(f"{_count(len(notes.doubts))} marked DOUBT. Run `sealfit check` with this file.")
+    lines += _comment(f"{doubted} marked DOUBT. Run `sealfit check` with this file.")
     lines.append(f"name = {literal(name)}")
-    written: set[int] = set()
+    doubts: dict[str, list[str]] = {}
+    for doubt in notes.doubts:
+        about = _comment(f"DOUBT: {doubt.reason} {doubt.fix}") + [f"#     {line}" for line in doubt.lines]
+        doubts.setdefault(doubt.key, []).extend(about)
     for section in SECTIONS:
         guesses = [guess for guess in notes.guesses if guess.key.rpartition(".")[0] == section]
-        doubts = [doubt for doubt in notes.doubts if doubt.key == section and id(doubt) not in written]
-        about = {guess.key for guess in guesses}
-        named = [doubt for doubt in notes.doubts if doubt.key in about]
-        if not guesses and not doubts:
+        if not guesses and section not in doubts:
             continue
         lines += ["", f"[{section}]"] if section else []
-        for doubt in doubts:
-            lines += _doubt_lines(doubt)
+        lines += doubts.pop(section, [])
         for guess in guesses:
-            lines += _comment(guess.evidence)
-            lines += [line for doubt in named if doubt.key == guess.key for line in _doubt_lines(doubt)]
+            lines += _comment(guess.evidence) + doubts.pop(guess.key, [])
             lines.append(f"{_key(guess.key.rpartition('.')[2])} = {toml(guess.value)}")
-        written |= {id(doubt) for doubt in (*doubts, *named)}
-    rest = [doubt for doubt in notes.doubts if id(doubt) not in written]
-    if rest:
+    if doubts:
         lines.append("")
-    for doubt in rest:
-        lines += _doubt_lines(doubt)
+    for rest in doubts.values():
+        lines += rest
     return "\n".join(lines) + "\n"
-
-
-def _count(doubts: int) -> str:
-    return {0: "Nothing is", 1: "One thing is"}.get(doubts, f"{doubts} things are")
-
-
-def _doubt_lines(doubt: Doubt) -> list[str]:
-    return [*_comment(f"DOUBT: {doubt.reason} {doubt.fix}"), *(f"#     {line}" for line in doubt.lines)]
 
 
 def _comment(text: str) -> list[str]:

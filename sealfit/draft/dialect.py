@@ -149,12 +149,9 @@ def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
     if start is None:
         return _Block(decimal, 0, 0, ())
     rows = sum(is_data for _, is_data in data[start:])
-    cells = [
-        sum(bool(cell.strip()) for cell in split_line(lines[i], delimiter))
-        for i, good in data[start:]
-        if good
-    ]
-    pure = sum(count == len(core) for count in cells) > 0.9 * len(cells)
+    rows_of_cells = [split_line(lines[i], delimiter) for i, good in data[start:] if good]
+    full = [sum(bool(cell.strip()) for cell in cells) for cells in rows_of_cells]
+    pure = sum(count == len(core) for count in full) > 0.9 * len(full)
     return _Block(decimal, data[start][0], rows, tuple(sorted(core)), pure)
 
 
@@ -163,10 +160,8 @@ def _numeric(line: str, delimiter: str, decimal: str) -> frozenset[int] | None:
     bare = line.rstrip(STRAYS)
     if not bare.strip(' "'):
         return None
-    cells = split_line(bare, delimiter)
-    return frozenset(
-        i for i, cell in enumerate(cells) if cell.strip() and as_number(cell, decimal) is not None
-    )
+    cells = enumerate(split_line(bare, delimiter))
+    return frozenset(i for i, cell in cells if cell.strip() and as_number(cell, decimal) is not None)
 
 
 def _first_of_many(data: Sequence[bool]) -> int | None:
@@ -218,9 +213,8 @@ def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Di
 
 def _ends_in_separator(data: Sequence[str], delimiter: str) -> bool:
     marks = ("\t" if delimiter == "tab" else delimiter, ",", ";")
-    return delimiter != "whitespace" and sum(line.rstrip(" ").endswith(marks) for line in data) > 0.5 * len(
-        data
-    )
+    ending = sum(line.rstrip(" ").endswith(marks) for line in data)
+    return delimiter != "whitespace" and ending > 0.5 * len(data)
 
 
 def _header_cells(line: str, delimiter: str, width: int) -> list[str]:

@@ -49,18 +49,15 @@ def draft(folder: Path) -> Draft:
     tables = read_tables(found)
     roles = find_roles(columns_of(found.dialect, list(tables.values())))
     if roles.time is None and roles.force is None:
-        raise RequestError(
-            f"{len(found.traces)} files hold tables of numbers, such as {found.traces[0]}, "
-            "but no time and no force.",
-            file=folder,
-            fix="Give the folder that holds traces: time, displacement and force in columns.",
-        )
+        tables = f"{len(found.traces)} files hold tables of numbers, such as {found.traces[0]}"
+        fix = "Give the folder that holds traces: time, displacement and force in columns."
+        raise RequestError(f"{tables}, but no time and no force.", file=folder, fix=fix)
     units = trace_keys.settled_units(roles, notes)
     speeds = trace_keys.motion_keys(roles, units, list(tables), notes)
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)
     names = run_keys.improved(read_names(found.traces), speeds, found, notes)
     source = run_keys.Source(run_keys.needs_no_load(names, roles), table)
-    header = [one.ours for one in trace_keys.header_keys(found, source.given, roles.load is not None, notes)]
+    header = trace_keys.header_keys(found, source.given, roles.load is not None, notes)
     run_keys.source_keys(found, source, header, notes)
     trace_keys.dialect_keys(found, notes)
     trace_keys.column_keys(found, roles, units, len(tables), notes)
@@ -76,11 +73,8 @@ def summary_lines(made: dict) -> list[str]:
     """Return what `sealfit init` prints: what was found, what could not be told, the command to run next."""
     count = f"{made['files']} trace file" + ("s" if made["files"] != 1 else "")
     lines = [f"{count} in {made['folder']}; {made['motion']}"]
-    lines += [
-        f"  {guess['key'].rpartition('.')[2]}: {guess['evidence']}"
-        for guess in made["guesses"]
-        if guess["key"].startswith(SHOWN)
-    ]
+    shown = [guess for guess in made["guesses"] if guess["key"].startswith(SHOWN)]
+    lines += [f"  {guess['key'].rpartition('.')[2]}: {guess['evidence']}" for guess in shown]
     if made["doubts"]:
         lines.append("could not be told:")
         lines += [f"  - {doubt['reason']} {doubt['fix']}" for doubt in made["doubts"]]

@@ -94,10 +94,9 @@ def _word(at: int, texts: tuple[str, ...]) -> Part | None:
     """Return a word that varies; None for one that is the same in all names."""
     if len(texts) == 1:
         return None
-    low = {text.lower() for text in texts}
-    pattern = (
-        "|".join(sorted(map(re.escape, texts), key=len, reverse=True)) if len(texts) <= FEW else r"[^\W\d_]+"
-    )
+    low, pattern = {text.lower() for text in texts}, r"[^\W\d_]+"
+    if len(texts) <= FEW:
+        pattern = "|".join(sorted(map(re.escape, texts), key=len, reverse=True))
     if low <= DIRECTIONS.keys():
         return Part(at, "direction", "_direction", pattern, texts, "a word for the direction")
     if low <= RUBBERS:
@@ -115,19 +114,18 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
         why = f"'{after}' stands after the number"
         return _as_height(Part(at, ours, "", pattern, texts, why, unit=unit), before)
     ours = before_number(before) if before else ""
-    if ours and not (ours in NO_COUNTS and _counts_up(texts)):
-        return _as_height(Part(at, ours, "", pattern, texts, f"'{before}' stands before the number"), before)
-    return Part(
-        at, "", "", pattern, texts, f"'{before}' stands before the number" if before else "a bare number"
-    )
+    if ours in NO_COUNTS and _counts_up(texts):
+        ours = ""
+    why = f"'{before}' stands before the number" if before else "a bare number"
+    return _as_height(Part(at, ours, "", pattern, texts, why), before)
 
 
 def _counts_up(texts: Sequence[str]) -> bool:
     """Whether numbers are 1, 2, 3 or 0, 1, 2."""
-    numbers = sorted({int(text) for text in texts}) if all(text.isdecimal() for text in texts) else [2]
-    return (
-        numbers[0] <= 1 and len(numbers) > 1 and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-    )
+    if not all(text.isdecimal() for text in texts):
+        return False
+    numbers = sorted({int(text) for text in texts})
+    return len(numbers) > 1 and numbers[0] <= 1 and numbers[-1] - numbers[0] == len(numbers) - 1
 
 
 def _around(rows: Sequence[Sequence[Token]], at: int) -> tuple[str, str]:
@@ -163,11 +161,9 @@ def _as_height(part: Part, before: str) -> Part:
         return part
     if max(as_float(text) for text in part.texts) >= HEIGHT_FROM:
         return part
-    doubt = (
-        f"{', '.join(part.texts[:4])} is taken as how much the rubber was compressed; "
-        "if it is the height that was left, let the part be called compression_ratio_pct"
-    )
-    return replace(part, expression="100 - {}", doubt=doubt)
+    taken = f"{', '.join(part.texts[:4])} is taken as how much the rubber was compressed"
+    otherwise = "if it is the height that was left, let the part be called compression_ratio_pct"
+    return replace(part, expression="100 - {}", doubt=f"{taken}; {otherwise}")
 
 
 def _with_bare_numbers(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> list[Part]:
@@ -212,16 +208,13 @@ def _repeats(part: Part, known: Sequence[Part], rows: Sequence[Sequence[Token]])
 def _without_doubles(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> list[Part]:
     """Return the parts with one for each of our columns: the last, as file names say more than folders."""
     made: list[Part] = []
-    for part in parts:
-        later = next(
-            (other for other in parts if other.at > part.at and part.ours and other.ours == part.ours), None
-        )
+    for i, part in enumerate(parts):
+        later = next((other for other in parts[i + 1 :] if part.ours and other.ours == part.ours), None)
         if later is None:
             made.append(part)
         elif part.ours == "started_at":
-            made.append(
-                replace(part, ours="", group="", pattern=r"[\dTh:_. -]+", why="a date before another one")
-            )
+            any_date = replace(part, ours="", group="", pattern=r"[\dTh:_. -]+")
+            made.append(replace(any_date, why="a date before another one"))
         elif all(row[part.at].text == row[later.at].text for row in rows):
             made.append(replace(part, ours="", why=f"{part.why}, said again later in the path"))
         else:
@@ -283,13 +276,10 @@ def _optional_word(
         pieces = cut[members[0]]
         if len(pieces) != len(row) + 1 or len(members) < ALIKE * len(main):
             continue
-        for at in range(len(row)):
-            if (
-                row[at].kind == "number"
-                and pieces[at].kind == "word"
-                and _has_word(pieces, (at, pieces[at].text), row)
-            ):
-                return at, pieces[at].text
+        for at, token in enumerate(row):
+            word = (at, pieces[at].text)
+            if token.kind == "number" and pieces[at].kind == "word" and _has_word(pieces, word, row):
+                return word
     return None
 
 
@@ -305,7 +295,5 @@ def _with_sign(parts: Sequence[Part], sign: tuple[int, str]) -> list[Part]:
     at, text = sign
     why = f"'{text}' stands before the number in some names"
     doubt = f"'{text}' is taken for the other direction"
-    return [
-        *parts,
-        Part(at, "direction", "_direction", f"(?:{re.escape(text)})?", ("", text), why, doubt=doubt),
-    ]
+    pattern = f"(?:{re.escape(text)})?"
+    return [*parts, Part(at, "direction", "_direction", pattern, ("", text), why, doubt=doubt)]

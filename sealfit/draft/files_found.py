@@ -195,11 +195,8 @@ def _no_traces(
     if formats:
         what = ", ".join(f"{count} {FORMATS[suffix]} ({suffix})" for suffix, count in formats.most_common())
         reason = f"holds {what} and no trace file that is text."
-        fix = (
-            "Name their columns in a config (README: Excel, TDMS, MATLAB and Parquet), "
-            "or export them as text (CSV)."
-        )
-        return RequestError(reason, file=folder, fix=fix)
+        fix = "Name their columns in a config (README: Excel, TDMS, MATLAB and Parquet)"
+        return RequestError(reason, file=folder, fix=f"{fix}, or export them as text (CSV).")
     shown = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
     reason = f"none of {len(files)} files holds a table of numbers with two columns or more ({shown})."
     return RequestError(reason, file=folder, fix=fix)

@@ -72,7 +72,7 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
         if ours not in SETTINGS or ours in found or (unit is not None and unit.dimension != SETTINGS[ours]):
             continue
         pattern = rf'^"?{re.escape(match["key"])}"?[\s:=;,"]*([-+]?[\d.,]*\d)'.replace(r"\ ", " ")
-        if all(any(re.search(pattern, other) for other in header) for header in headers):
+        if _everywhere(pattern, headers):
             found[ours] = Setting(ours, pattern, unit, number, line.strip())
     return list(found.values())
 
@@ -105,12 +105,12 @@ def _with_clock(headers, number: int, line: str, match: re.Match, spelled: str) 
     pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(match.group())) + ")"
     following = headers[0][number] if number < len(headers[0]) else ""
     beside = _CLOCK.search(following)
-    own = _leading(following[: beside.start()]) + r"(\d+:\d+(?::\d+)?)" if beside else ""
     if not _everywhere(pattern, headers):
         return None
-    return When(
-        pattern, f"{spelled} {_clock_format(beside)}" if beside else spelled, number, line.strip(), own
-    )
+    if beside is None:
+        return When(pattern, spelled, number, line.strip())
+    own = _leading(following[: beside.start()]) + r"(\d+:\d+(?::\d+)?)"
+    return When(pattern, f"{spelled} {_clock_format(beside)}", number, line.strip(), own)
 
 
 def _clock_format(clock: re.Match) -> str:
@@ -120,9 +120,8 @@ def _clock_format(clock: re.Match) -> str:
 
 def _leading(text: str) -> str:
     """Return a pattern for what stands before the date in its line: the words, and whatever numbers."""
-    return "^" + re.sub(
-        r"\d+(?:[.,]\d+)?", r"[\\d.,]+", re.escape(text).replace(r"\ ", " ").replace("\\\t", r"\t")
-    )
+    words = re.escape(text).replace(r"\ ", " ").replace("\\\t", r"\t")
+    return "^" + re.sub(r"\d+(?:[.,]\d+)?", r"[\\d.,]+", words)
 
 
 def _everywhere(pattern: str, headers: Sequence[Sequence[str]]) -> bool:

@@ -125,10 +125,9 @@ def plateau_speeds(time: np.ndarray, displacement: np.ndarray) -> list[list[floa
         sign = float(np.sign(x[-1] - x[0]))
         if len(t) <= SMOOTHED:
             continue
-        # Where the clock stands there is no speed at a row.
-        parts = (
-            steady_speeds(t, sign * x, noise, Strokes()) if (np.diff(t) > 0).all() else [(slice(len(t)), 0)]
-        )
+        parts = [(slice(len(t)), 0)]
+        if (np.diff(t) > 0).all():  # where the clock stands there is no speed at a row
+            parts = steady_speeds(t, sign * x, noise, Strokes())
         speeds = [sign * measured_speed(t[at : part.stop], x[at : part.stop])[1] for part, at in parts]
         strokes.append([speed for speed in speeds if np.isfinite(speed) and speed != 0])
     return strokes

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from sealfit.config import AGING_CONDITION
 from sealfit.draft.vocabulary import DIRECTIONS
 
 SUFFIX = re.compile(r"\.(?=[^./]*[^\W\d])[^./]*$")
@@ -77,11 +78,7 @@ def tokens(name: str) -> list[Token]:
     >>> [token.text for token in tokens("T80_d4/v0.5 mm_s")]
     ['T', '80', '_', 'd', '4', '/', 'v', '0.5', ' ', 'mm_s']
     """
-    kinds = ("date", "dmy", "word", "number", "sep")
-    return [
-        Token(next(kind for kind in kinds if match[kind] is not None), match.group())
-        for match in _TOKEN.finditer(name)
-    ]
+    return [Token(match.lastgroup, match.group()) for match in _TOKEN.finditer(name)]
 
 
 def shape_of(pieces: Sequence[Token]) -> tuple:
@@ -143,25 +140,21 @@ def _date_pattern(text: str, kind: str) -> str:
 def settings_with(pattern: str, parts: Sequence[Part], middle: tuple[int, int] | None) -> Names:
     """Return the value maps, expressions, templates and units that go with the pattern."""
     values: dict[str, dict[str, float | str]] = {}
-    compute, columns = {}, {}
+    compute: dict[str, str] = {}
     for part in parts:
         if not part.group or part.ours == "started_at":
             continue
         if any(mark in text for text in part.texts for mark in ",p") and part.ours != "rubber":
             values[part.group] = {text: as_float(text) for text in part.texts if text[:1] in "-0123456789"}
-        if (
-            middle is not None
-            and middle[0] <= part.at < middle[1]
-            and (part.ours == "aging_days" or part.expression)
-        ):
+        replaced = middle is not None and middle[0] <= part.at < middle[1]
+        if replaced and (part.ours == "aging_days" or part.expression):
             values.setdefault(part.group, {})[""] = 0.0
         if part.ours == "direction":
-            values[part.group] = {
-                text: float(DIRECTIONS.get(text.lower(), -1 if text else 1)) for text in part.texts
-            }
+            signs = {text: DIRECTIONS.get(text.lower(), -1 if text else 1) for text in part.texts}
+            values[part.group] = {text: float(sign) for text, sign in signs.items()}
         elif part.expression or (part.group.startswith("_") and part.ours != "specimen_id"):
             compute[part.ours] = (part.expression or "{}").format(part.group)
-    columns |= _date_template(pattern) | _specimen_template(parts)
+    columns = _date_template(pattern) | _specimen_template(parts)
     compute |= _signed_speed(parts, compute)
     units = {part.ours: part.unit for part in parts if part.unit}
     return Names(pattern, tuple(parts), values, compute, columns, units)
@@ -180,9 +173,7 @@ def _specimen_template(parts: Sequence[Part]) -> dict[str, str]:
     """Return the template of specimen_id: numbers that start again in every condition name pieces of each."""
     if not any(part.ours == "specimen_id" for part in parts):
         return {}
-    settings = [
-        p.group for p in parts if p.ours in ("rubber", "temperature_C", "compression_ratio_pct", "aging_days")
-    ]
+    settings = [part.group for part in parts if part.ours in ("rubber", *AGING_CONDITION)]
     return {"specimen_id": " ".join("{" + name + "}" for name in [*settings, "_specimen"])}
 
 

@@ -47,22 +47,12 @@ class Source:
         return self.names.given | (self.table.given if self.table is not None else set())
 
 
-def settings_of(names: Names) -> Files:
-    """Return the part of a config that reads the names."""
-    return Files(
-        name_pattern=names.pattern,
-        values=names.values,
-        compute=names.compute,
-        columns=names.columns,
-        units=names.units,
-    )
-
-
 def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, float | str]]:
     """Return what the names of files say, by file."""
     if names.pattern is None:
         return {file: {} for file in files}
-    settings = settings_of(names)
+    given = {"values": names.values, "compute": names.compute, "columns": names.columns, "units": names.units}
+    settings = Files(name_pattern=names.pattern, **given)
     conversions = {name: conversion(unit, Units().of(name)) for name, unit in names.units.items()}
     found = {}
     for file in files:
@@ -101,12 +91,10 @@ def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Name
 
 def _ratio(said: Mapping[str, object], measured: Mapping[str, float]) -> float | None:
     """Return the named over the measured speed, if most files of two speeds or more have the same."""
-    pairs = [
-        (abs(v), measured[f]) for f, v in said.items() if isinstance(v, int | float) and v and measured.get(f)
-    ]
-    if len({named for named, _ in pairs}) < 2:
+    named = {f: abs(v) for f, v in said.items() if isinstance(v, int | float) and v and measured.get(f)}
+    if len(set(named.values())) < 2:
         return None
-    ratios = sorted(named / speed for named, speed in pairs)
+    ratios = sorted(speed / measured[file] for file, speed in named.items())
     middle = ratios[len(ratios) // 2]
     agree = sum(abs(ratio / middle - 1) <= AGREES for ratio in ratios)
     return middle if agree >= MOSTLY * len(ratios) else None
@@ -118,9 +106,8 @@ def _speed_in_unit(names: Names, ratio: float, notes: Notes) -> Names:
     unit = next((u for u in SPEED_UNITS if abs(ratio * conversion(u, "mm/s").factor - 1) <= AGREES / 2), None)
     if unit is None or part.unit:
         reason = f"speeds in names are {ratio:.3g} times those measured."
-        notes.doubt(
-            "files.name_pattern", reason, "Check the units of time and displacement, and the speed in names."
-        )
+        fix = "Check the units of time and displacement, and the speed in names."
+        notes.doubt("files.name_pattern", reason, fix)
         return names
     why = f"{part.why}; {ratio:.3g} times the measured speed in mm/s, so it is in {unit}"
     parts = tuple(replace(p, unit=unit, why=why) if p is part else p for p in names.parts)
@@ -145,18 +132,16 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
     if repeat is None:
         return names
     said = values_by_file(names, found.traces)
-    aging = names.given & set(AGING_CONDITION)
-    of_run = (
-        {*aging, "rubber", "specimen_id", "speed_mm_s", "repeat"} if aging else names.given - {"started_at"}
-    )
+    of_run = names.given - {"started_at"}
+    if aging := names.given & set(AGING_CONDITION):
+        of_run = {*aging, "rubber", "specimen_id", "speed_mm_s", "repeat"}
     keys = Counter(tuple((name, one.get(name)) for name in sorted(of_run)) for one in said.values() if one)
     if not keys or max(keys.values()) == 1:
         return names
     count = sum(number for number in keys.values() if number > 1)
     reason = f"the repeat in names does not tell {count} files apart that are named alike otherwise."
-    notes.doubt(
-        "files.name_pattern", reason, "It is not used; repeats are numbered in the order of the files."
-    )
+    fix = "It is not used; repeats are numbered in the order of the files."
+    notes.doubt("files.name_pattern", reason, fix)
     return _without(names, repeat)
 
 
@@ -181,18 +166,20 @@ def source_keys(found: Found, source: Source, header: Collection[str], notes: No
     if table is not None and table.is_runs_csv:
         _table_keys(table, notes)
         if not table.whole_paths:
-            _paths_doubt(table, found, notes)
+            column = next(theirs for theirs, ours in table.ours.items() if ours == "file")
+            what = f"does not give whole paths, such as '{found.traces[0]}'"
+            fix = "Write paths relative to the folder, with the suffix."
+            notes.doubt("files.runs_columns", f"column '{column}' of {table.file} {what}.", fix)
     else:
         _glob_keys(found, source, notes)
         if table is not None:
             _table_keys(table, notes)
-            notes.doubt(
-                "files.runs_columns",
-                f"'{table.file}' lists {table.named} of the trace files, but only {RUNS_CSV} is read.",
-                f"Copy it to {RUNS_CSV}; the columns below are those of this table. "
-                "Without it, only names count."
-                + ("" if table.whole_paths else " Its names of files need their folders and suffixes."),
-            )
+            reason = f"'{table.file}' lists {table.named} of the trace files, but only {RUNS_CSV} is read."
+            fix = f"Copy it to {RUNS_CSV}; the columns below are those of this table."
+            fix += " Without it, only names count."
+            if not table.whole_paths:
+                fix += " Its names of files need their folders and suffixes."
+            notes.doubt("files.runs_columns", reason, fix)
     if table is None or not table.is_runs_csv or not set(AGING_CONDITION) <= table.given:
         told = table is not None or bool(set(header) & set(AGING_CONDITION))
         _name_keys(source.names, len(found.traces), told, notes)
@@ -211,15 +198,10 @@ def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:
     delimiter = f"separator '{dialect.delimiter}'"
     decimal = f", decimal '{dialect.decimal}'" if dialect.decimal else ""
     names = f", columns {', '.join(dialect.names[:4])}" if dialect.names else ""
-    reason = (
-        f"{len(others)} files are written otherwise ({delimiter}{decimal}{names}): "
-        f"{', '.join(list(others)[:3])}."
-    )
-    fix = (
-        "One config reads files of one form. "
-        "Move them to a folder of their own and draft a config for them, too."
-    )
-    notes.doubt("files", reason, fix)
+    form, shown = f"({delimiter}{decimal}{names})", ", ".join(list(others)[:3])
+    fix = "Move them to a folder of their own and draft a config for them, too."
+    reason = f"{len(others)} files are written otherwise {form}: {shown}."
+    notes.doubt("files", reason, f"One config reads files of one form. {fix}")
 
 
 def _glob_keys(found: Found, source: Source, notes: Notes) -> None:
@@ -231,9 +213,8 @@ def _glob_keys(found: Found, source: Source, notes: Notes) -> None:
     surplus = (matched - set(found.traces)) | (unmatched & matched) | (table & matched)
     if surplus:
         excluded = _excluded(surplus, matched)
-        notes.guess(
-            "files.exclude", excluded[:MOST_LISTED], "no traces, or named or written otherwise than the rest"
-        )
+        why = "no traces, or named or written otherwise than the rest"
+        notes.guess("files.exclude", excluded[:MOST_LISTED], why)
         if len(excluded) > MOST_LISTED:
             reason = f"{len(excluded) - MOST_LISTED} more files are no traces like the rest."
             notes.doubt("files.exclude", reason, "Move them away, or add them here.")
@@ -281,32 +262,23 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         if told:
             return
         reason = "the names of the files say nothing that is known here: temperature, days, speed, repeat."
-        notes.doubt(
-            "files", reason, f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand."
-        )
+        fix = f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand."
+        notes.doubt("files", reason, fix)
         return
-    told = [
-        f"{_example(part)} -> {part.ours} ({part.why}: {_values(part)})" for part in names.parts if part.ours
-    ]
-    notes.guess(
-        "files.name_pattern", names.pattern, f"matches {names.matched} of {files} files. " + "; ".join(told)
-    )
-    for part in names.parts:
-        if part.doubt and part.ours:
-            notes.doubt(
-                "files.name_pattern", f"'{_example(part)}': {part.doubt}.", "Check what it stands for."
-            )
+    ours = [part for part in names.parts if part.ours]
+    said = "; ".join(f"{_example(part)} -> {part.ours} ({part.why}: {_values(part)})" for part in ours)
+    notes.guess("files.name_pattern", names.pattern, f"matches {names.matched} of {files} files. {said}")
+    for part in ours:
+        if part.doubt:
+            reason = f"'{_example(part)}': {part.doubt}."
+            notes.doubt("files.name_pattern", reason, "Check what it stands for.")
     for name, template in names.columns.items():
         evidence = "made of parts of the name"
         if name == "specimen_id":
             evidence = "the number of the piece of rubber, within its condition"
-            fix = (
-                "If they are repeats with one piece, "
-                "call the part `repeat` in name_pattern and delete this line."
-            )
-            notes.doubt(
-                "files.columns.specimen_id", "files of a condition are taken as different pieces.", fix
-            )
+            reason = "files of a condition are taken as different pieces."
+            fix = "call the part `repeat` in name_pattern and delete this line."
+            notes.doubt(f"files.columns.{name}", reason, f"If they are repeats with one piece, {fix}")
         notes.guess(f"files.columns.{name}", template, evidence)
     for group, mapped in names.values.items():
         notes.guess(f"files.values.{group}", dict(mapped), "how these are written in the names")
@@ -332,40 +304,26 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
             cell = next((cell for cell in table.cells[theirs] if cell), "")
             evidence = f"column '{theirs}' of {table.file}, such as '{cell}'"
             notes.guess(f"files.runs_columns.{ours}", value, evidence)
-    heights = next(
-        (table.cells[theirs] for theirs, ours in table.ours.items() if ours == "compression_ratio_pct"), ()
-    )
+    cells = {ours: table.cells[theirs] for theirs, ours in table.ours.items()}
+    heights = cells.get("compression_ratio_pct", ())
     numbers = [n for cell in heights if (n := as_number(cell) or as_number(cell, ",")) is not None]
     if numbers and max(numbers) < HEIGHT_FROM:
-        reason = (
-            f"compressions up to {max(numbers):g} % look like how much the rubber was compressed, "
-            "not its height."
-        )
-        notes.doubt(
-            "files.runs_columns", reason, "Write the height in percent of the original into the table."
-        )
-    _dates_doubt(table, notes)
+        like = "look like how much the rubber was compressed, not its height"
+        fix = "Write the height in percent of the original into the table."
+        notes.doubt("files.runs_columns", f"compressions up to {max(numbers):g} % {like}.", fix)
+    if "started_at" not in cells:
+        _dates_doubt(table, notes)
 
 
 def _dates_doubt(table: RunsTable, notes: Notes) -> None:
-    if "started_at" in table.given:
-        return
     dates = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}")
     for name, cells in table.cells.items():
         full = [cell for cell in cells if cell]
         if name not in table.ours and full and all(dates.search(cell) for cell in full):
-            reason = (
-                f"column '{name}' of {table.file} holds dates that are not ISO 8601, such as '{full[0]}'."
-            )
+            what = f"holds dates that are not ISO 8601, such as '{full[0]}'"
             fix = f"Name it, started_at = '{name}', and give files.date_format, such as '%d.%m.%Y %H:%M'."
-            notes.doubt("files.runs_columns", reason, fix)
+            notes.doubt("files.runs_columns", f"column '{name}' of {table.file} {what}.", fix)
             return
-
-
-def _paths_doubt(table: RunsTable, found: Found, notes: Notes) -> None:
-    column = next(theirs for theirs, ours in table.ours.items() if ours == "file")
-    reason = f"column '{column}' of {table.file} does not give whole paths, such as '{found.traces[0]}'."
-    notes.doubt("files.runs_columns", reason, "Write paths relative to the folder, with the suffix.")
 
 
 # ---------------------------------------------------------------- condition
@@ -391,10 +349,9 @@ def condition_keys(source: Source, header: Collection[str], notes: Notes) -> Non
         own += [name for name in source.table.given if name not in NO_CONDITION]
     if own:
         notes.guess("condition", own, "what names give besides speed and repeat")
+        reason = "nothing says temperature, compression or days: there is no aging to fit."
         fix = "Leave those that change nothing about the sample or the contact out of it."
-        notes.doubt(
-            "condition", "nothing says temperature, compression or days: there is no aging to fit.", fix
-        )
+        notes.doubt("condition", reason, fix)
         return
     notes.guess("condition", ["state"], "nothing tells conditions apart")
     notes.guess("files.columns.state", "one", "the same for all files")

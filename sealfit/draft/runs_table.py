@@ -113,9 +113,8 @@ def _fits(meaning: str, column: Sequence[str]) -> bool:
         return all(_is_iso(cell) for cell in full)
     if meaning in ("specimen_id", "run_id", "rubber", "file"):
         return True
-    return sum(as_number(cell) is not None or as_number(cell, ",") is not None for cell in full) > 0.8 * len(
-        full
-    )
+    numbers = [cell for cell in full if as_number(cell) is not None or as_number(cell, ",") is not None]
+    return len(numbers) > 0.8 * len(full)
 
 
 def _is_iso(cell: str) -> bool:

@@ -13,7 +13,7 @@ from sealfit.draft.columns import BY_BEHAVIOUR, Column, Roles
 from sealfit.draft.config_text import Notes, column_guesses, date_lines, file_column
 from sealfit.draft.dialect import STRAYS
 from sealfit.draft.files_found import Found
-from sealfit.draft.header_lines import Setting, settings_in, started_in
+from sealfit.draft.header_lines import settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 from sealfit.units import Units, conversion
 
@@ -53,21 +53,15 @@ def dialect_keys(found: Found, notes: Notes) -> None:
         notes.guess("trace.trailing_separator", True, evidence)
     footers = [other.footer for other in sniffed if other.footer]
     if footers:
-        notes.doubt(
-            "trace",
-            f"{len(footers)} of {len(sniffed)} files end in lines that are no data, "
-            f"such as '{footers[0][0][:60]}'.",
-            "A config cannot name them: these lines are left out, and `check` lists them. "
-            "Delete them in the files, or leave them out of the export.",
-        )
+        what = f"end in lines that are no data, such as '{footers[0][0][:60]}'"
+        fix = "A config cannot name them: these lines are left out, and `check` lists them."
+        fix += " Delete them in the files, or leave them out of the export."
+        notes.doubt("trace", f"{len(footers)} of {len(sniffed)} files {what}.", fix)
     odd = [other.odd_lines for other in sniffed if other.odd_lines]
     if odd:
-        notes.doubt(
-            "trace",
-            f"in {len(odd)} of {len(sniffed)} files up to {max(odd)} lines between the data are none.",
-            "They are left out, and `check` lists them. "
-            "If a file holds several recordings, export one file each.",
-        )
+        reason = f"in {len(odd)} of {len(sniffed)} files up to {max(odd)} lines between the data are none."
+        fix = "If a file holds several recordings, export one file each."
+        notes.doubt("trace", reason, f"They are left out, and `check` lists them. {fix}")
 
 
 def _header_keys(found: Found, of: str, notes: Notes) -> None:
@@ -79,14 +73,11 @@ def _header_keys(found: Found, of: str, notes: Notes) -> None:
         notes.guess("trace.names", "none", f"{why} in {of}: columns go by position")
     units_row = back == 2 and one.units_back == 1
     if units_row:
-        notes.guess(
-            "trace.units_row", True, f"the line below the names holds units: {_shown(one.header[-1])}"
-        )
+        evidence = f"the line below the names holds units: {_shown(one.header[-1])}"
+        notes.guess("trace.units_row", True, evidence)
     elif back is not None and back > 1:
-        evidence = (
-            f"the names are in the header's line {count - back + 1} of {count}: {_shown(one.header[-back])}"
-        )
-        notes.guess("trace.names_line", back, evidence)
+        line = f"line {count - back + 1} of {count}: {_shown(one.header[-back])}"
+        notes.guess("trace.names_line", back, f"the names are in the header's {line}")
     if len({len(other.header) for other in found.sniffed}) > 1:
         _varying_header(found, notes)
     elif count != (1 + units_row if back is not None else 0):
@@ -97,22 +88,18 @@ def _varying_header(found: Found, notes: Notes) -> None:
     """Add the pattern of the header's last line, as headers are not of one length."""
     lengths = Counter(len(one.header) for one in found.sniffed)
     shown = ", ".join(f"{length} lines in {count} files" for length, count in sorted(lengths.items()))
-    usual = next(one for one in found.sniffed if len(one.header) == lengths.most_common(1)[0][0])
+    count = lengths.most_common(1)[0][0]
+    usual = next(one for one in found.sniffed if len(one.header) == count)
     last = usual.header[-1].rstrip(STRAYS) if usual.header else ""
     pattern = "^" + re.escape(last[:80]).replace(r"\ ", " ").replace("\\\t", r"\t")
     if last and all(_ends_at(one.header, pattern) for one in found.sniffed):
-        notes.guess(
-            "trace.header_ends_at",
-            pattern,
-            f"headers differ in length ({shown}), and this line ends all of them",
-        )
+        evidence = f"headers differ in length ({shown}), and this line ends all of them"
+        notes.guess("trace.header_ends_at", pattern, evidence)
         return
-    count = lengths.most_common(1)[0][0]
     notes.guess("trace.header_lines", count, f"the most frequent of {shown}")
+    reason = f"headers differ in length ({shown}), and no one line ends all of them."
     fix = "Set header_ends_at to a pattern that only the last header line matches, or export all files alike."
-    notes.doubt(
-        "trace.header_lines", f"headers differ in length ({shown}), and no one line ends all of them.", fix
-    )
+    notes.doubt("trace.header_lines", reason, fix)
 
 
 def _ends_at(header: Sequence[str], pattern: str) -> bool:
@@ -163,9 +150,8 @@ def column_keys(
             torque = {"quantity": "torque", "unit": unit.name}
             notes.guess("quantities.force", torque, f"{roles.force.place} is a torque")
     if helpers:
-        notes.guess(
-            "trace.drop_columns", helpers, "read for the columns computed below, no channels of their own"
-        )
+        evidence = "read for the columns computed below, no channels of their own"
+        notes.guess("trace.drop_columns", helpers, evidence)
     _other_columns(found, roles, notes)
 
 
@@ -175,12 +161,9 @@ def _evidence(column: Column, role: str, roles: Roles, read: int) -> str:
         by.append("its name")
     if column.in_unit_of(role):
         by.append("its unit")
-    behaves = {
-        "time": "it rises evenly",
-        "displacement": "it goes along strokes",
-        "force": f"it follows the direction of motion in {roles.signed_files} of {read} files"
-        + (", with the other sign" if roles.sign < 0 else ""),
-    }
+    follows = f"it follows the direction of motion in {roles.signed_files} of {read} files"
+    follows += ", with the other sign" if roles.sign < 0 else ""
+    behaves = {"time": "it rises evenly", "displacement": "it goes along strokes", "force": follows}
     text = f"{column.place}: by {' and '.join(by) or 'behaviour'}"
     return f"{text}; {behaves[role]}" if role in behaves else text
 
@@ -195,14 +178,11 @@ def _column_doubts(column: Column, role: str, key: str, roles: Roles, notes: Not
         return
     if roles.signs_differ:
         reason = f"the sign of {column.place} against the motion is not the same in all files."
-        notes.doubt(
-            key, reason, "Check whether the sensor was turned, or the force was exported as a magnitude."
-        )
+        fix = "Check whether the sensor was turned, or the force was exported as a magnitude."
+        notes.doubt(key, reason, fix)
     if not unit_fits and column.unit is not None:
-        reason = f"{column.place} is not in a unit of force."
-        notes.doubt(
-            key, reason, "Give the factor to N under [trace.compute], or declare it under [quantities]."
-        )
+        fix = "Give the factor to N under [trace.compute], or declare it under [quantities]."
+        notes.doubt(key, f"{column.place} is not in a unit of force.", fix)
     moves = roles.time is not None and roles.displacement is not None
     if named and moves and roles.both_ways and roles.strength < BY_BEHAVIOUR / 2:
         reason = f"{column.place} has the same sign in both directions."
@@ -219,17 +199,13 @@ def _integrated(speed: Column, notes: Notes) -> list[str]:
     notes.guess("trace.integrate_displacement", helper, evidence)
     if rotation:
         notes.guess("trace.integrate_per", "min", "rpm")
-        notes.guess("quantities.displacement", {"quantity": "angle", "unit": "turn"}, f"from {speed.place}")
-        notes.guess(
-            "quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, f"from {speed.place}"
-        )
+        source = f"from {speed.place}"
+        notes.guess("quantities.displacement", {"quantity": "angle", "unit": "turn"}, source)
+        notes.guess("quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, source)
         notes.guess("position_origin", "file", "an integral begins anew in every file")
-        notes.doubt(
-            "strokes",
-            "a rotation in one direction may slide over the same track in each turn.",
-            "Then set turn: each turn is a stroke of its own.",
-            ("turn = 1",),
-        )
+        reason = "a rotation in one direction may slide over the same track in each turn."
+        fix = "Then set turn: each turn is a stroke of its own."
+        notes.doubt("strokes", reason, fix, ("turn = 1",))
     return [helper]
 
 
@@ -277,11 +253,8 @@ def _channel(column: Column, taken: set[str]) -> str:
     if column.copy_of or column.role not in CHANNELS or all(motion.rises(values) for values in column.values):
         return ""
     unit = f"_{column.unit.suffix}" if column.unit is not None else ""
-    bases = [
-        f"{column.role}_sensor",
-        "_".join(plain(name_and_unit(column.label)[0]).split()),
-        f"{column.role}_column_{column.position}",
-    ]
+    label = "_".join(plain(name_and_unit(column.label)[0]).split())
+    bases = (f"{column.role}_sensor", label, f"{column.role}_column_{column.position}")
     return next(name for base in bases if (name := base + unit) not in taken)
 
 
@@ -322,8 +295,8 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
 # ---------------------------------------------------------------- header and motion
 
 
-def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes) -> list[Setting]:
-    """Add the date and the settings that header lines give and nothing else does; return these settings."""
+def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes) -> list[str]:
+    """Add the date and the settings that header lines give and nothing else does; return their columns."""
     headers = [one.header for one in found.sniffed]
     if not headers[0]:
         return []
@@ -339,15 +312,11 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
             notes.doubt("trace.header_fields", reason, fix, lines)
     settings = [one for one in settings_in(headers, found.dialect.decimal) if one.ours not in given]
     for one in settings:
-        _setting_keys(one, notes)
-    return settings
-
-
-def _setting_keys(one: Setting, notes: Notes) -> None:
-    evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
-    notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
-    if one.unit is not None and one.unit.name != Units().of(one.ours):
-        notes.guess(f"files.units.{one.ours}", one.unit.name, f"the unit in header line {one.line}")
+        evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
+        notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
+        if one.unit is not None and one.unit.name != Units().of(one.ours):
+            notes.guess(f"files.units.{one.ours}", one.unit.name, f"the unit in header line {one.line}")
+    return [one.ours for one in settings]
 
 
 def motion_keys(
@@ -374,11 +343,8 @@ def motion_keys(
         reason = f"strokes in one direction have several speeds, {_shown_speeds(others, files)}."
         fix = "The strokes of a file in one direction are one run: write each speed into a file of its own."
         notes.doubt("strokes", reason, fix)
-    return {
-        file: float(np.median(np.abs(found)))
-        for file, found in speeds.items()
-        if found and file not in several
-    }
+    one_speed = {file: found for file, found in speeds.items() if found and file not in several}
+    return {file: float(np.median(np.abs(found))) for file, found in one_speed.items()}
 
 
 def _in_ours(values: np.ndarray, unit: Unit | None, ours: str) -> np.ndarray:
