@@ -35,6 +35,11 @@ class Schema:
         return [column.name for column in self.columns]
 
 
+def table(name: str, *columns: Column, open_: bool = False) -> Schema:
+    """Return the schema of a table."""
+    return Schema(name, columns, open_)
+
+
 # ---------------------------------------------------------------- keys that several tables share
 FILE = Column("file", "trace file, relative to the campaign folder", TEXT)
 RUN = Column("run_id", "run: one condition at one speed and direction", TEXT)
@@ -64,117 +69,103 @@ ELAPSED = Column("elapsed_h", "time since the campaign's first file; null if not
 KEYS = (FILE, RUN, REPEAT, STROKE, DIRECTION, SPECIMEN, CONDITION, SERIES, RUBBER)
 
 # ---------------------------------------------------------------- ingest
-INPUTS = Schema(
+INPUTS = table(
     "inputs",
-    (
-        FILE,
-        Column("size", "size of the file", INT, unit="byte"),
-        Column("mtime_ns", "time of last change", INT, unit="ns"),
-        Column("sha256", "hash of the content", TEXT),
-        Column("rows", "data rows read", INT),
-        Column("strokes", "strokes found", INT),
-        Column("status", "used | left out | not matched", TEXT),
-    ),
+    FILE,
+    Column("size", "size of the file", INT, unit="byte"),
+    Column("mtime_ns", "time of last change", INT, unit="ns"),
+    Column("sha256", "hash of the content", TEXT),
+    Column("rows", "data rows read", INT),
+    Column("strokes", "strokes found", INT),
+    Column("status", "used | left out | not matched", TEXT),
 )
-RUNS = Schema(
+RUNS = table(
     "runs",
-    (
-        *KEYS,
-        SPEED,
-        SPEED_SET,
-        LOAD,
-        RUN_ORDER,
-        ELAPSED,
-        Column("started_at", "start of the file, ISO 8601, as given where it is; null if not given", TEXT),
-        Column("used", "false where the stroke was left out; quality says why", BOOL),
-    ),
+    *KEYS,
+    SPEED,
+    SPEED_SET,
+    LOAD,
+    RUN_ORDER,
+    ELAPSED,
+    Column("started_at", "start of the file, ISO 8601, as given where it is; null if not given", TEXT),
+    Column("used", "false where the stroke was left out; quality says why", BOOL),
     open_=True,
 )
-QUALITY = Schema(
+QUALITY = table(
     "quality",
-    (
-        FILE,
-        Column("stroke", "stroke, null for the whole file", INT),
-        Column("line", "line in the file, null if not one line", INT),
-        Column("column", "column concerned, null if none", TEXT),
-        Column("check", "name of the rule", TEXT),
-        Column("value", "what was found", TEXT),
-        Column("severity", "info | warning | error", TEXT),
-        Column("action", "kept | row left out | stroke left out | file left out", TEXT),
-        Column("reason", "in a sentence", TEXT),
-        Column("fix", "what to do about it", TEXT),
-    ),
+    FILE,
+    Column("stroke", "stroke, null for the whole file", INT),
+    Column("line", "line in the file, null if not one line", INT),
+    Column("column", "column concerned, null if none", TEXT),
+    Column("check", "name of the rule", TEXT),
+    Column("value", "what was found", TEXT),
+    Column("severity", "info | warning | error", TEXT),
+    Column("action", "kept | row left out | stroke left out | file left out", TEXT),
+    Column("reason", "in a sentence", TEXT),
+    Column("fix", "what to do about it", TEXT),
 )
-TRACES = Schema(
+TRACES = table(
     "traces",
-    (
-        FILE,
-        CONDITION,
-        STROKE,
-        TIME,
-        DISPLACEMENT,
-        FORCE,
-        Column("presliding_N", "in the steady window, what is left in force_N of the pre-sliding rise"),
-        Column("steady", "true inside the steady window", BOOL),
-    ),
+    FILE,
+    CONDITION,
+    STROKE,
+    TIME,
+    DISPLACEMENT,
+    FORCE,
+    Column("presliding_N", "in the steady window, what is left in force_N of the pre-sliding rise"),
+    Column("steady", "true inside the steady window", BOOL),
     open_=True,  # channels measured along the trace
 )
-TRACES_MEAN = Schema(
+TRACES_MEAN = table(
     "traces_mean",
-    (
-        RUN,
-        DIRECTION,
-        CONDITION,
-        DISPLACEMENT,
-        Column("force_N", "mean force of the repeats at this displacement"),
-        Column("force_se_N", "standard error of that mean, from the repeats; null for one repeat"),
-        Column("n", "strokes averaged", INT),
-        Column("steady", "true where every stroke averaged is in its steady window", BOOL),
-    ),
+    RUN,
+    DIRECTION,
+    CONDITION,
+    DISPLACEMENT,
+    Column("force_N", "mean force of the repeats at this displacement"),
+    Column("force_se_N", "standard error of that mean, from the repeats; null for one repeat"),
+    Column("n", "strokes averaged", INT),
+    Column("steady", "true where every stroke averaged is in its steady window", BOOL),
 )
-STEADY = Schema(
+STEADY = table(
     "steady",
-    (
-        *KEYS,
-        SPEED,
-        SPEED_SET,
-        LOAD,
-        Column("force_N", "friction force: mean over the steady window, without presliding_N"),
-        PRESLIDING,
-        Column("force_sd_N", "standard deviation of the samples in the window"),
-        Column("force_se_N", "standard error of the mean, autocorrelation counted in"),
-        Column("n", "samples in the window", INT),
-        DISPLACEMENT,
-        Column("displacement_from_mm", "start of the steady window"),
-        Column("displacement_to_mm", "end of the steady window"),
-        DISTANCE,
-        TIME,
-        RUN_ORDER,
-        ELAPSED,
-        Column("outlier", "true where this repeat disagrees with its run beyond pooled scatter", BOOL),
-        Column("used", "false where the config leaves an outlier out of the fits", BOOL),
-    ),
+    *KEYS,
+    SPEED,
+    SPEED_SET,
+    LOAD,
+    Column("force_N", "friction force: mean over the steady window, without presliding_N"),
+    PRESLIDING,
+    Column("force_sd_N", "standard deviation of the samples in the window"),
+    Column("force_se_N", "standard error of the mean, autocorrelation counted in"),
+    Column("n", "samples in the window", INT),
+    DISPLACEMENT,
+    Column("displacement_from_mm", "start of the steady window"),
+    Column("displacement_to_mm", "end of the steady window"),
+    DISTANCE,
+    TIME,
+    RUN_ORDER,
+    ELAPSED,
+    Column("outlier", "true where this repeat disagrees with its run beyond pooled scatter", BOOL),
+    Column("used", "false where the config leaves an outlier out of the fits", BOOL),
     open_=True,
 )
-BINS = Schema(
+BINS = table(
     "bins",
-    (
-        *KEYS,
-        Column("bin", "number of the bin along its stroke, from 0", INT),
-        SPEED,
-        Column("speed_bin_mm_s", "sliding speed in the bin; the stroke's where no difference is seen"),
-        SPEED_SET,
-        LOAD,
-        Column("force_N", "friction force: mean in the bin, without presliding_N"),
-        PRESLIDING,
-        Column("force_sd_N", "standard deviation of the samples in the bin"),
-        Column("n", "samples in the bin", INT),
-        DISPLACEMENT,
-        DISTANCE,
-        TIME,
-        RUN_ORDER,
-        ELAPSED,
-    ),
+    *KEYS,
+    Column("bin", "number of the bin along its stroke, from 0", INT),
+    SPEED,
+    Column("speed_bin_mm_s", "sliding speed in the bin; the stroke's where no difference is seen"),
+    SPEED_SET,
+    LOAD,
+    Column("force_N", "friction force: mean in the bin, without presliding_N"),
+    PRESLIDING,
+    Column("force_sd_N", "standard deviation of the samples in the bin"),
+    Column("n", "samples in the bin", INT),
+    DISPLACEMENT,
+    DISTANCE,
+    TIME,
+    RUN_ORDER,
+    ELAPSED,
     open_=True,
 )
 
@@ -195,8 +186,8 @@ _FIT = (
     Column("identified", "false where these data do not determine it", BOOL),
     Column("reason", "why it is not determined, or a remark such as mu_s < mu_c", TEXT),
 )
-STEADY_FIT = Schema("steady_fit", (CONDITION, SERIES, RUBBER, *_FIT), open_=True)
-AGING_FIT = Schema("aging_fit", (SERIES, RUBBER, *_FIT), open_=True)
+STEADY_FIT = table("steady_fit", CONDITION, SERIES, RUBBER, *_FIT, open_=True)
+AGING_FIT = table("aging_fit", SERIES, RUBBER, *_FIT, open_=True)
 _OTHER = Column("other", "the other parameter; the parameter itself for a variance", TEXT)
 _COVARIANCE = (
     Column("value", "covariance of the two estimates (type A)"),
@@ -204,51 +195,43 @@ _COVARIANCE = (
     Column("identified", "false where these data do not determine one of the two", BOOL),
 )
 _PARAMETER = Column("parameter", "parameter, in the field's symbol", TEXT)
-STEADY_COVARIANCE = Schema(
-    "steady_covariance", (CONDITION, SERIES, RUBBER, MODEL, _PARAMETER, _OTHER, *_COVARIANCE), open_=True
+STEADY_COVARIANCE = table(
+    "steady_covariance", CONDITION, SERIES, RUBBER, MODEL, _PARAMETER, _OTHER, *_COVARIANCE, open_=True
 )
-AGING_COVARIANCE = Schema(
+AGING_COVARIANCE = table(
     "aging_covariance",
-    (
-        SERIES,
-        RUBBER,
-        MODEL,
-        Column("quantity", "what the law is of: mu_s, mu_c, F_s or F_c", TEXT),
-        replace(_PARAMETER, meaning="mu_0, a or ln b"),
-        _OTHER,
-        *_COVARIANCE,
-    ),
+    SERIES,
+    RUBBER,
+    MODEL,
+    Column("quantity", "what the law is of: mu_s, mu_c, F_s or F_c", TEXT),
+    replace(_PARAMETER, meaning="mu_0, a or ln b"),
+    _OTHER,
+    *_COVARIANCE,
     open_=True,
 )
-STEADY_SHIFT = Schema(
+STEADY_SHIFT = table(
     "steady_shift",
-    (
-        CONDITION,
-        SERIES,
-        RUBBER,
-        MODEL,
-        Column(
-            "source", "sensor: it reads one standard uncertainty too high | 1, 2, ...: of the effects", TEXT
-        ),
-        _PARAMETER,
-        Column("value", "change of the parameter, common to all conditions in sign"),
-        Column("unit", "unit of value", TEXT),
-        Column("identified", "false where these data do not determine the parameter", BOOL),
-    ),
+    CONDITION,
+    SERIES,
+    RUBBER,
+    MODEL,
+    Column("source", "sensor: it reads one standard uncertainty too high | 1, 2, ...: of the effects", TEXT),
+    _PARAMETER,
+    Column("value", "change of the parameter, common to all conditions in sign"),
+    Column("unit", "unit of value", TEXT),
+    Column("identified", "false where these data do not determine the parameter", BOOL),
     open_=True,
 )
-DYNAMIC_FIT = Schema("dynamic_fit", (CONDITION, SERIES, RUBBER, DIRECTION, SPEED_SET, *_FIT), open_=True)
+DYNAMIC_FIT = table("dynamic_fit", CONDITION, SERIES, RUBBER, DIRECTION, SPEED_SET, *_FIT, open_=True)
 
-STEADY_AFTER = Schema(
+STEADY_AFTER = table(
     "steady_after",
-    (
-        *(
-            replace(c, meaning=f"{c.meaning}, less `effects_N`") if c.name == "force_N" else c
-            for c in STEADY.columns
-        ),
-        Column("effects_N", "mean force of the subtracted effects over the steady window"),
-        Column("effects_start_N", "force of these effects at the start of the stroke"),
+    *(
+        replace(c, meaning=f"{c.meaning}, less `effects_N`") if c.name == "force_N" else c
+        for c in STEADY.columns
     ),
+    Column("effects_N", "mean force of the subtracted effects over the steady window"),
+    Column("effects_start_N", "force of these effects at the start of the stroke"),
     # Channels, and effects_u1_N, ...: directions in which the effects are uncertain, one standard error each.
     open_=True,
 )
@@ -260,21 +243,19 @@ _ESTIMATE = (
     Column("hi95", "upper end of the 95 % interval"),
     Column("unit", "unit of value, lo95 and hi95", TEXT),
 )
-EFFECTS = Schema(
+EFFECTS = table(
     "effects",
-    (
-        Column("round", "round of the loop in which it was added", INT),
-        Column("id", "name in the catalogue, or smooth, levels, ...", TEXT),
-        Column("label", "in words", TEXT),
-        Column("channels", "channels it reads, separated by spaces", TEXT),
-        Column("acts_on", "force, mu or a parameter of the declared model", TEXT),
-        Column("operation", "add | multiply", TEXT),
-        Column("form", "equation", TEXT),
-        Column("named", "false where no closed form fits as well as the free shape", BOOL),
-        Column("parameter", "parameter, in the field's symbol", TEXT),
-        *_ESTIMATE,
-        Column("p_value", "adjusted over the whole search"),
-    ),
+    Column("round", "round of the loop in which it was added", INT),
+    Column("id", "name in the catalogue, or smooth, levels, ...", TEXT),
+    Column("label", "in words", TEXT),
+    Column("channels", "channels it reads, separated by spaces", TEXT),
+    Column("acts_on", "force, mu or a parameter of the declared model", TEXT),
+    Column("operation", "add | multiply", TEXT),
+    Column("form", "equation", TEXT),
+    Column("named", "false where no closed form fits as well as the free shape", BOOL),
+    Column("parameter", "parameter, in the field's symbol", TEXT),
+    *_ESTIMATE,
+    Column("p_value", "adjusted over the whole search"),
 )
 _RESIDUALS = (
     *BINS.columns,
@@ -284,148 +265,128 @@ _RESIDUALS = (
     Column("heldout_residual_N", "measured minus held-out model"),
     Column("weight", "weight in the errors: each file weighs the same"),
 )
-RESIDUALS_BEFORE = Schema("residuals_before", _RESIDUALS, open_=True)
-RESIDUALS_AFTER = Schema("residuals_after", _RESIDUALS, open_=True)
+RESIDUALS_BEFORE = table("residuals_before", *_RESIDUALS, open_=True)
+RESIDUALS_AFTER = table("residuals_after", *_RESIDUALS, open_=True)
 
 # ---------------------------------------------------------------- values of the report's plots of the loop
-LEVELS = Schema(
+LEVELS = table(
     "levels",
-    (
-        Column("stage", "before | after", TEXT),
-        Column("level", "sample | stroke | file | run | specimen", TEXT),
-        Column("channel", "null for the whole level; else the channel tested at it", TEXT),
-        Column(
-            "sd_N",
-            "standard deviation of the residual at this level, or of the part that the channel explains",
-        ),
-        Column("share", "share of the residual's variance"),
-        Column("df", "degrees of freedom"),
-        Column("p_value", "p-value of the channel, adjusted over the search; null for a level"),
+    Column("stage", "before | after", TEXT),
+    Column("level", "sample | stroke | file | run | specimen", TEXT),
+    Column("channel", "null for the whole level; else the channel tested at it", TEXT),
+    Column(
+        "sd_N",
+        "standard deviation of the residual at this level, or of the part that the channel explains",
     ),
+    Column("share", "share of the residual's variance"),
+    Column("df", "degrees of freedom"),
+    Column("p_value", "p-value of the channel, adjusted over the search; null for a level"),
 )
-CHANNELS = Schema(
+CHANNELS = table(
     "channels",
-    (
-        Column("channel", "channel", TEXT),
-        Column("x", "middle of the group of channel values; null for a category"),
-        Column("label", "the category, or null", TEXT),
-        Column("n", "bins rows in the group", INT),
-        Column("before_N", "mean residual before"),
-        Column("before_se_N", "its standard error, from whole units"),
-        Column("before_run", "run with the largest mean residual in the group", TEXT),
-        Column("after_N", "mean residual after"),
-        Column("after_se_N", "its standard error, from whole units"),
-        Column("after_run", "run with the largest mean residual in the group", TEXT),
-    ),
+    Column("channel", "channel", TEXT),
+    Column("x", "middle of the group of channel values; null for a category"),
+    Column("label", "the category, or null", TEXT),
+    Column("n", "bins rows in the group", INT),
+    Column("before_N", "mean residual before"),
+    Column("before_se_N", "its standard error, from whole units"),
+    Column("before_run", "run with the largest mean residual in the group", TEXT),
+    Column("after_N", "mean residual after"),
+    Column("after_se_N", "its standard error, from whole units"),
+    Column("after_run", "run with the largest mean residual in the group", TEXT),
 )
-SHAPES = Schema(
+SHAPES = table(
     "shapes",
-    (
-        Column("effect", "row in closure.json's effects, from 0", INT),
-        Column("id", "effect", TEXT),
-        Column("channel", "channel drawn along", TEXT),
-        Column("x", "channel value; null for a category"),
-        Column("label", "the category, or null", TEXT),
-        Column("value", "added force, factor minus one, or change of the parameter"),
-        Column("lo95", "lower end of the 95 % band"),
-        Column("hi95", "upper end of the 95 % band"),
-        Column("free", "the free smooth shape at x, null where none was fitted"),
-        Column("unit", "unit of value, lo95, hi95 and free", TEXT),
-    ),
+    Column("effect", "row in closure.json's effects, from 0", INT),
+    Column("id", "effect", TEXT),
+    Column("channel", "channel drawn along", TEXT),
+    Column("x", "channel value; null for a category"),
+    Column("label", "the category, or null", TEXT),
+    Column("value", "added force, factor minus one, or change of the parameter"),
+    Column("lo95", "lower end of the 95 % band"),
+    Column("hi95", "upper end of the 95 % band"),
+    Column("free", "the free smooth shape at x, null where none was fitted"),
+    Column("unit", "unit of value, lo95, hi95 and free", TEXT),
 )
-CURVES = Schema(
+CURVES = table(
     "curves",
-    (
-        CONDITION,
-        SERIES,
-        SPEED,
-        LOAD,
-        Column("force_before_N", "declared model"),
-        Column("force_after_N", "model with its effects, other channels at their means"),
-        Column("force_after_lo95_N", "lower end of the mean's 95 % interval"),
-        Column("force_after_hi95_N", "upper end of the mean's 95 % interval"),
-    ),
+    CONDITION,
+    SERIES,
+    SPEED,
+    LOAD,
+    Column("force_before_N", "declared model"),
+    Column("force_after_N", "model with its effects, other channels at their means"),
+    Column("force_after_lo95_N", "lower end of the mean's 95 % interval"),
+    Column("force_after_hi95_N", "upper end of the mean's 95 % interval"),
     open_=True,
 )
-AGING_LAWS = Schema(
+AGING_LAWS = table(
     "aging_laws",
-    (
-        RUBBER,
-        MODEL,
-        Column("quantity", "mu_s, mu_c, F_s or F_c", TEXT),
-        Column("law", "log | stretched | power | induction, for all series; or separate laws", TEXT),
-        Column(
-            "way", "what temperature and compression change: rate | loss; empty where neither varies", TEXT
-        ),
-        Column("form", "equation", TEXT),
-        Column("rank", "1: lowest BIC", INT),
-        Column("rival", "true where it is not distinguishable from the best law with these data", BOOL),
-        Column("criterion", "BIC minus that of the best law"),
-        Column("scatter_rel", "relative scatter between specimens about the law"),
-        Column("lack_of_fit_p", "of the law against replicates; null without them"),
-        Column(
-            "heldout_series",
-            "RMS error on held-out series (50 of them, if there are more), in the quantity's unit",
-        ),
-        Column("heldout_last_day", "RMS error on the held-out last days of these series"),
-        Column("parameter", "parameter; null for separate laws", TEXT),
-        *_ESTIMATE,
-        Column("identified", "false where these data do not determine it", BOOL),
+    RUBBER,
+    MODEL,
+    Column("quantity", "mu_s, mu_c, F_s or F_c", TEXT),
+    Column("law", "log | stretched | power | induction, for all series; or separate laws", TEXT),
+    Column("way", "what temperature and compression change: rate | loss; empty where neither varies", TEXT),
+    Column("form", "equation", TEXT),
+    Column("rank", "1: lowest BIC", INT),
+    Column("rival", "true where it is not distinguishable from the best law with these data", BOOL),
+    Column("criterion", "BIC minus that of the best law"),
+    Column("scatter_rel", "relative scatter between specimens about the law"),
+    Column("lack_of_fit_p", "of the law against replicates; null without them"),
+    Column(
+        "heldout_series",
+        "RMS error on held-out series (50 of them, if there are more), in the quantity's unit",
     ),
+    Column("heldout_last_day", "RMS error on the held-out last days of these series"),
+    Column("parameter", "parameter; null for separate laws", TEXT),
+    *_ESTIMATE,
+    Column("identified", "false where these data do not determine it", BOOL),
 )
-PROPERTY_VALUES = Schema(
+PROPERTY_VALUES = table(
     "property_values",
-    (
-        CONDITION,
-        SERIES,
-        RUBBER,
-        Column("aging_days", "aging time"),
-        Column("quantity", "property: the column's name", TEXT),
-        Column("value", "value of one specimen"),
-        Column("unit", "unit of value", TEXT),
-        Column("batch", "batch of the specimen; null if none is named", TEXT),
-        Column("line", "line in the table of values", INT),
-    ),
+    CONDITION,
+    SERIES,
+    RUBBER,
+    Column("aging_days", "aging time"),
+    Column("quantity", "property: the column's name", TEXT),
+    Column("value", "value of one specimen"),
+    Column("unit", "unit of value", TEXT),
+    Column("batch", "batch of the specimen; null if none is named", TEXT),
+    Column("line", "line in the table of values", INT),
     open_=True,
 )
-MASTER_CURVE = Schema(
+MASTER_CURVE = table(
     "master_curve",
-    (
-        RUBBER,
-        Column("quantity", "mu_s, mu_c, F_s or F_c", TEXT),
-        Column("kind", "value | law", TEXT),
-        Column("scaled_days", "aging time, by the rate where temperature and compression change that"),
-        Column("value", "value of a condition, brought to the reference where that changes the loss; or law"),
-        Column("lo95", "lower end of the law's 95 % band"),
-        Column("hi95", "upper end of the law's 95 % band"),
-        Column("temperature_C", "aging temperature; null for unaged rubber and for the law"),
-        Column("compression_ratio_pct", "height while aging; null for unaged rubber and for the law"),
-        Column("aging_days", "aging time; null for the law"),
-    ),
+    RUBBER,
+    Column("quantity", "mu_s, mu_c, F_s or F_c", TEXT),
+    Column("kind", "value | law", TEXT),
+    Column("scaled_days", "aging time, by the rate where temperature and compression change that"),
+    Column("value", "value of a condition, brought to the reference where that changes the loss; or law"),
+    Column("lo95", "lower end of the law's 95 % band"),
+    Column("hi95", "upper end of the law's 95 % band"),
+    Column("temperature_C", "aging temperature; null for unaged rubber and for the law"),
+    Column("compression_ratio_pct", "height while aging; null for unaged rubber and for the law"),
+    Column("aging_days", "aging time; null for the law"),
 )
-DYNAMIC_CURVES = Schema(
+DYNAMIC_CURVES = table(
     "dynamic_curves",
-    (
-        CONDITION,
-        SPEED_SET,
-        DIRECTION,
-        Column("distance_mm", "distance slid since the platform began to move"),
-        Column("force_N", "mean force of the starts, in the direction of motion"),
-        Column("force_se_N", "standard error of that mean, from the starts; null for one start"),
-        Column("n", "starts averaged", INT),
-        Column("model_N", "mean of the fitted dynamic model over the same samples; null without a fit"),
-    ),
+    CONDITION,
+    SPEED_SET,
+    DIRECTION,
+    Column("distance_mm", "distance slid since the platform began to move"),
+    Column("force_N", "mean force of the starts, in the direction of motion"),
+    Column("force_se_N", "standard error of that mean, from the starts; null for one start"),
+    Column("n", "starts averaged", INT),
+    Column("model_N", "mean of the fitted dynamic model over the same samples; null without a fit"),
 )
-AGING_CURVES = Schema(
+AGING_CURVES = table(
     "aging_curves",
-    (
-        SERIES,
-        Column("quantity", "mu_s or mu_c", TEXT),
-        Column("aging_days", "aging time"),
-        Column("value", "the law's value"),
-        Column("lo95", "lower end of its 95 % interval"),
-        Column("hi95", "upper end of its 95 % interval"),
-    ),
+    SERIES,
+    Column("quantity", "mu_s or mu_c", TEXT),
+    Column("aging_days", "aging time"),
+    Column("value", "the law's value"),
+    Column("lo95", "lower end of its 95 % interval"),
+    Column("hi95", "upper end of its 95 % interval"),
 )
 
 _INGESTED = (INPUTS, RUNS, QUALITY, TRACES, TRACES_MEAN, STEADY, BINS)
