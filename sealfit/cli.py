@@ -8,6 +8,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -201,13 +202,11 @@ def check(
     as_json: Json = False,
 ) -> None:
     """List every fault of a campaign, write nothing."""
-    count = _workers(workers, scheduler)
+    options = _options(workers, scheduler)
     from sealfit import commands, progress
     from sealfit.report import summary_lines
 
-    found, faults = commands.check(
-        campaign, config, workers=count, scheduler=scheduler, progress=progress.to_stderr()
-    )
+    found, faults = commands.check(campaign, config, progress=progress.to_stderr(), **options)
     if as_json:
         errors = [fault.as_dict() for fault in faults]
         print_json({"ok": not faults, "command": "check", **found, "errors": errors})
@@ -434,7 +433,7 @@ def _do(command: str, profile: bool, as_json: bool, work: Callable[..., dict]) -
     with progress.profiled() as parts:
         made = work(progress=progress.to_stderr())
     if profile:
-        made["profile"] = progress.as_dicts(parts)
+        made["profile"] = [asdict(part) for part in parts]
 
     def lines(made: dict) -> list[str]:
         return summary_lines.lines(made) + progress.lines(made.get("profile", ()))
@@ -443,18 +442,13 @@ def _do(command: str, profile: bool, as_json: bool, work: Callable[..., dict]) -
 
 
 def _options(workers: int | None, scheduler: str | None, **more: object) -> dict:
-    """Return the options of `pipeline.Options`."""
-    return {"workers": _workers(workers, scheduler), "scheduler": scheduler, **more}
-
-
-def _workers(workers: int | None, scheduler: str | None) -> int:
-    """Return how many processes of this computer to use."""
+    """Return the options of `pipeline.Options`; without `workers`, all cores of this computer."""
     from sealfit.engine import run_map
 
     if workers is not None and scheduler is not None:
         either = "use either --workers (this computer) or --scheduler (a Dask cluster), not both."
         raise typer.BadParameter(either)
-    return workers or run_map.cores()
+    return {"workers": workers or run_map.cores(), "scheduler": scheduler, **more}
 
 
 def main() -> None:

@@ -30,9 +30,21 @@ class Silent:
 
     def warn(self, text: str) -> None:
         """Say what the user should know."""
+        self.say(f"warning: {text}")
 
     def faults(self, faults: Iterable[Fault]) -> None:
-        """List the faults found in a campaign."""
+        """List the faults found in a campaign, those of all of it first; only the first if they are many.
+
+        One that many files share is one line.
+        """
+        groups = grouped(fault for fault in faults if fault.severity != "info")
+        groups.sort(key=lambda group: group[0].file is not None)
+        for group in groups[:FAULTS_SHOWN]:
+            left_out = "" if group[0].action == "kept" else f" [{group[0].action}]"
+            self.say(f"{group[0].severity}: {told(group)}{left_out}")
+        if len(groups) > FAULTS_SHOWN:
+            more = sum(len(group) for group in groups[FAULTS_SHOWN:])
+            self.say(f"... and {more} more: `sealfit check` lists them all, the quality table too.")
 
     @contextlib.contextmanager
     def working(self, what: str) -> Iterator[None]:
@@ -56,24 +68,6 @@ class Lines(Silent):
         """Say what is being done."""
         self._said_at = time.monotonic()
         print(text, file=self._stream, flush=True)
-
-    def warn(self, text: str) -> None:
-        """Say what the user should know."""
-        self.say(f"warning: {text}")
-
-    def faults(self, faults: Iterable[Fault]) -> None:
-        """List the faults found in a campaign, those of all of it first; only the first if they are many.
-
-        One that many files share is one line.
-        """
-        groups = grouped(fault for fault in faults if fault.severity != "info")
-        groups.sort(key=lambda group: group[0].file is not None)
-        for group in groups[:FAULTS_SHOWN]:
-            left_out = "" if group[0].action == "kept" else f" [{group[0].action}]"
-            self.say(f"{group[0].severity}: {told(group)}{left_out}")
-        if len(groups) > FAULTS_SHOWN:
-            more = sum(len(group) for group in groups[FAULTS_SHOWN:])
-            self.say(f"... and {more} more: `sealfit check` lists them all, the quality table too.")
 
     @contextlib.contextmanager
     def working(self, what: str) -> Iterator[None]:
@@ -180,17 +174,17 @@ def for_notebook() -> Lines:
 
 @dataclass
 class Part:
-    """A step (`depth` 0) or a part of one: `rows` counts what it worked on, in `of`."""
+    """Seconds of a step, or of a part of it: `rows` counts what it worked on, in `of`."""
 
-    name: str
-    depth: int
+    step: str
+    part: str | None  # None: the whole step
     seconds: float = 0.0
     rows: int | None = None
     of: str = ""
 
 
 _parts: ContextVar[list[Part] | None] = ContextVar("parts", default=None)
-_depth: ContextVar[int] = ContextVar("depth", default=0)
+_step: ContextVar[str | None] = ContextVar("step", default=None)
 
 
 @contextlib.contextmanager
@@ -212,33 +206,22 @@ def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[Part]:
     --------
     >>> with profiled() as parts, timed("ingest"), timed("reading", rows=3, of="files"):
     ...     pass
-    >>> [(part.name, part.depth, part.rows, part.of) for part in parts]
-    [('ingest', 0, None, ''), ('reading', 1, 3, 'files')]
+    >>> [(part.step, part.part, part.rows, part.of) for part in parts]
+    [('ingest', None, None, ''), ('ingest', 'reading', 3, 'files')]
     """
-    parts = _parts.get()
-    part = Part(name, _depth.get(), rows=rows, of=of)
+    parts, step = _parts.get(), _step.get()
+    part = Part(step or name, name if step else None, rows=rows, of=of)
     if parts is None:
         yield part
         return
     parts.append(part)
-    token = _depth.set(part.depth + 1)
+    token = _step.set(part.step)
     began = time.perf_counter()
     try:
         yield part
     finally:
-        part.seconds = time.perf_counter() - began
-        _depth.reset(token)
-
-
-def as_dicts(parts: Sequence[Part]) -> list[dict]:
-    """Return the parts as plain values: step, part (null for the step), seconds, rows and what these are."""
-    found, step = [], ""
-    for part in parts:
-        step = part.name if part.depth == 0 else step
-        name = None if part.depth == 0 else part.name
-        seconds = round(part.seconds, 3)
-        found.append({"step": step, "part": name, "seconds": seconds, "rows": part.rows, "of": part.of})
-    return found
+        part.seconds = round(time.perf_counter() - began, 3)
+        _step.reset(token)
 
 
 def lines(profile: Sequence[Mapping]) -> list[str]:
