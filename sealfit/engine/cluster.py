@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import re
 import socket
 import threading
@@ -70,23 +71,17 @@ class Cluster:
             raise RequestError(f"the cluster {self.scheduler} has no workers.", fix=fix)
         if others := {worker: found for worker, found in versions.items() if found != __version__}:
             worker, found = next(iter(others.items()))
-            raise RequestError(
-                f"the worker {worker} has sealfit {found}, here is {__version__}.",
-                fix="Install the same version on all workers.",
-            )
+            reason = f"the worker {worker} has sealfit {found}, here is {__version__}."
+            raise RequestError(reason, fix="Install the same version on all workers.")
 
     def require_folders(self, *folders: Path) -> None:
         """Raise RequestError unless every worker sees these folders."""
-        for folder in folders:
+        for folder in map(Path.resolve, folders):
             with self._reached():
-                found = self._client.run(_is_folder, str(folder.resolve()))
-            for worker, there in found.items():
-                if not there:
-                    raise RequestError(
-                        f"the worker {worker} does not see the folder {folder.resolve()}.",
-                        fix="Put campaign and OUT on a file system that all workers share, under the same "
-                        "path.",
-                    )
+                found = self._client.run(os.path.isdir, str(folder))
+            if blind := [worker for worker, there in found.items() if not there]:
+                fix = "Put campaign and OUT on a file system that all workers share, under the same path."
+                raise RequestError(f"the worker {blind[0]} does not see the folder {folder}.", fix=fix)
 
     def threads(self) -> int:
         """Return the present number of threads of the cluster; WorkerError if its scheduler went away."""
@@ -114,10 +109,7 @@ class Cluster:
     def apply(self, function: Callable[[bytes], list], chunks: Iterator[bytes]) -> Iterator[list]:
         """Yield the list that `function` returns for each chunk.
 
-        Raises
-        ------
-        WorkerError
-            If the cluster gives a chunk up, or goes away.
+        WorkerError if the cluster gives a chunk up, or goes away.
         """
         import dask
         from distributed import CancelledError, KilledWorker
@@ -126,14 +118,11 @@ class Cluster:
 
         def send() -> None:
             room = max(2, WAITING_PER_THREAD * self.threads()) - len(sent)
-            with dask.config.set(
-                {"distributed.admin.large-graph-warning-threshold": "1 TB"}
-            ):  # a fold is large
+            # No warning of large chunks, as a fold is large.
+            with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
                 for chunk in islice(chunks, max(room, 0)):
-                    # A unique key, because Dask would merge equal chunks of two runs.
-                    sent.append(
-                        self._client.submit(function, chunk, key=f"sealfit-{uuid.uuid4().hex}", pure=False)
-                    )
+                    key = f"sealfit-{uuid.uuid4().hex}"  # Dask would merge equal chunks of two runs
+                    sent.append(self._client.submit(function, chunk, key=key, pure=False))
 
         try:
             send()
@@ -143,10 +132,9 @@ class Cluster:
                 send()
                 yield made
         except KilledWorker as error:
-            raise WorkerError(
-                "several workers of the cluster died over the same piece of work.",
-                fix="If memory ran out, give the workers more of it; their logs say more.",
-            ) from error
+            fix = "If memory ran out, give the workers more of it; their logs say more."
+            what = "several workers of the cluster died over the same piece of work."
+            raise WorkerError(what, fix=fix) from error
         except (CancelledError, OSError) as error:
             if sent and sent[0].status == "error":  # raised by the work itself
                 raise
@@ -168,10 +156,8 @@ class Cluster:
                     if future.status == "error":  # the work itself ended with one
                         raise
             alone = alone + LOOK_S if not self.threads() else 0.0
-        raise WorkerError(
-            f"the cluster {self.scheduler} has no workers left.",
-            fix="If memory ran out, give them more of it; start them again, then run the command again.",
-        )
+        fix = "If memory ran out, give them more of it; start them again, then run the command again."
+        raise WorkerError(f"the cluster {self.scheduler} has no workers left.", fix=fix)
 
 
 def _connected(scheduler: str) -> Client:
@@ -181,47 +167,33 @@ def _connected(scheduler: str) -> Client:
     except ImportError as error:
         raise RequestError("Dask is not installed.", fix="Run: pip install 'sealfit[cluster]'") from error
     try:
-        address = (
-            json.loads(Path(scheduler).read_text("utf-8"))["address"]
-            if Path(scheduler).is_file()
-            else scheduler
-        )
+        address = scheduler
+        if Path(scheduler).is_file():
+            address = json.loads(Path(scheduler).read_text("utf-8"))["address"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RequestError(
-            f"{scheduler} is not a scheduler file.", fix=f"Give one that Dask wrote, or {EXAMPLE}."
-        ) from error
+        fix = f"Give one that Dask wrote, or {EXAMPLE}."
+        raise RequestError(f"{scheduler} is not a scheduler file.", fix=fix) from error
     place = re.fullmatch(r"\w+://\[?(?P<host>[^]]+)\]?:(?P<port>\d+)", address)
     if place is None:
-        raise RequestError(
-            f"'{scheduler}' is not an address of a scheduler.", fix=f"Write {EXAMPLE}, or its file."
-        )
+        fix = f"Write {EXAMPLE}, or its file."
+        raise RequestError(f"'{scheduler}' is not an address of a scheduler.", fix=fix)
     encrypted = address.startswith("tls://")
     if encrypted and settings.get("distributed.comm.tls.ca-file", None) is None:
-        raise RequestError(
-            f"{address} asks for a certificate, and none is set here.",
-            fix="Set Dask's TLS options as for the scheduler: see docs/how-to/cluster.md.",
-        )
+        fix = "Set Dask's TLS options as for the scheduler: see docs/how-to/cluster.md."
+        raise RequestError(f"{address} asks for a certificate, and none is set here.", fix=fix)
     if not encrypted and settings.get("distributed.comm.require-encryption", None):
-        raise RequestError(
-            f"{address} is not encrypted, and Dask's options here ask for it.",
-            fix="Give the scheduler's tls:// address, or unset require-encryption.",
-        )
+        fix = "Give the scheduler's tls:// address, or unset require-encryption."
+        raise RequestError(f"{address} is not encrypted, and Dask's options here ask for it.", fix=fix)
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # our own error says it in one line
     try:  # checked first, because a client without a scheduler blocks for a minute
         socket.create_connection((place["host"], int(place["port"])), timeout=CONNECT_S).close()
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise RequestError(
-            f"no Dask scheduler answers at {address}.",
-            fix="Start one (dask scheduler), or give the path of its scheduler file.",
-        ) from error
+        fix = "Start one (dask scheduler), or give the path of its scheduler file."
+        raise RequestError(f"no Dask scheduler answers at {address}.", fix=fix) from error
 
 
 def _version() -> str:
     one_thread()
     return __version__
-
-
-def _is_folder(folder: str) -> bool:
-    return Path(folder).is_dir()

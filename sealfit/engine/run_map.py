@@ -48,17 +48,8 @@ def cores() -> int:
 def on_cluster(scheduler: str | None, *folders: Path) -> Iterator[None]:
     """Run every map of the block on the cluster of a Dask scheduler, or on this computer if it is None.
 
-    Parameters
-    ----------
-    scheduler : str or None
-        Address ("tcp://host:8786"), or path of a scheduler file.
-    folders : Path
-        Folders that every worker has to see.
-
-    Raises
-    ------
-    RequestError
-        If the cluster cannot be used; it says why.
+    The scheduler is an address ("tcp://host:8786") or the path of a scheduler file; every worker has to see
+    the folders. RequestError, which says why, if the cluster cannot be used.
     """
     if scheduler is None:
         yield
@@ -115,17 +106,13 @@ def run_map(
     # Pickled here, because the caller may change the items before another thread pickles them.
     chunks = (pickle.dumps((function, items[start : start + size])) for start in range(0, len(items), size))
     if cluster is None:
-        made = in_processes(_apply, chunks, workers, load=function_module(function))
+        module = getattr(function, "func", function).__module__  # of a function, or of a partial one
+        made = in_processes(_apply, chunks, workers, load=module)
     else:
         made = cluster.apply(_apply, chunks)
     with contextlib.closing(made):
         for results in made:
             yield from results
-
-
-def function_module(function: Callable) -> str:
-    """Return the name of the module of a function or partial function."""
-    return getattr(function, "func", function).__module__
 
 
 def _apply(pickled: bytes) -> list:
@@ -145,18 +132,9 @@ START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() 
 def in_processes(
     apply: Callable[[bytes], list], chunks: Iterator[bytes], workers: int, *, load: str
 ) -> Iterator[list]:
-    """Yield the list that `apply` returns for each chunk.
+    """Yield the list that `apply`, which is at the top level of a module, returns for each chunk.
 
-    Parameters
-    ----------
-    apply : callable
-        At the top level of a module.
-    chunks : iterator of bytes
-        What it is given, one after the other.
-    workers : int
-        Processes to use.
-    load : str
-        Module that the server of processes imports once, so that no process imports it again.
+    `workers` processes are used. Their server imports the module `load` once, so that none imports it again.
 
     Raises
     ------
@@ -182,7 +160,8 @@ def in_processes(
             yield made
         finished = True
     except (BrokenProcessPool, EOFError) as error:  # EOFError if the fork server died
-        raise _died() from error
+        fix = "If memory ran out, use fewer workers (--workers 1)."
+        raise WorkerError("a worker process died before it had answered.", fix=fix) from error
     finally:
         processes = list((executor._processes or {}).values())
         executor.shutdown(wait=finished, cancel_futures=True)
@@ -191,13 +170,6 @@ def in_processes(
                 process.terminate()
             for process in processes:
                 process.join()
-
-
-def _died() -> WorkerError:
-    return WorkerError(
-        "a worker process died before it had answered.",
-        fix="If memory ran out, use fewer workers (--workers 1).",
-    )
 
 
 @contextlib.contextmanager
