@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,17 +12,10 @@ from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault, OutError, RequestError, StaleError
 from sealfit.pipeline import FAULTY
 from sealfit.progress import Silent
+from sealfit.store import paths
 from sealfit.store.manifest import ConfigCopy
 from sealfit.store.out_folder import Store
-from sealfit.store.paths import (
-    OPTION,
-    RUNS,
-    campaign_folder,
-    existing_file,
-    existing_out,
-    own_effects_folder,
-    what_differs,
-)
+from sealfit.store.paths import OPTION, existing_out, own_effects_folder, what_differs
 from sealfit.units import Units
 
 if TYPE_CHECKING:
@@ -45,20 +39,17 @@ def init(folder: Path, output: Path, *, force: bool = False) -> dict:
     from sealfit.draft.draft import draft
 
     if output.suffix.lower() != ".toml":
-        raise OutError(
-            "is no name for a config.", file=output, fix="Give --output a name that ends in .toml."
-        )
+        fix = "Give --output a name that ends in .toml."
+        raise OutError("is no name for a config.", file=output, fix=fix)
     if output.exists() and not force:
-        raise OutError(
-            "is there already.", file=output, fix="Choose another --output, or replace it with --force."
-        )
+        fix = "Choose another --output, or replace it with --force."
+        raise OutError("is there already.", file=output, fix=fix)
     made = draft(folder)
     try:
         output.write_text(made.text, "utf-8")
     except OSError as error:
-        raise OutError(
-            f"cannot be written ({error.strerror}).", file=output, fix="Choose another --output."
-        ) from error
+        fix = "Choose another --output."
+        raise OutError(f"cannot be written ({error.strerror}).", file=output, fix=fix) from error
     return {
         "config": str(output),
         "folder": str(folder),
@@ -66,7 +57,7 @@ def init(folder: Path, output: Path, *, force: bool = False) -> dict:
         "motion": made.motion,
         "guesses": [asdict(guess) for guess in made.guesses],
         "doubts": [doubt.as_dict() for doubt in made.doubts],
-        "next": made.next_command(output),
+        "next": shlex.join(["sealfit", "check", str(folder), "--config", str(output)]),
     }
 
 
@@ -80,10 +71,7 @@ def check(
 ) -> tuple[dict, list[Fault]]:
     """Read everything, write nothing, and return what was found and every fault.
 
-    Raises
-    ------
-    ConfigError
-        If the config cannot be used.
+    ConfigError if the config cannot be used.
     """
     from sealfit.ingest.campaign import ingest_campaign
     from sealfit.report import summary
@@ -92,7 +80,7 @@ def check(
     checked = source.parse()
     own_effects_folder(None, source, campaign)
     try:
-        folder = campaign_folder(campaign, checked)
+        folder = paths.campaign_folder(campaign, checked)
         with on_cluster(scheduler, folder), (progress or Silent()).counting("reading trace files") as on_file:
             ingested = ingest_campaign(folder, checked, workers=workers, on_file=on_file)
     except CampaignError as error:
@@ -274,9 +262,9 @@ def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
     from sealfit.simulation import load_spec, truth_path
     from sealfit.simulation import simulate as make
 
-    loaded = load_spec(existing_file(spec, "spec"))
+    loaded = load_spec(paths.existing_file(spec, "spec"))
     if not force and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
         raise OutError("is there already.", file=out, fix="Choose another --out, or replace it with --force.")
     make(loaded, out)
-    files = sum(1 for path in out.rglob("*") if path.is_file() and path.name != RUNS)
+    files = sum(1 for path in out.rglob("*") if path.is_file() and path.name != paths.RUNS)
     return {"campaign": str(out), "truth": str(truth_path(out)), "files": files}

@@ -83,12 +83,7 @@ class Roles:
 def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
     """Return the columns that hold numbers.
 
-    Parameters
-    ----------
-    dialect : Dialect
-        How the files are written.
-    tables : sequence of ndarray, shape (rows, width)
-        The numbers of some files, nan where there are none.
+    `tables` are the numbers of some files, each of shape (rows, width), nan where there are none.
     """
     found = []
     for i in dialect.numbers:
@@ -163,8 +158,6 @@ def _as_time(column: Column) -> float:
 
 
 def _as_displacement(column: Column) -> float:
-    if all(np.ptp(values) == 0 for values in column.values):
-        return 0.0
     return float(np.median([motion.spread(v) * motion.smoothness(v) for v in column.values]))
 
 

@@ -76,16 +76,8 @@ def column_guesses(
 ) -> tuple[list[Guess], str]:
     """Return the config lines that bring a column into a slot, and the helper column they need, "" for none.
 
-    A column of the other sign is read under a helper's name and computed.
-
-    Parameters
-    ----------
-    slot : str
-        `time_s`, `displacement_mm`, `force_N` or `load_N`.
-    unit : Unit or None
-        Its unit; None for that of the slot.
-    sign : int
-        -1 to change the sign.
+    `slot` is `time_s`, `displacement_mm`, `force_N` or `load_N`; `unit` None is that of the slot. With `sign`
+    -1 the column is read under a helper's name and computed.
     """
     value = file_column(column.key, unit, slot)
     if sign > 0:

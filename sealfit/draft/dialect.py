@@ -69,13 +69,8 @@ class Dialect:
 def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialect | None:
     """Return how a text is written; None if it holds no table of numbers with at least two columns.
 
-    Parameters
-    ----------
-    text : str
-        The file, or with `whole` False its beginning; lines end in a line feed.
-    likely : str, optional
-        The separator of files that are named alike; it is tried first, as clevercsv takes longer than all the
-        rest.
+    The text is the file, or with `whole` False its beginning; lines end in a line feed. `likely` is the
+    separator of files that are named alike: it is tried first, as clevercsv takes longer than all the rest.
     """
     lines = text.split("\n")
     if not whole:
@@ -86,8 +81,8 @@ def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialec
     mixed = None  # with columns of text: right only where no other separator leaves nothing but numbers
     for delimiter in _in_turn(sample, likely):
         found = [_block(sample, delimiter, decimal) for decimal in (".", ",") if decimal != delimiter]
-        # The first, a point, where there are whole numbers only.
-        best = max(found, key=lambda block: block.score)
+        # Most cells that are numbers; the first, a point, where there are whole numbers only.
+        best = max(found, key=lambda block: block.rows * len(block.numbers))
         if best.rows >= MIN_ROWS and len(best.numbers) >= 2:
             if best.pure:
                 return _dialect(lines, delimiter, best, whole)
@@ -129,11 +124,6 @@ class _Block:
     rows: int
     numbers: tuple[int, ...]
     pure: bool = False  # nothing but numbers in its lines
-
-    @property
-    def score(self) -> int:
-        """Cells that are numbers."""
-        return self.rows * len(self.numbers)
 
 
 def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:

@@ -23,26 +23,15 @@ SHOWN = ("trace.columns.", "condition", "files.glob", "files.name_pattern", "fil
 class Draft:
     """A drafted config: its text, the guesses and the doubts; `motion` says in words how the rig moves."""
 
-    folder: Path
     text: str
     files: int
     motion: str
     guesses: tuple[Guess, ...]
     doubts: tuple[Doubt, ...]
 
-    def next_command(self, config: Path) -> str:
-        """Return the command that tries the config."""
-        return shlex.join(["sealfit", "check", str(self.folder), "--config", str(config)])
-
 
 def draft(folder: Path) -> Draft:
-    """Return the draft of a config that reads the trace files in a folder.
-
-    Raises
-    ------
-    RequestError
-        If there is no such folder, or no trace file in it that is text.
-    """
+    """Return the draft of a config that reads the trace files in a folder; errors as `look`."""
     folder = Path(folder)
     found = look(folder)
     notes = Notes()
@@ -66,7 +55,7 @@ def draft(folder: Path) -> Draft:
     # A draft that is no config is a fault of this module, and raises here.
     parse_config(text, "the drafted config")
     words = trace_keys.motion_words(roles)
-    return Draft(folder, text, len(found.traces), words, tuple(notes.guesses), tuple(notes.doubts))
+    return Draft(text, len(found.traces), words, tuple(notes.guesses), tuple(notes.doubts))
 
 
 def summary_lines(made: dict) -> list[str]:

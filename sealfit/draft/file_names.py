@@ -68,7 +68,7 @@ def read_names(files: Sequence[str]) -> Names:
     names = settings_with(pattern, parts, middle)
     regex = re.compile(pattern)
     unmatched = tuple(file for file in files if not regex.fullmatch(file))
-    return replace(names, unmatched=unmatched, matched=len(files) - len(unmatched))
+    return replace(names, unmatched=unmatched)
 
 
 # ---------------------------------------------------------------- parts
@@ -196,9 +196,8 @@ def _counts(part: Part) -> bool:
 
 def _repeats(part: Part, known: Sequence[Part], rows: Sequence[Sequence[Token]]) -> bool:
     """Whether a number counts from 0 or 1 and differs between files of the same settings."""
-    if len(part.texts) > FEW or len(part.texts) == len(rows) > COUNTED:
-        return False
-    if not _counts_up(part.texts):
+    all_differ = len(part.texts) == len(rows) > COUNTED
+    if len(part.texts) > FEW or all_differ or not _counts_up(part.texts):
         return False
     seen = Counter(tuple(row[other.at].text for other in (*known, part)) for row in rows)
     settings = {tuple(row[other.at].text for other in known) for row in rows}

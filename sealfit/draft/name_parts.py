@@ -62,7 +62,6 @@ class Names:
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     unmatched: tuple[str, ...] = ()
-    matched: int = 0
 
     @property
     def given(self) -> set[str]:

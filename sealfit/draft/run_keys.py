@@ -208,7 +208,7 @@ def _glob_keys(found: Found, source: Source, notes: Notes) -> None:
     pattern = glob_of(found.traces)
     notes.guess("files.glob", pattern, f"finds the trace files: {len(found.traces)}")
     matched = {p.relative_to(found.folder).as_posix() for p in found.folder.glob(pattern) if p.is_file()}
-    unmatched = set(source.names.unmatched) if source.names.pattern is not None else set()
+    unmatched = set(source.names.unmatched)
     table = {source.table.file} if source.table is not None else set()
     surplus = (matched - set(found.traces)) | (unmatched & matched) | (table & matched)
     if surplus:
@@ -265,9 +265,9 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         fix = f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand."
         notes.doubt("files", reason, fix)
         return
-    ours = [part for part in names.parts if part.ours]
+    ours, matched = [part for part in names.parts if part.ours], files - len(names.unmatched)
     said = "; ".join(f"{_example(part)} -> {part.ours} ({part.why}: {_values(part)})" for part in ours)
-    notes.guess("files.name_pattern", names.pattern, f"matches {names.matched} of {files} files. {said}")
+    notes.guess("files.name_pattern", names.pattern, f"matches {matched} of {files} files. {said}")
     for part in ours:
         if part.doubt:
             reason = f"'{_example(part)}': {part.doubt}."

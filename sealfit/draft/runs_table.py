@@ -28,7 +28,6 @@ class RunsTable:
     """
 
     file: str
-    names: tuple[str, ...]
     ours: Mapping[str, str]
     units: Mapping[str, Unit]
     cells: Mapping[str, tuple[str, ...]]
@@ -75,7 +74,7 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
         return None
     named, whole = naming[best]
     ours, units = _meanings(names, best, cells)
-    return RunsTable(file, tuple(names), ours, units, cells, whole == named, named)
+    return RunsTable(file, ours, units, cells, whole == named, named)
 
 
 def _names_files(column: Sequence[str], traces: Sequence[str]) -> tuple[int, int]:

@@ -121,12 +121,7 @@ def column_keys(
 ) -> None:
     """Add which column goes into which slot, and what is done with the others.
 
-    Parameters
-    ----------
-    units : dict
-        The unit of each role's column, as `settled_units` gives it.
-    read : int
-        Files whose columns were read.
+    `units` are those of `settled_units`, `read` is the number of files whose columns were read.
     """
     helpers: list[str] = []
     for role, slot in SLOTS.items():
@@ -227,13 +222,10 @@ def _missing_slots(roles: Roles, notes: Notes) -> None:
 
 def _other_columns(found: Found, roles: Roles, notes: Notes) -> None:
     """Add the columns kept as channels and say which are not used."""
-    kept, ignored = [], []
-    taken = {name.partition(".")[2] for name in SLOTS.values()}
+    ignored, taken = [], {""}
     for column in roles.others:
-        name = _channel(column, taken)
-        if name:
+        if name := _channel(column, taken):
             taken.add(name)
-            kept.append(column)
             notes.guess(f"trace.columns.{name}", column.key, f"{column.place}: kept as a channel")
         else:
             ignored.append(column)
@@ -276,7 +268,6 @@ def settled_units(roles: Roles, notes: Notes) -> dict[str, Unit | None]:
 
 
 def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
-    default = slot.rpartition("_")[2]
     if role == "time":
         step, long = np.median(np.diff(column.values[0])), np.ptp(column.values[0])
         if step >= 1.0 and long > LONG_S:
@@ -284,11 +275,10 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
             reason = f"{column.place} has no unit; {lasts}, so it is taken as ms."
             notes.doubt("trace.columns.time_s", reason, "Change the unit if it is another.")
             return UNITS["ms"]
-    if column.role != role:
-        return None  # said where it is said that nothing but its behaviour speaks for it
-    reason = f"{column.place} has no unit; {default} is assumed."
-    fix = f"If it is another, name it: {slot} = {{ name = ..., unit = ... }}."
-    notes.doubt(f"trace.columns.{slot}", reason, fix)
+    if column.role == role:  # else it is said where nothing but its behaviour speaks for it
+        reason = f"{column.place} has no unit; {slot.rpartition('_')[2]} is assumed."
+        fix = f"If it is another, name it: {slot} = {{ name = ..., unit = ... }}."
+        notes.doubt(f"trace.columns.{slot}", reason, fix)
     return None
 
 
@@ -325,14 +315,15 @@ def motion_keys(
     """Say whether strokes go both ways and how many speeds a file has; return each file's measured speed."""
     if roles.time is None or (roles.displacement is None and roles.speed is None):
         return {}
+    given = {role: unit.name for role, unit in units.items() if unit is not None}
+    in_s, in_mm = conversion(given.get("time", "s"), "s"), conversion(given.get("displacement", "mm"), "mm")
     strokes: dict[str, list[list[float]]] = {}
     for i, file in enumerate(files):
         if roles.displacement is None:
             strokes[file] = [[motion.mean_speed(roles.speed.values[i])]]
             continue
-        time = _in_ours(roles.time.values[i], units.get("time"), "s")
-        way = _in_ours(roles.displacement.values[i], units.get("displacement"), "mm")
-        strokes[file] = motion.plateau_speeds(time, way)
+        time, displacement = in_s(roles.time.values[i]), in_mm(roles.displacement.values[i])
+        strokes[file] = motion.plateau_speeds(time, displacement)
     speeds = {file: [speed for stroke in found for speed in stroke] for file, found in strokes.items()}
     several = {file: found for file, all_ in speeds.items() if (found := motion.several_speeds(all_))}
     steps = {file: found for file, found in several.items() if max(map(len, strokes[file])) > 1}
@@ -345,10 +336,6 @@ def motion_keys(
         notes.doubt("strokes", reason, fix)
     one_speed = {file: found for file, found in speeds.items() if found and file not in several}
     return {file: float(np.median(np.abs(found))) for file, found in one_speed.items()}
-
-
-def _in_ours(values: np.ndarray, unit: Unit | None, ours: str) -> np.ndarray:
-    return values if unit is None else conversion(unit.name, ours)(values)
 
 
 def _shown_speeds(several: Mapping[str, Sequence[float]], files: Sequence[str]) -> str:
