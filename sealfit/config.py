@@ -468,10 +468,7 @@ class Config(Strict):
         return [name for name in self.condition if name != "aging_days"]
 
 
-ConfigPath = Annotated[Path | None, "path of a TOML config, or None for the default inside the package"]
-
-
-def load_config(path: ConfigPath = None) -> Config:
+def load_config(path: Path | None = None) -> Config:
     """Return the config at `path`, or the default that ships inside the package.
 
     Raises
@@ -482,13 +479,10 @@ def load_config(path: ConfigPath = None) -> Config:
     return parse_config(read_config(path), "default.toml" if path is None else str(path))
 
 
-def read_config(path: ConfigPath = None) -> str:
+def read_config(path: Path | None = None) -> str:
     """Return the text of the config at `path`, or of the default that ships inside the package.
 
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read or is not UTF-8.
+    ConfigError if the file cannot be read or is not UTF-8.
     """
     if path is None:
         return files("sealfit").joinpath("configs/default.toml").read_text("utf-8")
@@ -504,13 +498,7 @@ def read_config(path: ConfigPath = None) -> str:
 
 
 def parse_config(text: str, name: str) -> Config:
-    """Return the config written in `text`; `name` is what messages call it.
-
-    Raises
-    ------
-    ConfigError
-        As `load_config`.
-    """
+    """Return the config written in `text`, which messages call `name`; errors as `load_config`."""
     try:
         return Config.model_validate(tomllib.loads(text))
     except ValidationError as error:

@@ -90,15 +90,16 @@ def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
     A place is a line, or a file. Faults are shared that differ in the file, the line, the value and in
     numbers of their reason only.
     """
-    alike: dict[tuple, list[tuple[int, Fault]]] = {}
+    order: dict[int, int] = {}
+    alike: dict[tuple, list[Fault]] = {}
     for place, fault in enumerate(faults):
-        alike.setdefault(_shared(fault), []).append((place, fault))
+        order.setdefault(id(fault), place)
+        alike.setdefault(_shared(fault), []).append(fault)
     found = []
     for group in alike.values():
-        shared = len({(fault.file, fault.line) for _, fault in group}) > EXAMPLES
-        found += [group] if shared else [[one] for one in group]
-    found.sort(key=lambda group: group[0][0])
-    return [[fault for _, fault in group] for group in found]
+        shared = len({(fault.file, fault.line) for fault in group}) > EXAMPLES
+        found += [group] if shared else [[fault] for fault in group]
+    return sorted(found, key=lambda group: order[id(group[0])])
 
 
 def told(group: Sequence[Fault]) -> str:
@@ -179,11 +180,8 @@ def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
     while not parent.is_dir():
         missing, parent = parent, parent.parent
     try:
-        there = sorted(
-            child.name
-            for child in parent.iterdir()
-            if not child.name.startswith(".") and (missing or fits(child))
-        )
+        shown = [child for child in parent.iterdir() if not child.name.startswith(".")]
+        there = sorted(child.name for child in shown if missing or fits(child))
     except OSError:
         return ""
     likely = nearest((missing or path.absolute()).name, there)
@@ -287,6 +285,7 @@ class WorkerError(SealfitError):
 
 # ---------------------------------------------------------------- memory
 
+_NO_MEMORY = ("failed to map segment from shared object", "annot allocate memory", "can't start new thread")
 MEMORY = "memory ran out; what was complete before is kept."
 MORE_MEMORY = "Use fewer workers (--workers 1), or a computer with more memory."
 
@@ -311,10 +310,3 @@ def memory_ran_out(error: BaseException) -> bool:
         return True
     before = error.__cause__ or error.__context__
     return before is not None and memory_ran_out(before)
-
-
-_NO_MEMORY = (
-    "failed to map segment from shared object",
-    "annot allocate memory",
-    "can't start new thread",
-)

@@ -23,10 +23,6 @@ _DEFAULT = {
 }
 
 
-SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
-"""Columns of the slots, under whichever units they hold."""
-
-
 @dataclass(frozen=True, slots=True)
 class Units:
     """The true unit of each slot: `Units({"force": ("torque", "mN m")})` when a config declares one.
@@ -63,8 +59,8 @@ class Units:
 
     def label(self, column: str) -> str:
         """Return an axis label with the true quantity and unit, e.g. "torque (mN m)"."""
-        slot = column.partition("_")[0]
-        if column in SLOTS:
+        if column in ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s"):
+            slot = column.partition("_")[0]
             return f"{self.quantity(slot)} ({self.unit(slot)})"
         unit = self.of(column)
         ending = next((e for e in ("_mm_s", *_ENDINGS) if column.endswith(e)), "") if unit else ""
