@@ -12,23 +12,9 @@ from sealfit.engine import claim_memory
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.progress import Silent, timed
-from sealfit.store.manifest import (
-    BATCH,
-    STEPS,
-    ConfigCopy,
-    Properties,
-    fingerprint,
-    glob_names,
-    provenance,
-)
+from sealfit.store import manifest, paths
+from sealfit.store.manifest import BATCH, STEPS, ConfigCopy, Properties, fingerprint
 from sealfit.store.out_folder import Store
-from sealfit.store.paths import (
-    campaign_folder,
-    existing_file,
-    existing_out,
-    own_effects_folder,
-    possible_tables,
-)
 from sealfit.store.staged_writes import Staged
 
 if TYPE_CHECKING:
@@ -66,27 +52,18 @@ Counted = tuple[int, str]
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How steps are done.
-
-    Parameters
-    ----------
-    workers : int
-        Processes of this computer that read trace files, fit and repeat the search.
-    scheduler : str or None
-        Address or scheduler file of a Dask cluster to do that instead; it has to see both folders.
-    force : bool
-        Do current steps too.
-    strict : bool
-        Stop at any fault of the campaign, after the first step.
-    effects_folder : Path or None
-        Folder of the user's own effects, which is run; it comes before the one that the config names.
-    """
+    """How steps are done."""
 
     workers: int = 1
+    """Processes of this computer that read trace files, fit and repeat the search."""
     scheduler: str | None = None
+    """Address or scheduler file of a Dask cluster to do that instead; it has to see both folders."""
     force: bool = False
+    """Do current steps too."""
     strict: bool = False
+    """Stop at any fault of the campaign, after the first step."""
     effects_folder: Path | None = None
+    """Folder of the user's own effects, which is run; it comes before the one that the config names."""
 
 
 def run(
@@ -116,8 +93,8 @@ def run(
     """
     chosen, source = Options(**options), ConfigCopy.at(config)
     checked = source.parse()
-    own = own_effects_folder(chosen.effects_folder, source, out, campaign)  # before OUT is made
-    folder = campaign_folder(campaign, checked)
+    own = paths.own_effects_folder(chosen.effects_folder, source, out, campaign)  # before OUT is made
+    folder = paths.campaign_folder(campaign, checked)
     with Store.writing(out, folder, source, own) as store, on_cluster(chosen.scheduler, folder, out):
         return _do_steps(store, steps, chosen, progress or Silent())
 
@@ -139,16 +116,8 @@ def fit_properties(
 ) -> dict:
     """Fit the aging laws of properties of specimens, without traces, and return the summary.
 
-    Parameters
-    ----------
-    table : Path
-        CSV, Excel or Parquet file with a row per specimen.
-    out, config : Path
-        As `run`.
-    names, batch
-        As `sealfit.ingest.property_table.read_properties`.
-    **options
-        Fields of `Options`.
+    The table is a CSV, Excel or Parquet file with a row per specimen; `names` and `batch` are as those of
+    `sealfit.ingest.property_table.read_properties`, and all else as for `run`.
 
     Raises
     ------
@@ -157,7 +126,7 @@ def fit_properties(
     """
     chosen, source = Options(**options), ConfigCopy.at(config)
     source.parse()
-    table = existing_file(table, "table of values").resolve()
+    table = paths.existing_file(table, "table of values").resolve()
     asked = Properties(table.name, tuple(names), batch)
     with Store.writing(out, table.parent, source, properties=asked) as store:
         return _do_steps(store, ("fit-aging",), chosen, progress or Silent())
@@ -177,7 +146,7 @@ def single(step: str, out: Path, *, progress: Silent | None = None, **options) -
     """
     chosen = Options(**options)
     with (
-        Store.writing(existing_out(out), effects=chosen.effects_folder) as store,
+        Store.writing(paths.existing_out(out), effects=chosen.effects_folder) as store,
         on_cluster(chosen.scheduler, out),
     ):
         for before in store.up_to(step)[:-1][-1:]:
@@ -228,7 +197,7 @@ def _ingest(store: Store, staged: Staged, options: Options, progress: Silent) ->
 
     campaign, config = store.state.campaign, store.seen_config("ingest")
     # As they were when the reading began.
-    runs_before = {name: fingerprint(campaign / name) for name in possible_tables(config)}
+    runs_before = {name: fingerprint(campaign / name) for name in paths.possible_tables(config)}
     done = store.state.steps.get("ingest")
     known = known_parts(store.out, done.files) if done and not options.force else {}
     place = Place(staged.folder(), known, store.marks)
@@ -240,7 +209,8 @@ def _ingest(store: Store, staged: Staged, options: Options, progress: Silent) ->
             staged.table(name, table)
     staged.adopt(ingested.stored)
     marks = ingested.marks
-    named = {fault.file for fault in ingested.faults if fault.file} | set(glob_names(campaign, config.files))
+    named = {fault.file for fault in ingested.faults if fault.file}
+    named.update(manifest.glob_names(campaign, config.files))
     # Missing or unreadable: if that changes, the campaign has changed.
     marks |= {name: fingerprint(campaign / name) for name in sorted(named - marks.keys())}
     staged.inputs = marks | runs_before
@@ -306,12 +276,11 @@ def _close_loop(store: Store, staged: Staged, options: Options, progress: Silent
 
     store.require_effects()
     config = store.seen_config("close-loop")
-    closure = close_loop(
-        store.read("bins"), store.traces(), config, workers=options.workers, on_progress=progress.say
-    )
+    workers, bins = options.workers, store.read("bins")
+    closure = close_loop(bins, store.traces(), config, workers=workers, on_progress=progress.say)
     if closure.tables["effects"].size:
         progress.say("the fits with the effects taken out")
-    after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=options.workers)
+    after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=workers)
     with timed("writing tables"):
         _write(staged, {**closure.tables, **after})
     started = store.read("runs", ["started_at"])["started_at"].dropna()
@@ -344,7 +313,7 @@ def _report(store: Store, staged: Staged, options: Options, progress: Silent) ->
         tables = report_tables(store)
     with timed("page"):
         closure = store.read_json("closure") if store.state.properties is None else None
-        report = build_report(tables, closure, provenance(store.state), store.seen_config("report"))
+        report = build_report(tables, closure, manifest.provenance(store.state), store.seen_config("report"))
     with timed("writing plots", rows=len(report.figures), of="plots"):
         for name, figure in report.figures.items():
             staged.figure(name, figure)

@@ -560,7 +560,7 @@ def test_results_written_while_they_are_read_are_not_mixed(out, campaign):
 
 def test_every_folder_in_which_a_step_puts_files_is_synced(tmp_path, campaign, monkeypatch):
     out, synced = tmp_path / "new" / "out", []
-    for module in ("out_folder", "staged_writes", "lock"):
+    for module in ("staged_writes", "lock"):
         monkeypatch.setattr(f"sealfit.store.{module}.sync", lambda path: synced.append(Path(path)))
     with Store.writing(out, campaign, ConfigCopy.at(None)) as store, store.step("ingest") as staged:
         staged.table("steady", small("steady"))
@@ -574,7 +574,7 @@ import os, signal, sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 import test_store
-from sealfit.store import out_folder, staged_writes
+from sealfit.store import staged_writes
 
 real_replace, real_write, calls = os.replace, staged_writes.sync, 0
 
@@ -588,7 +588,7 @@ def count(real):
     return counted
 
 os.replace = count(real_replace)
-out_folder.sync = staged_writes.sync = count(real_write)
+staged_writes.sync = count(real_write)
 test_store.do_all(Path({out!r}), Path({campaign!r}), rows=5)
 """
 MOMENTS_PER_STEP = 14  # files written and moved, folders synced

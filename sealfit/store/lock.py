@@ -38,7 +38,11 @@ def undisturbed() -> Iterator[None]:
 
 
 # ---------------------------------------------------------------- lock
-# One writer per OUT: the lock holds host and process, and is released when the process dies.
+# One writer per OUT: the lock names host and process.
+#
+# The kernel drops the lock with the process that held it, however that ended, so the lock of a dead process
+# of this host is taken over at once. Another host's lock is never taken over: what runs there cannot be seen
+# from here. Where the file system has no locks, the process that the file names is looked for.
 
 try:
     import fcntl
@@ -49,39 +53,11 @@ LOCK = ".lock"
 
 
 @contextlib.contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
-    """Hold `folder` for writing while the block runs.
-
-    The kernel drops the lock with the process that held it, however that ended, so the lock of a dead process
-    of this host is taken over at once. Another host's lock is never taken over: what runs there cannot be
-    seen from here. Where the file system has no locks, the process that the file names is looked for.
-
-    Raises
-    ------
-    OutError
-        If another process holds the folder (its host and process id are named), or if the lock cannot be
-        written.
-    """
-    path = folder / LOCK
-    with taken(path) as handle:
-        try:
-            _sign(handle, path)
-            yield
-        finally:
-            with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
-                path.unlink()
-
-
-@contextlib.contextmanager
 def taken(path: Path, option: str = "--out") -> Iterator[int]:
     """Open and lock the file at `path`, and give its descriptor; it is created if missing.
 
-    A link is replaced by a file of its own.
-
-    Raises
-    ------
-    OutError
-        If another process has locked it, or if it cannot be written; the fix names the `option`.
+    A link is replaced by a file of its own. OutError, whose fix names the `option`, if another process has
+    locked it, or if it cannot be written.
     """
     handle = _take(path, option)
     try:
@@ -199,20 +175,30 @@ def held(out: Path) -> Iterator[None]:
         If `out` is a file, a folder that sealfit did not make, in use by another process, or cannot be
         written.
     """
-    made = _make(out)
+    made, path = _make(out), out / LOCK
     try:
-        with only_writer(out):
-            state = State.read(out)
-            if state is not None and state.moving is not None:
-                with undisturbed(), disk(out):
-                    finish(out, state)
-            for left in out.glob(f"{STAGING}*"):
-                shutil.rmtree(left, ignore_errors=True)
-            yield
+        with taken(path) as handle:
+            try:
+                _sign(handle, path)
+                _tidy(out)
+                yield
+            finally:
+                with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
+                    path.unlink()
     finally:
         if made:
             with contextlib.suppress(OSError):  # stays if it is not empty
                 out.rmdir()
+
+
+def _tidy(out: Path) -> None:
+    """Move what an interrupted step left to be moved, and remove other staged files."""
+    state = State.read(out)
+    if state is not None and state.moving is not None:
+        with undisturbed(), disk(out):
+            finish(out, state)
+    for left in out.glob(f"{STAGING}*"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _make(out: Path) -> bool:

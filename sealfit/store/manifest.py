@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -33,14 +34,9 @@ STEPS = ("ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "repo
 STEPS_OF_PROPERTIES = ("fit-aging", "report")
 """The steps of a table of properties, which has no traces."""
 
-FITS = ("fit-steady", "fit-aging", "fit-dynamic")
-"""Steps whose tables close-loop does not read: it fits its own model to the bins."""
-
 UNSEEN = {
     "ingest": {"sensor": Sensor(), "loop": Loop()},
-    "fit-steady": {"loop": Loop()},
-    "fit-aging": {"loop": Loop()},
-    "fit-dynamic": {"loop": Loop()},
+    **{step: {"loop": Loop()} for step in ("fit-steady", "fit-aging", "fit-dynamic")},
 }
 """Parts of the config that a step does not use, with defaults; a change of them does not make it stale."""
 
@@ -148,12 +144,16 @@ PACKAGES = ("numpy", "pandas", "scipy", "pyarrow", "matplotlib", "pydantic", "ji
 
 def provenance(state: State) -> dict:
     """Return versions, campaign, config, every input with its hash, and when each step was done."""
+    packages = {}
+    for name in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            packages[name] = version(name)
     return {
         "program": "sealfit",
         "version": __version__,
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
-        "packages": {name: found for name in PACKAGES if (found := _version(name)) is not None},
+        "packages": packages,
         "campaign": str(state.campaign),
         "table": None if state.properties is None else state.properties.table,
         "config": {
@@ -172,13 +172,6 @@ def provenance(state: State) -> dict:
             for name, done in state.steps.items()
         ],
     }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 # ---------------------------------------------------------------- state
@@ -200,13 +193,7 @@ class ConfigCopy:
 
     @classmethod
     def at(cls, path: Path | None) -> ConfigCopy:
-        """Return the config file at `path`, or the default.
-
-        Raises
-        ------
-        ConfigError
-            If it cannot be read.
-        """
+        """Return the config file at `path`, or the default; ConfigError if it cannot be read."""
         return cls(path.resolve() if path else None, read_config(path))
 
     @property
@@ -221,13 +208,7 @@ class ConfigCopy:
         return self
 
     def parse(self) -> Config:
-        """Return the checked config.
-
-        Raises
-        ------
-        ConfigError
-            If the text is not a config.
-        """
+        """Return the checked config; ConfigError if the text is none."""
         return parse_config(self.text, str(self.path or DEFAULT))
 
     def effects_folder(self) -> Path | None:
@@ -276,21 +257,11 @@ class Done:
 
 @dataclass(frozen=True, slots=True)
 class Properties:
-    """A table of properties of specimens, in the folder that stands for a campaign, and what is asked of it.
-
-    Attributes
-    ----------
-    table : str
-        File name of the table.
-    names : tuple of str
-        Columns of the properties; none for the only one there is.
-    batch : str
-        Column that names the batch.
-    """
+    """A table of properties of specimens in the campaign's folder, and what is asked of it."""
 
     table: Annotated[str, AfterValidator(_file_name)]
-    names: tuple[str, ...]
-    batch: str
+    names: tuple[str, ...]  # columns of the properties; none for the only one there is
+    batch: str  # column that names the batch
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,35 +15,11 @@ from typing import TYPE_CHECKING
 from sealfit import __version__
 from sealfit.config import Config, Files
 from sealfit.errors import ConfigError, OutError, RequestError, StaleError, quoted
+from sealfit.store import manifest, staged_writes
 from sealfit.store.lock import held, undisturbed
-from sealfit.store.manifest import (
-    BATCH,
-    STATE,
-    ConfigCopy,
-    Done,
-    Fingerprint,
-    Moving,
-    Properties,
-    State,
-    changes,
-    fingerprint,
-    provenance,
-    seen_config,
-    step_keys,
-    to_json,
-)
+from sealfit.store.manifest import STATE, ConfigCopy, Fingerprint, Properties, State, fingerprint, to_json
 from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
-from sealfit.store.staged_writes import (
-    BEGUN,
-    ENDED,
-    PARQUET,
-    PROVENANCE,
-    Staged,
-    disk,
-    file_size,
-    finish,
-    sync,
-)
+from sealfit.store.staged_writes import PARQUET, PROVENANCE, Staged, disk, file_size
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,18 +28,14 @@ if TYPE_CHECKING:
 
 
 class Store:
-    """One OUT folder with the campaign and the config it belongs to; `known` if it holds results already.
+    """One OUT folder with the campaign and the config it belongs to.
 
-    `effects` is the folder of the user's own effects that the command line names; the config has it, and no
-    other.
+    `kept` is the state as stored in it. `effects` is the folder of the user's own effects that the command
+    line names; the config has it, and no other.
     """
 
-    def __init__(
-        self, out: Path, state: State, *, known: bool, kept: State | None = None, effects: Path | None = None
-    ):
-        self.out, self.state = out, state
-        self._kept = kept  # the state as stored in `out`
-        self.effects = effects
+    def __init__(self, out: Path, state: State, kept: State | None, effects: Path | None):
+        self.out, self.state, self._kept, self.effects = out, state, kept, effects
         config = state.config.parse()
         self._names_effects = config.loop.effects_folder is not None
         own = {"effects_folder": None if effects is None else str(effects)}
@@ -75,11 +47,10 @@ class Store:
         self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
         if state.campaign.is_dir():
             files = self.config.files if state.properties is None else Files()
-            self._changed = changes(state.campaign, state.inputs, files)
-        elif known:
-            self.warnings.append(
-                f"the campaign folder {state.campaign} is missing, so changes cannot be detected."
-            )
+            self._changed = manifest.changes(state.campaign, state.inputs, files)
+        else:
+            missing = f"the campaign folder {state.campaign} is missing"
+            self.warnings.append(f"{missing}, so changes cannot be detected.")
         self.marks = state.inputs | self._changed  # the present files of the campaign
 
     # ------------------------------------------------------------ opening
@@ -106,8 +77,7 @@ class Store:
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
         hashes = effects_seen(effects, state.own_effects, state.config, config)
-        now = replace(state, config=config, own_effects=hashes)
-        store = cls(out, now, known=True, kept=state, effects=effects)
+        store = cls(out, replace(state, config=config, own_effects=hashes), state, effects)
         store._opened = opened
         return store
 
@@ -158,8 +128,7 @@ class Store:
         table = properties.table if properties else None
         former = kept.properties.table if kept and kept.properties else None
         if kept is None or (not kept.steps and (kept.campaign != campaign or former != table)):
-            state = State(campaign, source, properties, own_effects=hashes)
-            return cls(out, state, known=False, kept=kept, effects=effects)
+            return cls(out, State(campaign, source, properties, own_effects=hashes), kept, effects)
         if former != table:
             what = f"the campaign {kept.campaign}" if former is None else f"the table {former}"
             raise OutError(f"holds the results of {what}.", file=out, fix="Choose another --out.")
@@ -170,11 +139,10 @@ class Store:
                 what = f"belongs to the campaign {kept.campaign}, and {campaign} holds other data."
                 raise OutError(what, file=out, fix="Choose another --out.")
         state = State(campaign, source, properties, inputs, hashes, kept.steps)
-        store = cls(out, state, known=True, kept=kept, effects=effects)
+        store = cls(out, state, kept, effects)
         if moved:
-            store.warnings.append(
-                f"{out} was made from {kept.campaign}; {campaign} holds the same data and takes over."
-            )
+            same = f"{campaign} holds the same data and takes over."
+            store.warnings.append(f"{out} was made from {kept.campaign}; {same}")
         return store
 
     def _keep_what_moved(self) -> None:
@@ -219,16 +187,10 @@ class Store:
         return ""
 
     def _step_keys(self, inputs: Mapping[str, Fingerprint]) -> dict[str, str]:
-        return step_keys(inputs, self.config, self.state.own_effects, self.state.properties)
+        return manifest.step_keys(inputs, self.config, self.state.own_effects, self.state.properties)
 
     def up_to(self, step: str) -> tuple[str, ...]:
-        """Return the steps up to `step`, in order.
-
-        Raises
-        ------
-        RequestError
-            If these results have no such step.
-        """
+        """Return the steps up to `step`, in order; RequestError if these results have no such step."""
         order = self.state.order
         if step not in order:
             laws = f"the aging laws of {self.state.properties.table}, which has no traces"
@@ -236,7 +198,7 @@ class Store:
             raise RequestError(f"{self.out} holds {laws}: there is no {step}.", fix=fix)
         return order[: order.index(step) + 1]
 
-    def _damaged(self, file: str, done: Done) -> bool:
+    def _damaged(self, file: str, done: manifest.Done) -> bool:
         """Whether a file is not what its step wrote; it is read once by this process."""
         if file not in done.checksums:
             return False
@@ -244,7 +206,7 @@ class Store:
             self._checksums[file] = fingerprint(self.out / file).sha256
         return self._checksums[file] != done.checksums[file]
 
-    def _what_changed(self, step: str, done: Done) -> str:
+    def _what_changed(self, step: str, done: manifest.Done) -> str:
         if done.version != __version__:
             return f"it was made by sealfit {done.version}, this is {__version__}"
         known = self.state.inputs
@@ -281,7 +243,7 @@ class Store:
         config = f" --config {quoted(self.state.config.path)}" if self.state.config.path else ""
         if (asked := self.state.properties) is not None:
             names = "".join(f" --property {quoted(name)}" for name in asked.names)
-            batch = f" --batch {quoted(asked.batch)}" if asked.batch != BATCH else ""
+            batch = f" --batch {quoted(asked.batch)}" if asked.batch != manifest.BATCH else ""
             table = quoted(self.state.campaign / asked.table)
             return f"sealfit fit-aging --values {table} --out {out}{config}{names}{batch}"
         return f"sealfit ingest {quoted(self.state.campaign)} --out {out}{config}"
@@ -328,19 +290,12 @@ class Store:
 
     def seen_config(self, step: str) -> Config:
         """Return the config as `step` uses it."""
-        return seen_config(step, self.config)
+        return manifest.seen_config(step, self.config)
 
     # ------------------------------------------------------------ writing
     @contextlib.contextmanager
     def step(self, name: str) -> Iterator[Staged]:
-        """Give a place for the files of step `name`.
-
-        They all take their places when the block ends without an error.
-
-        Parameters
-        ----------
-        name : str
-            One of `STEPS`.
+        """Give a place for the files of step `name`; all are moved when the block ends without an error.
 
         Raises
         ------
@@ -360,22 +315,23 @@ class Store:
         # Copied, as the files below are those of no step.
         files, checksums, steps = dict(staged.files), dict(staged.checksums), self.state.steps
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        done = Done(self._step_keys(inputs)[name], __version__, now, round(seconds, 3), files, checksums)
+        key = self._step_keys(inputs)[name]
+        done = manifest.Done(key, __version__, now, round(seconds, 3), files, checksums)
         earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
         ended = replace(self.state, inputs=inputs, steps={**earlier, name: done})
-        old = steps[name].files if name in steps else {}
-        begun = replace(ended, moving=Moving(staged.name, tuple(sorted(self._left_over(old, files)))))
-        staged.text(BEGUN, to_json(begun.as_dict(), indent=None))
-        staged.text(ENDED, to_json(ended.as_dict(), indent=None))
-        staged.text(PROVENANCE, to_json(provenance(ended), indent=None))
+        left_over = self._left_over(steps[name].files if name in steps else {}, files)
+        begun = replace(ended, moving=manifest.Moving(staged.name, tuple(sorted(left_over))))
+        staged.text(staged_writes.BEGUN, to_json(begun.as_dict(), indent=None))
+        staged.text(staged_writes.ENDED, to_json(ended.as_dict(), indent=None))
+        staged.text(PROVENANCE, to_json(manifest.provenance(ended), indent=None))
         # Until state.json is replaced, OUT is what it was. After that the step is done, and whoever opens OUT
         # next moves the files if this process does not come to it.
         with undisturbed(), disk(self.out):
             staged.sync()
-            staged.replace(BEGUN, STATE)
+            staged.replace(staged_writes.BEGUN, STATE)
             staged.committed = True
-            sync(self.out)
-            finish(self.out, begun)
+            staged_writes.sync(self.out)
+            staged_writes.finish(self.out, begun)
             self.state = ended
         self._checksums |= done.checksums
         if staged.inputs is not None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,16 +36,13 @@ def to_arrow(frame: pd.DataFrame | Columns, schema: Schema, units: Units) -> pa.
         not of the user's data.
     """
     names = [str(name) for name in frame]
-    if len(set(names)) != len(names):
-        raise ValueError(
-            f"table {schema.name}: doubled columns {sorted({n for n in names if names.count(n) > 1})}"
-        )
+    if doubled := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"table {schema.name}: doubled columns {doubled}")
     missing = [name for name in schema.names() if name not in names]
     others = [name for name in names if name not in set(schema.names())]
     if missing or (others and not schema.open_):
-        raise ValueError(
-            f"table {schema.name}: missing columns {missing}, columns that it does not know {others}"
-        )
+        unknown = f"columns that it does not know {others}"
+        raise ValueError(f"table {schema.name}: missing columns {missing}, {unknown}")
 
     arrays, fields = [], []
     for column in (*schema.columns, *(Column(name, CHANNEL, None) for name in others)):
@@ -79,9 +75,7 @@ def with_columns(table: pa.Table, columns: Mapping[str, str], units: Units) -> p
         if wanted == TEXT and pa.types.is_dictionary(values.type):
             wanted = values.type
         elif wanted == TEXT and values.type != TEXT:
-            values = pa.array(
-                values.to_pandas().map(str, na_action="ignore").astype(object), TEXT, from_pandas=True
-            )
+            values = _as_words(values.to_pandas())
         arrays.append(values.cast(wanted))
         fields.append(table.schema.field(at).with_type(wanted))
     return _table(arrays, fields, table.schema.metadata[b"sealfit"])
@@ -105,10 +99,8 @@ def as_dictionary(words: pa.Array, row: np.ndarray) -> pa.Array:
 
 def spelled_out(schema: pa.Schema) -> pa.Schema:
     """Return the schema of the same table without dictionaries, as it is read from the disk."""
-    return pa.schema(
-        [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in schema],
-        schema.metadata,
-    )
+    fields = [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in schema]
+    return pa.schema(fields, schema.metadata)
 
 
 def write_arrow(table: pa.Table, path: Path) -> None:
@@ -157,33 +149,28 @@ def read(
     paths = [path] if isinstance(path, Path) else path
     parts = []
     for one in paths:
-        with _readable(one):
+        try:
             # A tenth of what read_table takes for a small file.
             with pq.ParquetFile(one, read_dictionary=list(coded), page_checksum_verification=True) as file:
                 part = file.read(columns=columns)
             for name, values in (where or {}).items():
                 part = part.filter(pc.is_in(part[name], pa.array(values, TEXT)))
+        except MemoryError:  # Arrow's own is an ArrowException, too
+            raise
+        except (OSError, KeyError, pa.ArrowException) as error:
+            fix = "Make all results again: sealfit run CAMPAIGN --out OUT --force"
+            raise OutError("is missing or damaged.", file=one, fix=fix) from error
         parts.append(part)
     return pa.concat_tables(parts).to_pandas(self_destruct=True)
 
 
-@contextlib.contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Raise OutError for a damaged or missing file."""
-    try:
-        yield
-    except MemoryError:  # Arrow's own is an ArrowException, too
-        raise
-    except (OSError, KeyError, pa.ArrowException) as error:
-        fix = "Make all results again: sealfit run CAMPAIGN --out OUT --force"
-        raise OutError("is missing or damaged.", file=path, fix=fix) from error
-
-
 def _array(values: pd.Series | np.ndarray | pa.Array, column: Column, table: str) -> pa.Array:
     try:
-        array = _whole(values if isinstance(values, pa.Array) else _of_column(values, column))
+        array = values if isinstance(values, pa.Array) else _of_column(values, column)
     except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
         raise ValueError(f"table {table}, column '{column.name}': {error}") from error
+    if isinstance(array, pa.ChunkedArray):
+        array = array.combine_chunks()
     if pa.types.is_null(array.type):  # an optional channel without a single value
         return array.cast(pa.float64())
     if pa.types.is_large_string(array.type):
@@ -195,14 +182,13 @@ def _of_column(values: pd.Series | np.ndarray, column: Column) -> pa.Array | pa.
     if column.dtype == TEXT and isinstance(values.dtype, pd.StringDtype):
         return pa.array(values, from_pandas=True)
     if column.dtype == TEXT or (column.dtype is None and _mixed(values)):
-        values = pd.Series(values).map(str, na_action="ignore").astype(object)
-        return pa.array(values, type=TEXT, from_pandas=True)
+        return _as_words(pd.Series(values))
     missing = values.dtype != float or np.isnan(values).any()  # that none is, is seen faster here
     return pa.array(values, type=column.dtype, from_pandas=missing)
 
 
-def _whole(array: pa.Array | pa.ChunkedArray) -> pa.Array:
-    return array.combine_chunks() if isinstance(array, pa.ChunkedArray) else array
+def _as_words(values: pd.Series) -> pa.Array:
+    return pa.array(values.map(str, na_action="ignore").astype(object), type=TEXT, from_pandas=True)
 
 
 def _mixed(values: pd.Series | np.ndarray) -> bool:

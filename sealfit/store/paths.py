@@ -22,19 +22,15 @@ def possible_tables(config: Config) -> tuple[str, ...]:
 
 def runs_tables(folder: Path, config: Config) -> list[str]:
     """Return those of `possible_tables` that a campaign folder holds."""
-    return [
-        name for name in possible_tables(config) if (folder / name).exists() or (folder / name).is_symlink()
-    ]
+    paths = {name: folder / name for name in possible_tables(config)}
+    return [name for name, path in paths.items() if path.exists() or path.is_symlink()]
 
 
 def campaign_folder(path: Path, config: Config) -> Path:
     """Return `path` if it is a folder that can be a campaign.
 
-    Raises
-    ------
-    CampaignError
-        If there is no such folder, or no table of runs in it where the config needs one; the fix names the
-        likeliest.
+    CampaignError, whose fix names the likeliest, if there is no such folder, or no table of runs in it where
+    the config needs one.
     """
     if path.is_file():
         fix = f"Give the folder that holds {RUNS}."
@@ -57,17 +53,13 @@ def campaign_folder(path: Path, config: Config) -> Path:
 def existing_out(out: Path) -> Path:
     """Return `out` if it is a folder.
 
-    Raises
-    ------
-    RequestError
-        If it is not; the fix names the likeliest folder of results, or the command that makes one.
+    Else raise RequestError; its fix names the likeliest folder of results, or the command that makes one.
     """
     if out.is_dir():
         return out
     fix = did_you_mean(out, lambda folder: (folder / STATE).is_file())
-    raise RequestError(
-        f"there is no folder {out}.", fix=fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}"
-    )
+    fix = fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}"
+    raise RequestError(f"there is no folder {out}.", fix=fix)
 
 
 def existing_file(path: Path, what: str) -> Path:
@@ -93,14 +85,8 @@ KEY = "key 'loop.effects_folder'"
 def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Path) -> Path | None:
     """Return the folder of the user's own effects, without symbolic links; None if none is named.
 
-    Parameters
-    ----------
-    given : Path or None
-        What --effects-folder says; it comes before the config.
-    config : ConfigCopy or None
-        The config that the command line names, never one that a folder of results keeps.
-    *data : Path
-        The campaign and the folder of results.
+    `given` is what --effects-folder says; it comes before the config, which is the one that the command line
+    names, never one that a folder of results keeps. `data` are the campaign and the folder of results.
 
     Raises
     ------
@@ -114,21 +100,16 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
     if folder is None:
         return None
     if said == KEY and (place := _place_of(config.path, data)):
-        raise ConfigError(
-            f"{KEY}: the config lies in {place}, so the folder that it names is not run.",
-            file=config.path,
-            fix=f"Name the folder by {OPTION}, or move the config.",
-        )
+        reason = f"{KEY}: the config lies in {place}, so the folder that it names is not run."
+        fix = f"Name the folder by {OPTION}, or move the config."
+        raise ConfigError(reason, file=config.path, fix=fix)
     if not folder.is_dir():
-        raise ConfigError(
-            f"{said}: there is no folder {folder}.", fix=did_you_mean(folder) or "Fix the path."
-        )
+        fix = did_you_mean(folder) or "Fix the path."
+        raise ConfigError(f"{said}: there is no folder {folder}.", fix=fix)
     for path in (folder, *sorted(folder.glob("*.py"))):
         if place := _place_of(path, data):
-            raise ConfigError(
-                f"{said}: {path} lies in {place}, and Python is never run from there.",
-                fix="Read the files; if you trust them, move them to a folder of your own.",
-            )
+            fix = "Read the files; if you trust them, move them to a folder of your own."
+            raise ConfigError(f"{said}: {path} lies in {place}, and Python is never run from there.", fix=fix)
     return folder.resolve()
 
 
@@ -147,14 +128,8 @@ def effects_seen(
 ) -> dict[str, str | None]:
     """Return the present hashes of the user's own effects, as far as known; nothing is run.
 
-    Parameters
-    ----------
-    given : Path or None
-        The folder that the command line names.
-    kept, kept_config
-        The hashes and the config that the folder of results keeps.
-    config : ConfigCopy
-        The same config as it stands now, read again if its file is still there.
+    `given` is the folder that the command line names, `kept` and `kept_config` are what the folder of results
+    keeps, and `config` is that config as it stands now, read again if its file is still there.
     """
     if given is not None:
         return effect_hashes(given)
@@ -174,7 +149,5 @@ def what_differs(kept: Mapping[str, str | None], now: Mapping[str, str | None]) 
 def needed(what: str, names: Mapping[str, str | None] | list[str]) -> RequestError:
     """Return the error of a command that needs the user's own effects and was given none."""
     files = f" ({', '.join(sorted(names))})" if names else ""
-    return RequestError(
-        f"{what} your own effects{files}, and Python is run only from a folder that the command line names.",
-        fix=f"Add {OPTION} FOLDER.",
-    )
+    why = "Python is run only from a folder that the command line names."
+    return RequestError(f"{what} your own effects{files}, and {why}", fix=f"Add {OPTION} FOLDER.")

@@ -101,12 +101,8 @@ class Staged:
 def finish(out: Path, state: State) -> None:
     """Finish the step whose files are being moved: move the rest, remove what is left over, store the state.
 
-    Whatever of it has been done already stays, so it may be interrupted and called again.
-
-    Raises
-    ------
-    OutError
-        If the staged files are not there any more, or a folder of them is a link.
+    Whatever of it has been done already stays, so it may be interrupted and called again. OutError if the
+    staged files are not there any more, or a folder of them is a link.
     """
     folder, (*_, done) = out / state.moving.folder, state.steps.values()
     if not folder.is_dir():
