@@ -167,7 +167,7 @@ COMPUTED = (
     ("sealfit.fit.aging.all_series", "law_of"),
     ("sealfit.fit.aging.lifetime", "answer"),
     ("sealfit.report.page", "build_report"),
-    ("sealfit.store.manifest", "_version"),
+    ("sealfit.store.manifest", "version"),
 )
 
 
