@@ -63,7 +63,7 @@ UNLIKELY = 10.0
 # The lengths that are tried reach three times as far as the force's arrival.
 LONGER = 3.0
 # Rise lengths on the plateau of the speed after which the law is asked again where it did not hold.
-SKIPPED = (0.0, 1.0, 2.0)
+SKIPPED = (1.0, 2.0)
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0
 # Parts of equal rows into which a steady window is cut to see whether it begins within a transient, and how
@@ -249,21 +249,25 @@ def _rise_from_rest(start: Start) -> Rise:
 def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
     """Return C and x_0 of F = A + B x + C exp(-x / x_0) of a start, from its rows of constant speed.
 
-    The first rise lengths of these may still follow the changing speed; they are left out if the law holds
-    after them. C is 0 where the force does not follow the law at all: where a rise that is over at some
-    distance fits better.
+    C is 0 where the force does not follow that law: where a rise that is over at some distance fits better.
+    The first rise lengths may still follow the changing speed; without them the law has to fit better itself.
     """
-    found = length_mm
+    left_N, found, better = _law_on(_on_plateau(start), length_mm)
+    if better > -UNLIKELY:
+        return _before(left_N, start.plateau_mm / found), found
     for skipped in SKIPPED:
         begin_mm = start.plateau_mm + skipped * found
-        left_N, found = _followed(_from(start, begin_mm), found)
-        if left_N:
-            return _before(left_N, begin_mm / found), found
-    return 0.0, length_mm
+        left_N, later, better = _law_on(_from(start, begin_mm), found)
+        if better > UNLIKELY:
+            return _before(left_N, begin_mm / later), later
+    return 0.0, found
 
 
-def _followed(plateau: Start, length_mm: float) -> tuple[float, float]:
-    """Return C and x_0 of a start at constant speed; C is 0 where it does not follow the law."""
+def _law_on(plateau: Start, length_mm: float) -> tuple[float, float, float]:
+    """Return C and x_0 of a start at constant speed, and by how much the law is likelier than its rivals.
+
+    That is twice the difference of the log likelihoods.
+    """
     reach = REACH * length_mm
     sloped = min(plateau.distance_mm[-1], reach) >= SLOPED * length_mm
     length = _rise_length_mm(plateau, reach, length_mm * REFINED, sloped)
@@ -275,7 +279,7 @@ def _followed(plateau: Start, length_mm: float) -> tuple[float, float]:
     rival = min(
         beside.fitted(_shape(x, end, power), force)[1] for power, end in zip(POWERS, ends, strict=True)
     )
-    return 0.0 if n * math.log(max(squares, 1e-300) / max(rival, 1e-300)) > UNLIKELY else left, length
+    return left, length, n * math.log(max(rival, 1e-300) / max(squares, 1e-300))
 
 
 def _before(left_N: float, lengths: float) -> float:
