@@ -255,11 +255,11 @@ def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
     left_N, found, better = _law_on(_on_plateau(start), length_mm)
     if better > -UNLIKELY:
         return _before(left_N, start.plateau_mm / found), found
-    for skipped in SKIPPED:
+    for skipped in SKIPPED:  # each time a longer one can be found
         begin_mm = start.plateau_mm + skipped * found
-        left_N, later, better = _law_on(_from(start, begin_mm), found)
+        left_N, found, better = _law_on(_from(start, begin_mm), found)
         if better > UNLIKELY:
-            return _before(left_N, begin_mm / later), later
+            return _before(left_N, begin_mm / found), found
     return 0.0, found
 
 
