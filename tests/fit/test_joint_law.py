@@ -377,3 +377,11 @@ def test_strength_by_temperature(table, loss, energy):
     found = {name: (low, high) for name, _, low, high, _ in laws[0].parameters()}
     assert energy[0] < found["E"][0] < found["E"][1] < energy[1]
     assert laws[0] not in rivals_of(laws)
+
+
+def test_an_interval_without_a_bound_has_none():
+    law = fit_joint_law(campaign(), "log")
+    unknown = law.covariance + 1e5 * np.diag([float(name == "b") for name in law.names])
+    ends = {name: (low, high) for name, _, low, high, _ in replace(law, covariance=unknown).parameters()}
+    assert np.isnan(ends["b"]).all()
+    assert np.isfinite(ends["mu_0"]).all()

@@ -388,7 +388,7 @@ def test_units_of_parameters_are_those_of_their_numbers(speed, load, mu, sigma_2
     assert (units["mu_s"], units["sigma_2"]) == (mu, sigma_2)
 
 
-@pytest.mark.parametrize("speeds, setup", [((1, 5, 25), 0.0), ((1, 5, 25), 0.01), ((0.5, 3), 0.0)])
+@pytest.mark.parametrize(("speeds", "setup"), [((1, 5, 25), 0.0), ((1, 5, 25), 0.01), ((0.5, 3), 0.0)])
 def test_few_speeds_give_the_mean_over_them_and_intervals_that_cover(campaign, speeds, setup):
     """Too few speeds for a Stribeck curve: its fall, the same every day, is no scatter between runs."""
     law = {"mu_0": 0.9, "a": 0.05, "b": 0.3}

@@ -156,7 +156,7 @@ def test_noise_does_not_hide_the_rise_after_a_jump():
 
 @pytest.mark.parametrize("ramp_end", [4, 6, 9])
 def test_a_fast_stroke_of_few_samples_whose_force_jumps_at_its_reversal_shows_its_rise(ramp_end):
-    """Sixty samples, four of them in the ramp: damping brings the force up there, faster than the bristles."""
+    """Sixty samples, four of them in the ramp, where damping brings the force up faster than the bristles."""
     distance = np.r_[0.0, 0.007, 0.022, 0.049, 0.082 + 0.0345 * np.arange(56)]
     force = 76.5 - 62.0 * np.exp(-distance / 0.163)
     force[:4] = -50.0, -26.0, 0.6, 28.0

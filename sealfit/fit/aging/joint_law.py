@@ -200,6 +200,8 @@ TARGETS = ("rate", "loss")
 TURNS = 4
 # Relative change of the scatter at which these fits have converged.
 CONVERGED = 0.02
+# Logarithm from which a time in days, or its inverse, is no bound: 5e21 d.
+UNBOUNDED = 50.0
 # Largest difference in BIC of a rival law. It is less likely than the chosen law by a factor of up to exp(3).
 RIVAL = 6.0
 # A positive parameter is not determined if its 95 % interval spans more than this natural logarithm.
@@ -290,7 +292,7 @@ class JointLaw:
         return self.aged.days * (self.rate(self.aged) if self.acts_on == "rate" else 1.0)
 
     def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
-        """Yield name, value, ends of the 95 % interval, and whether the values determine it.
+        """Yield name, value, ends of the 95 % interval (NaN: no bound), and whether the values determine it.
 
         Without a loss (a may be 0) its shape, E and kappa have no meaning.
         """
@@ -299,7 +301,8 @@ class JointLaw:
         for k, name in enumerate(self.names):
             half = (self.t if name == "mu_0" else t) * float(np.sqrt(self.covariance[k, k]))
             if name in self.loss.parameters:
-                low, high = (float(np.exp(np.clip(self.x[k] + s * half, -700, 700))) for s in (-1, 1))
+                ends = self.x[k] - half, self.x[k] + half
+                low, high = (float(np.exp(end)) if abs(end) < UNBOUNDED else np.nan for end in ends)
                 yield name, float(np.exp(self.x[k])), low, high, bool(lost and 2 * half < KNOWN)
             else:
                 known = np.isfinite(half) and (lost or name == "mu_0")

@@ -276,7 +276,10 @@ def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
     elif condition.model == VISCOUS and condition.few_speeds:
         few = f"{most} speeds in one direction: the Stribeck curve needs four, two of them below about 2 v_s."
         verdict |= {name: (False, few) for name in ("mu_s", "v_s")}
-        verdict["mu_c"] = (True, "the mean coefficient over these speeds, which are too few for a Stribeck curve.")
+        verdict["mu_c"] = (
+            True,
+            "the mean coefficient over these speeds, which are too few for a Stribeck curve.",
+        )
     elif condition.model == VISCOUS:
         flat = f"mu_s = mu_c is not rejected (p = {condition.flat_p:.2g}): no Stribeck curve is seen"
         verdict |= {
