@@ -405,3 +405,12 @@ def test_few_speeds_give_the_mean_over_them_and_intervals_that_cover(campaign, s
             widths.append((row.hi95 - row.lo95) / value)
     assert np.mean(hits) > 0.9
     assert np.median(widths) < 0.04
+
+
+@pytest.mark.filterwarnings("error")
+def test_few_speeds_with_forces_along_the_motion_have_no_friction_and_say_so(campaign):
+    table = campaign(speeds=(1, 5, 25), days=(0, 1, 4), ways=(1,))
+    fits = fit_conditions(table.assign(force_N=-table.force_N), Config())
+    row = steady(fits, "mu_c")
+    assert row.value == 0.0
+    assert not row.identified

@@ -153,7 +153,7 @@ def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray
     one factor per speed and direction, which is common to all of them.
     """
     chi2, df = (np.array([getattr(c, name) for c in conditions], float) for name in ("chi2", "df"))
-    few = [k for k, c in enumerate(conditions) if c.model == VISCOUS and c.few_speeds]
+    few = [k for k, c in enumerate(conditions) if c.model == VISCOUS and c.few_speeds and c.values[0] > 0]
     if not few:
         return chi2, df
     cells = {k: conditions[k].run_levels() for k in few}
