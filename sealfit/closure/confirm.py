@@ -38,8 +38,11 @@ from sealfit.fit.joint.whitening import Whitening
 LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 """Least and most settings for which interpolation is tested: fewer have no inner one, and more are dense."""
 
-NEGLIGIBLE = "it is smaller than the resolution of the recorded force"
-"""Reason of a refusal after which nothing is left to explain: the effect is too small to matter."""
+TOO_FINE = "it is smaller than the resolution of the recorded force"
+TOO_SMALL = f"it is less than {LEAST_SIZE:.2%} of the force"
+NO_GAIN = f"it lowers the error on held-out data by less than {LEAST_GAIN:.2%} of the force"
+NEGLIGIBLE = (TOO_FINE, TOO_SMALL, NO_GAIN)
+"""Reasons of a refusal after which nothing is left to explain: the effect is too small to matter."""
 
 WHOLE = ("mu", "force")
 """Targets that are the whole friction."""
@@ -264,7 +267,7 @@ class RefusedEffect:
     @property
     def negligible(self) -> bool:
         """Whether it is too small to matter."""
-        return self.reason == NEGLIGIBLE
+        return self.reason in NEGLIGIBLE
 
 
 def silent(text: str) -> None:
@@ -323,12 +326,14 @@ def _reason_refused(
     """Return the reason why a proposal is refused; None if it is confirmed."""
     force = float(np.sqrt(np.mean(fitted.rows.force**2)))
     size = float(np.sqrt(np.mean(added_force(proposal) ** 2)))
-    if size <= max(rounding_error_N(samples), LEAST_SIZE * force):
-        return NEGLIGIBLE
+    if size <= rounding_error_N(samples):
+        return TOO_FINE
+    if size <= LEAST_SIZE * force:
+        return TOO_SMALL
     if not gain.real:
         return "it does not lower the error on held-out data"
     if gain.rmse_N < LEAST_GAIN * force and not proposal.term.effect.periodic:
-        return NEGLIGIBLE
+        return NO_GAIN
     halved = gain.share > 1 - HALVED
     if proposal.p_value > CURVE_P and not halved and _changes_the_curve(proposal):
         return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"

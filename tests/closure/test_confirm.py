@@ -168,12 +168,15 @@ STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id":
     [
         ({"gains": [Gain(0.5, 0.5, 1.0, 2.0)]}, "does not lower the error on held-out data"),
         ({"gains": [Gain(0.01, 0.99, 9.0)], "p_value": 1e-4}, "lowers the held-out error by less than 5%"),
-        ({"added": 0.0019}, "smaller than the resolution of the recorded force"),  # 2e-4 of 10 N
+        ({"added": 0.0019}, "less than 0.02% of the force"),  # 10 N
         (
             {"added": 0.028, "samples": STEPS},
             "smaller than the resolution of the recorded force",
         ),  # 0.1 N over sqrt(12)
-        ({"gains": [Gain(0.0009, 0.01, 9.0)]}, "smaller than the resolution of the recorded force"),  # 1e-4
+        (
+            {"gains": [Gain(0.0009, 0.01, 9.0)]},
+            "lowers the error on held-out data by less than 0.01% of the force",
+        ),
         ({"settings": [GOOD, Gain(-0.1, 1.0, 1.0)]}, "does not predict held-out settings"),
     ],
 )
