@@ -64,6 +64,8 @@ UNLIKELY = 10.0
 LONGER = 3.0
 # Rise lengths on the plateau of the speed after which the law is asked again where it did not hold.
 SKIPPED = (1.0, 2.0)
+# Rows that this takes at least: twice as many as the law has parameters.
+LEAST_ROWS = 8
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0
 # Parts of equal rows into which a steady window is cut to see whether it begins within a transient, and how
@@ -216,13 +218,9 @@ def _explained(start: Start, length_mm: float) -> float:
     return 1.0 - beside.fitted(_shape(distance, length_mm), force)[1] / max(force @ force, 1e-300)
 
 
-def _on_plateau(start: Start) -> Start:
-    """Return a start from where the speed has reached its plateau."""
-    return _from(start, start.plateau_mm)
-
-
-def _from(start: Start, begin_mm: float) -> Start:
-    """Return a start from a distance at which its speed is constant."""
+def _on_plateau(start: Start, begin_mm: float | None = None) -> Start:
+    """Return a start from where the speed has reached its plateau, or from a later distance."""
+    begin_mm = start.plateau_mm if begin_mm is None else begin_mm
     rows = slice(int(start.distance_mm.searchsorted(begin_mm)), None)
     return Start(start.distance_mm[rows] - begin_mm, start.force_N[rows], 0)
 
@@ -257,17 +255,17 @@ def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
         return _before(left_N, start.plateau_mm / found), found
     for skipped in SKIPPED:  # each time a longer one can be found
         begin_mm = start.plateau_mm + skipped * found
-        left_N, found, better = _law_on(_from(start, begin_mm), found)
+        later = _on_plateau(start, begin_mm)
+        if len(later.force_N) < LEAST_ROWS:
+            break
+        left_N, found, better = _law_on(later, found)
         if better > UNLIKELY:
             return _before(left_N, begin_mm / found), found
     return 0.0, found
 
 
 def _law_on(plateau: Start, length_mm: float) -> tuple[float, float, float]:
-    """Return C and x_0 of a start at constant speed, and by how much the law is likelier than its rivals.
-
-    That is twice the difference of the log likelihoods.
-    """
+    """Return C, x_0, and twice the log likelihood of the law less that of its best rival."""
     reach = REACH * length_mm
     sloped = min(plateau.distance_mm[-1], reach) >= SLOPED * length_mm
     length = _rise_length_mm(plateau, reach, length_mm * REFINED, sloped)

@@ -370,7 +370,7 @@ def test_a_condition_of_a_few_slow_speeds_does_not_bend_the_law_of_mu_c(campaign
     fits = [fit_conditions(table, Config()) for table in (steady, few)]
     alone = fits[1].set_index(["condition", "quantity", "parameter"]).loc[(name, "steady", "mu_c")]
     assert alone["identified"]
-    assert "without Stribeck curve" in alone["reason"]
+    assert "too few for a Stribeck curve" in alone["reason"]
     whole, part = (law(fit_series(fit, Config()), "mu_c", "mu_0") for fit in fits)
     assert part["value"] == pytest.approx(whole["value"], abs=2 * whole["se"])
     assert part["se"] < 0.005  # it was 0.07, and mu_0 0.577
