@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from bins_helpers import LOAD_N, TRUE, make_bins, make_traces, warm
 
-from sealfit.closure.confirm import NEGLIGIBLE
+from sealfit.closure.confirm import TOO_SMALL
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.closure.result import BeforeAfter
@@ -71,7 +71,7 @@ def test_an_effect_too_small_to_matter_is_refused_and_leaves_nothing_missing():
     document = close(make_bins(3, bins=8, noise_N=0.003, gain=1e-6, effect=climb)).document
     assert document["refused"][0]["id"] == "linear"
     reasons = {refused["reason"] for refused in document["refused"]}
-    assert reasons <= set(NEGLIGIBLE)
+    assert reasons == {TOO_SMALL}
     assert document["verdict"] == "nothing_missing"
     assert document["left"]["channel"] is None
 
