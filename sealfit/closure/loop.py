@@ -86,7 +86,7 @@ def close_loop(
             with timed("declared model", rows=part.every.force.size, of="bins, merged"):
                 declared = fit_declared(part.every)
             start = Start(declared.model, declared.scatter)
-        heldout = _HeldOut(rows, part, steady_samples(traces, part.rows), context)
+        heldout = _HeldOut(rows, part, steady_samples(traces, part.rows, config.strokes.turn), context)
         fine = part.rows if part.coarse is not part.rows else None
         with timed("search", rows=part.coarse.force.size, of="bins, merged"):
             begin = None if part.whole else start

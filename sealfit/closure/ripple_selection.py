@@ -18,6 +18,11 @@ from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time, stroke_i
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # columns of the samples that the ripple search reads
 
+GAP = 3
+"""Steps between samples up to which a turn follows the one before without a gap.
+
+A change of speed leaves more: its rise is not in the steady windows."""
+
 
 class Ripples:
     """The periodic effects of a campaign, from its steady samples as returned by `steady_samples`."""
@@ -109,8 +114,13 @@ def numbered(bins: pd.DataFrame) -> pd.DataFrame:
     return bins.assign(stroke_id=bins.groupby(["file", "stroke"], sort=False).ngroup().to_numpy())
 
 
-def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) -> pd.DataFrame:
+def steady_samples(
+    traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows, turn: float | None = None
+) -> pd.DataFrame:
     """Return the steady samples of the strokes in `rows`, for the ripple search.
+
+    The turns of a rotation are joined, since a wave of one period per stroke is hard to distinguish from a
+    slow change: the displacement goes on past the turn, and they have the `stroke_id` of the first.
 
     Parameters
     ----------
@@ -118,6 +128,8 @@ def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) ->
         Table `traces`, its samples ordered by stroke; or where it is stored, to be read part by part.
     rows : Rows
         Rows made from `numbered` bins.
+    turn : float, optional
+        Displacement of one turn, where strokes are turns (`[strokes] turn`).
 
     Returns
     -------
@@ -141,4 +153,24 @@ def steady_samples(traces: pd.DataFrame | Sequence[StoredTraces], rows: Rows) ->
         map(np.concatenate, zip(*parts, strict=True)) if parts else [np.zeros(0, int)] * (1 + len(SAMPLED))
     )
     about = {name: own.astype(np.int32)[place] for name, own in about.items()}
-    return pd.DataFrame({**about, **dict(zip(SAMPLED, values, strict=True))})
+    samples = pd.DataFrame({**about, **dict(zip(SAMPLED, values, strict=True))})
+    return samples if turn is None or samples.empty else turns_joined(samples, turn)
+
+
+def turns_joined(samples: pd.DataFrame, turn: float) -> pd.DataFrame:
+    """Return samples whose displacement goes on where a stroke is the turn after the one before."""
+    place, way = samples["displacement_mm"].to_numpy(), samples["direction"].to_numpy()
+    first = np.flatnonzero(np.r_[True, np.diff(samples["stroke_id"]) != 0])
+    last = np.r_[first[1:], len(samples)] - 1
+    step = (way[last] * (place[last] - place[first])) / np.maximum(last - first, 1)
+    gap = way[first[1:]] * (place[first[1:]] - place[last[:-1]]) + turn
+    same = [np.diff(samples[name].to_numpy()[first]) == 0 for name in ("unit", "direction")]
+    after = np.diff(samples["stroke"].to_numpy()[first]) == 1
+    joined = np.r_[False, np.all([*same, after, np.abs(gap) <= GAP * step[1:]], axis=0)]
+    begin = np.maximum.accumulate(np.where(joined, 0, np.arange(first.size)))
+    shift = way[first] * turn * (np.arange(first.size) - begin)
+    size = last - first + 1
+    return samples.assign(
+        displacement_mm=place + np.repeat(shift, size),
+        stroke_id=np.repeat(samples["stroke_id"].to_numpy()[first][begin], size),
+    )

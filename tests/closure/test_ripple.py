@@ -2,6 +2,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sealfit.closure.ripple_selection import turns_joined
 from sealfit.closure.ripples import find_ripple
 
 
@@ -191,3 +192,40 @@ def test_noise_of_the_strokes_that_are_sampled_most_finely_is_no_ripple_where_on
         tables.append(pd.DataFrame({**own, "residual_N": rng.normal(0.0, 0.1, 60)}))
     peak = find_ripple(pd.concat(tables, ignore_index=True), common_phase=True)
     assert peak.p_value > 0.05
+
+
+def turns(direction=1, files=6, number=4, turn=360.0, noise=0.3, seed=0):
+    """Return samples of rotations cut into turns, with one wave a turn and the drift of each file."""
+    rng = np.random.default_rng(seed)
+    strokes = [(file, stroke) for file in range(files) for stroke in range(1, number + 1)]
+    of_file = rng.normal(size=(files, 3))
+    parts = []
+    for file, stroke in strokes:
+        place = ((np.arange(200) + 0.5) * turn / 200)[::direction]
+        along = stroke - 1 + (place if direction > 0 else turn - place) / turn
+        wave = np.sin(2 * np.pi * place / turn + 1.0)
+        residual = wave + of_file[file] @ np.vander(along / number, 3).T + noise * rng.normal(size=200)
+        parts.append(pd.DataFrame({"displacement_mm": place, "residual_N": residual, "time_s": along}))
+    own = [samples.assign(unit=f, stroke=s) for (f, s), samples in zip(strokes, parts, strict=True)]
+    every = pd.concat(own, ignore_index=True).assign(direction=direction)
+    return every.assign(stroke_id=every.groupby(["unit", "stroke"]).ngroup())
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_one_wave_a_turn_is_found_where_turns_are_strokes(direction):
+    """A wave of one period a stroke cannot be distinguished from a slow change of each stroke."""
+    cut = turns(direction)
+    joined = turns_joined(cut, 360.0)
+    assert joined["stroke_id"].nunique() == 6
+    assert np.all(np.diff(joined["displacement_mm"].to_numpy()[:800]) * direction > -1e-9)
+    found = find_ripple(joined, common_phase=True)
+    assert found.wavelength == pytest.approx(360.0, rel=0.01)
+    assert found.p_value < 1e-3
+
+
+def test_turns_are_joined_only_where_nothing_lies_between_them():
+    cut = turns(files=2)
+    gone = cut[(cut["unit"] != 0) | (cut["stroke"] != 2)]  # a turn without steady window
+    risen = cut[(cut["unit"] != 1) | (cut["stroke"] != 3) | (cut["displacement_mm"] > 40.0)]
+    assert list(turns_joined(gone, 360.0)["stroke_id"].unique()) == [0, 2, 4]
+    assert list(turns_joined(risen, 360.0)["stroke_id"].unique()) == [0, 4, 6]
