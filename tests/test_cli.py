@@ -13,6 +13,7 @@ import pytest
 
 from sealfit import cli
 from sealfit.errors import CampaignError, Fault, FitError
+from sealfit.report import summary_lines
 from sealfit.store.manifest import STEPS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -102,6 +103,18 @@ def test_a_verdict_is_in_colour_unless_it_is_not_wanted(monkeypatch, colour, exp
 def test_the_summary_names_the_settings_of_the_next_runs(sealfit, parts, campaign, out):
     ended = sealfit("run", campaign, "--out", out)
     assert "next runs   a second load would separate them: load_N 98\n" in ended.stdout
+
+
+@pytest.mark.parametrize(
+    ("own", "expected"),
+    [
+        (("speed_mm_s", 20.0, {"speed_mm_s": "mm/s"}), "speed_mm_s 20"),
+        (("speed_mm_s", 20.0, {"speed_mm_s": "rpm"}), "speed_mm_s 20 rpm"),
+        (("rubber", "NBR", {}), "rubber NBR"),
+    ],
+)
+def test_a_setting_has_its_unit_where_the_name_does_not_say_it(own, expected):
+    assert summary_lines._setting(*own) == expected
 
 
 def test_the_report_opens_in_the_browser(sealfit, parts, campaign, out, monkeypatch):

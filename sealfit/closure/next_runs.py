@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import too_short
+from sealfit.closure.channels import ALONG_STROKES, too_short
 from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import describe, grid_of, reference
@@ -133,20 +133,16 @@ def next_runs(
     wanted = [_run_to_repeat(one, config) for one in outliers]
     for item in selection.added:
         for rival in item.rivals[:1]:
-            chosen = item.proposal
+            chosen, own = item.proposal, item.proposal.fitted
             channels = (*chosen.term.channels, *rival.term.channels)
-            found = largest_difference(
-                chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, config
-            )
+            found = largest_difference(own.model, rival.fitted.model, own.rows, channels, config)
             if found is not None:
-                wanted.append(
-                    {
-                        "why": f"would distinguish {describe(item.proposal.term)} "
-                        f"from {describe(rival.term)}: "
-                        f"they differ there by {found[1]:.3g} {config.units.unit('force')}",
-                        "conditions": found[0],
-                    }
-                )
+                conditions, difference_N = found
+                tested = "more repeats of a tested run " if _is_tested(conditions, own.rows) else ""
+                forms = f"{describe(chosen.term)} from {describe(rival.term)}"
+                size = f"{difference_N:.3g} {config.units.unit('force')}"
+                why = f"{tested}would distinguish {forms}: they differ there by {size}"
+                wanted.append({"why": why, "conditions": conditions})
     if selection.inconclusive is not None:
         wanted.append(_replicate_of(selection.inconclusive, config))
     if selection.after.rows.has_aging and not selection.after.scatter.estimates("specimen"):
@@ -154,6 +150,20 @@ def next_runs(
     if too_short(selection.after.rows):
         wanted.append({"why": LONGER_STROKES, "conditions": {}})
     return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
+
+
+def _is_tested(conditions: Mapping[str, object], rows: Rows) -> bool:
+    """Return whether a run of these conditions is in the campaign, its numbers equal to three digits."""
+    same = np.ones(rows.force.size, dtype=bool)
+    for name, value in conditions.items():
+        own = rows.table[name].to_numpy()
+        if name in ALONG_STROKES:
+            same &= value <= 1.001 * np.max(own)  # another place of a stroke is not another run
+        elif isinstance(value, float) and name != "direction":
+            same &= np.isclose(np.abs(own.astype(float)), abs(value), rtol=1e-3)
+        else:
+            same &= own == value
+    return bool(same.any())
 
 
 def _run_to_repeat(one: OutlierFile, config: Config) -> dict:

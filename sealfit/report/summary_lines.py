@@ -175,10 +175,16 @@ def closure_lines(part: Mapping) -> list[str]:
     if part["left"]["channel"] is not None:
         found.append(line("residual", _left(part["left"], part["verdict"], unit)))
     for run in part["next_runs"][:3]:
-        texts = {k: v if isinstance(v, str) else f"{v:.4g}" for k, v in run["conditions"].items()}
-        settings = ", ".join(f"{name} {text}" for name, text in texts.items())
+        settings = ", ".join(_setting(*own, part["units"]) for own in run["conditions"].items())
         found.append(line("next runs", f"{run['why']}: {settings}" if settings else run["why"]))
     return found
+
+
+def _setting(name: str, value: object, units: Mapping[str, str]) -> str:
+    """Return a setting of a run, e.g. "speed_mm_s 20 rpm"; the unit where the name does not say it."""
+    text = value if isinstance(value, str) else f"{value:.4g}"
+    unit = units.get(name, "")
+    return f"{name} {text}" if name.endswith(unit.replace("/", "_")) else f"{name} {text} {unit}"
 
 
 def _left(left: Mapping, verdict: str, unit: str) -> str:

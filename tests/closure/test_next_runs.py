@@ -6,7 +6,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.next_runs import LONGER_STROKES, find_aliases, largest_difference, next_runs
+from sealfit.closure.next_runs import LONGER_STROKES, _is_tested, find_aliases, largest_difference, next_runs
 from sealfit.closure.outlier_files import OutlierFile
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -53,6 +53,39 @@ def test_forms_of_one_channel_differ_most_beyond_what_was_tested():
     assert where["elapsed_h"] > fitted.rows.values("elapsed_h").max()
     assert where["aging_days"] in fitted.rows.days
     assert apart == pytest.approx(abs(0.01 * where["elapsed_h"] - 0.05) * 45.0, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("changed", "tested"),
+    [
+        ({}, True),
+        ({"distance_mm": 2.0}, True),
+        ({"distance_mm": 1e4}, False),
+        ({"speed_mm_s": 7.7}, False),
+        ({"direction": -1.0}, False),
+        ({"temperature_C": 61.0}, False),
+    ],
+)
+def test_a_run_is_tested_if_the_campaign_has_one_of_its_conditions(changed, tested):
+    rows = make_rows(make_bins(bins=4, repeats=1), has_aging=True)
+    first = rows.table.iloc[0]
+    names = ("temperature_C", "aging_days", "speed_mm_s", "direction")
+    conditions = {name: float(first[name]) for name in names}
+    assert _is_tested({**conditions, **changed}, rows) == tested
+
+
+@pytest.mark.parametrize(("rival", "begins"), [("elapsed_h", "would"), ("humidity_pct", "more repeats of")])
+def test_repeats_are_asked_where_the_models_differ_most_at_a_tested_run(rival, begins, monkeypatch):
+    bins = make_bins(bins=4, repeats=1).assign(humidity_pct=lambda table: 30.0 + table["elapsed_h"] % 7)
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    chosen, other = bound(fitted, "linear", "elapsed_h", A=0.01), bound(fitted, "linear", rival, A=0.02)
+    first = {name: fitted.rows.table[name].iloc[0] for name in ("temperature_C", "aging_days", "speed_mm_s")}
+    most = {**first, "speed_mm_s": first["speed_mm_s"] * (1.0 if begins.startswith("more") else 1.3)}
+    monkeypatch.setattr("sealfit.closure.next_runs.largest_difference", lambda *given: (most, 0.5))
+    item = SimpleNamespace(proposal=chosen, rivals=(other,))
+    selection = SimpleNamespace(added=[item], after=fitted, inconclusive=None)
+    run, *_ = next_runs(selection, Config(), {})
+    assert run["why"].startswith(begins)
 
 
 def test_an_offset_is_friction_where_all_runs_go_one_way():
