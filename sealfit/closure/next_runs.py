@@ -168,7 +168,7 @@ def _is_tested(conditions: Mapping[str, object], rows: Rows) -> bool:
 
 def _run_to_repeat(one: OutlierFile, config: Config) -> dict:
     """Return the run of a file that was left out."""
-    names = (*config.condition, "speed_mm_s", "load_N")
+    names = (*config.rubber, *config.condition, "speed_mm_s", "load_N")
     side = "above" if one.deviation > 0 else "below"
     return {
         "why": f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and was left "
@@ -183,7 +183,7 @@ def _second_specimen(rows: Rows, config: Config) -> dict:
     return {
         "why": "would show the scatter of specimens, which is unknown in this campaign and in no interval: "
         "a second specimen of a tested condition",
-        "conditions": _settings(rows.table.iloc[k], config.condition),
+        "conditions": _settings(rows.table.iloc[k], (*config.rubber, *config.condition)),
     }
 
 
@@ -213,7 +213,7 @@ def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
     return {
         "why": f"{few} too few to distinguish {describe(item.proposal.term)} from the scatter of specimens: "
         "test a second specimen of the same conditions, here first",
-        "conditions": _settings(fitted.rows.table.iloc[k], (*config.condition, "speed_mm_s")),
+        "conditions": _settings(fitted.rows.table.iloc[k], (*config.rubber, *config.condition, "speed_mm_s")),
     }
 
 
@@ -235,7 +235,7 @@ def largest_difference(
         apart = np.where(np.isfinite(apart), apart, 0.0)
         k = int(np.argmax(apart >= apart.max() * (1 - TIE)))  # the first of those equal but for rounding
         if apart[k] > (0.0 if best is None else best[1] * (1 + TIE)):
-            names = (*config.condition, "speed_mm_s", *channels)
+            names = (*config.rubber, *config.condition, "speed_mm_s", *channels)
             best = (_settings(moved.table.iloc[k], names), float(apart[k]))
     return best
 

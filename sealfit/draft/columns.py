@@ -13,7 +13,7 @@ from sealfit.draft.vocabulary import Unit, column_role, name_and_unit, unit_of
 
 DIMENSION = {
     "time": ("time",),
-    "displacement": ("length",),
+    "displacement": ("length", "angle"),
     "force": ("force", "torque"),
     "load": ("force",),
     "speed": ("speed", "rotation"),

@@ -26,7 +26,7 @@ from sealfit.units import Units, conversion
 
 NO_CONDITION = {
     "repeat", "specimen_id", "speed_mm_s", "load_N", "started_at", "run_id", "direction", "direction_set",
-    "rubber", "file", "stroke",
+    "rubber", "file", "stroke", "speed_rpm",
 }  # fmt: skip
 AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
@@ -366,8 +366,8 @@ def _origin(name: str, source: Source) -> str:
 
 
 def needs_no_load(names: Names, roles: Roles) -> Names:
-    """Return the names without load if a torque is measured: torque over load is no friction coefficient."""
+    """Return the names without the one load of a torque: their ratio is no friction coefficient."""
     if roles.force is None or roles.force.unit is None or roles.force.unit.dimension == "force":
         return names
     load = next((part for part in names.parts if part.ours == "load_N"), None)
-    return names if load is None else _without(names, load)
+    return names if load is None or len(load.texts) > 1 else _without(names, load)

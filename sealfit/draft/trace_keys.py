@@ -144,6 +144,8 @@ def column_keys(
         if unit.dimension == "torque" or "torque" in words or "moment" in words:
             torque = {"quantity": "torque", "unit": unit.name}
             notes.guess("quantities.force", torque, f"{roles.force.place} is a torque")
+    if _turns(roles):
+        _rotation(roles.displacement.unit, f"{roles.displacement.place} is an angle", notes)
     if helpers:
         evidence = "read for the columns computed below, no channels of their own"
         notes.guess("trace.drop_columns", helpers, evidence)
@@ -194,14 +196,24 @@ def _integrated(speed: Column, notes: Notes) -> list[str]:
     notes.guess("trace.integrate_displacement", helper, evidence)
     if rotation:
         notes.guess("trace.integrate_per", "min", "rpm")
-        source = f"from {speed.place}"
-        notes.guess("quantities.displacement", {"quantity": "angle", "unit": "turn"}, source)
-        notes.guess("quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, source)
+        _rotation(UNITS["turn"], f"from {speed.place}", notes)
         notes.guess("position_origin", "file", "an integral begins anew in every file")
-        reason = "a rotation in one direction may slide over the same track in each turn."
-        fix = "Then set turn: each turn is a stroke of its own."
-        notes.doubt("strokes", reason, fix, ("turn = 1",))
     return [helper]
+
+
+def _turns(roles: Roles) -> bool:
+    """Whether the displacement is an angle."""
+    own = roles.displacement
+    return own is not None and own.unit is not None and own.unit.dimension == "angle"
+
+
+def _rotation(angle: Unit, source: str, notes: Notes) -> None:
+    """Add the quantities of a rotation, and the doubt whether its turns are strokes."""
+    notes.guess("quantities.displacement", {"quantity": "angle", "unit": angle.name}, source)
+    notes.guess("quantities.speed", {"quantity": "rotational speed", "unit": "rpm"}, source)
+    reason = "a rotation in one direction may slide over the same track in each turn."
+    fix = "Then set turn: each turn is a stroke of its own."
+    notes.doubt("strokes", reason, fix, (f"turn = {conversion('turn', angle.name)(1.0):.10g}",))
 
 
 def _missing_slots(roles: Roles, notes: Notes) -> None:
@@ -262,7 +274,7 @@ def settled_units(roles: Roles, notes: Notes) -> dict[str, Unit | None]:
             continue
         if column.unit is None:
             units[role] = _assumed(column, role, slot, notes)
-        elif column.in_unit_of(role) and column.unit.dimension != "torque":
+        elif column.in_unit_of(role) and column.unit.dimension not in ("torque", "angle"):
             units[role] = column.unit
     return units
 
@@ -334,6 +346,8 @@ def motion_keys(
         reason = f"strokes in one direction have several speeds, {_shown_speeds(others, files)}."
         fix = "The strokes of a file in one direction are one run: write each speed into a file of its own."
         notes.doubt("strokes", reason, fix)
+    if _turns(roles):  # these speeds are not in mm/s
+        return {}
     one_speed = {file: found for file, found in speeds.items() if found and file not in several}
     return {file: float(np.median(np.abs(found))) for file, found in one_speed.items()}
 

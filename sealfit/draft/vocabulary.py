@@ -40,10 +40,13 @@ _SPELLINGS = {
     ("force", "kgf"): ("kgf", "kp", "kg"),
     ("force", "gf"): ("gf", "g"),
     ("rotation", "rpm"): ("rpm", "1/min", "U/min", "min-1"),
-    ("torque", "N m"): ("Nm", "N m"),
-    ("torque", "mN m"): ("mNm", "mN m"),
-    ("torque", "N cm"): ("Ncm", "N cm"),
-    ("angle", "deg"): ("deg", "°", "rad", "turn"),
+    ("torque", "N m"): ("Nm", "N m", "N*m", "N·m"),
+    ("torque", "mN m"): ("mNm", "mN m", "mN*m", "mN·m"),
+    ("torque", "N cm"): ("Ncm", "N cm", "N*cm", "N·cm"),
+    ("torque", "N mm"): ("Nmm", "N mm", "N*mm", "N·mm"),
+    ("angle", "deg"): ("deg", "°", "degrees"),
+    ("angle", "rad"): ("rad",),
+    ("angle", "turn"): ("turn", "turns", "rev", "U"),
     ("temperature", "degC"): ("°C", "C", "degC", "deg C", "Grad C", "ºC"),
     ("temperature", "degF"): ("°F", "F", "degF", "deg F", "ºF"),
     ("temperature", "K"): ("K", "kelvin"),
@@ -125,11 +128,12 @@ _COLUMN_WORDS = (
     ("pressure", r"pressure|druck(?!kraft)"),
     ("time", r"time|zeit|x.?value|elapsed|sekunde"),
     ("load", r"normal|\bfz\b|\bfn\b|anpress|auflast|andruck|vertical"),
-    ("speed", r"speed|velocity|geschwind|\bvel\b"),
+    ("speed", r"speed|velocity|geschwind|\bvel\b|drehzahl"),
     ("torque", r"torque|moment"),
     ("force", r"force|kraft|friction|reib|tangential|load.?cell|kmd|\bfx\b|\bft\b|\bfr\b|\bfy\b|\bload\b"),
     ("displacement", r"displace|position|extension|crosshead|weg|verschieb|travel|traverse|\bhub\b|stroke"
-                     r"|lvdt|verfahr|\bpos\b|path|distance|auslenk|slide|schlitten"),
+                     r"|lvdt|verfahr|\bpos\b|path|distance|auslenk|slide|schlitten"
+                     r"|angle|winkel|rotation|revolution|umdrehung"),
 )  # fmt: skip
 _LETTERS = {"t": "time", "f": "force", "v": "speed", **dict.fromkeys("xys", "displacement")}
 

@@ -288,7 +288,7 @@ def add_runs(
 ) -> tuple[Columns, list[Fault]]:
     """Return the columns with a `run_id` for every file, and what is to be said of it.
 
-    Where none is given there is one per condition, commanded speed and (named) specimen.
+    Where none is given there is one per condition, commanded speed, load (of several) and (named) specimen.
 
     Parameters
     ----------
@@ -309,10 +309,14 @@ def add_runs(
     run_ids: dict[int, str] = {}
     groups = defaultdict(list)
     specimens, speeds = columns.get("specimen_id", none), columns.get("speed_mm_s", none)
+    loads = columns.get("load_N", none)
+    several_loads = len({load for load in loads if load is not None}) > 1
     for i in np.flatnonzero(~known(given)).tolist():
         words = [conditions[i]]
         if specimens[i] is not None:
             words.append(str(specimens[i]))
+        if several_loads and loads[i] is not None:
+            words.append(f"load {loads[i]:g}")
         if speeds[i] is not None:
             run_ids[i] = ", ".join([*words, f"{speeds[i]:g} {unit}"])
         else:

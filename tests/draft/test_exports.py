@@ -1,6 +1,7 @@
 """The draft of a config reads what others' programs export, with at most one edit; each edit is stated."""
 
 import shutil
+from itertools import product
 from pathlib import Path
 
 import exports
@@ -233,3 +234,24 @@ def test_every_guess_has_its_evidence_above_it(name, tmp_path):
     for number, line in enumerate(lines):
         if " = " in line and not line.startswith(("#", "name =")):
             assert lines[number - 1].startswith("# "), line
+
+
+@pytest.mark.parametrize(("angle", "turn"), [("Winkel [deg]", 360.0), ("revolutions [rev]", 1.0)])
+def test_a_rotating_rig_with_two_loads_needs_no_edit(angle, turn, tmp_path):
+    """The displacement is an angle, the force a torque; a run is a rubber at one load and speed."""
+    rng = np.random.default_rng(0)
+    for rubber, load, rpm, repeat in product(("NBR", "FKM"), (20, 40), (2, 20), (1, 2)):
+        turns = np.linspace(0.0, 3.0, 400)
+        torque = 0.02 * load * (1 - np.exp(-turns / 0.01)) + 0.002 * rng.normal(size=400)
+        rows = zip(60.0 * turns / rpm, turn * turns, torque, strict=True)
+        lines = [f"time [s],{angle},torque [N*m]", *(f"{t:.4f},{x:.5f},{m:.5f}" for t, x, m in rows)]
+        (tmp_path / f"{rubber}_{load}N_{rpm}rpm_{repeat}.csv").write_text("\n".join(lines) + "\n")
+    made, config, ingested = read(tmp_path)
+    assert config.units.label("displacement_mm").startswith("angle (")
+    assert config.units.label("force_N") == "torque (N m)"
+    assert any("set turn" in doubt.fix for doubt in made.doubts)
+    assert f"turn = {turn:g}" in made.text
+    runs = ingested.tables["steady"].groupby("run_id")["speed_mm_s"].first()
+    assert len(runs) == 8  # of a rubber, a load and a speed
+    assert sorted(runs.round(1).unique()) == [2.0, 20.0]  # in rpm
+    assert list(ingested.faults) == []
