@@ -10,11 +10,14 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from sealfit.config import TraceFormat
 from sealfit.draft.dialect import MIN_ROWS, STRAYS, Dialect, sniff
 from sealfit.draft.name_parts import shape_of, tokens
 from sealfit.errors import BadFile, RequestError
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
+from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
 from sealfit.ingest.listing import RUNS_CSV, natural
+from sealfit.ingest.workbooks import read_sheet
 
 SNIFFED = 24
 """Files of one kind of name that are looked at, spread evenly: more would show the same."""
@@ -32,8 +35,7 @@ ROWS = 20_000
 """Rows of a trace that are read: enough for some strokes."""
 
 FORMATS = {
-    ".tdms": "TDMS (LabVIEW)", ".xlsx": "Excel workbooks", ".xls": "Excel workbooks", ".mat": "MATLAB files",
-    ".parquet": "Parquet tables", ".h5": "HDF5 files", ".hdf5": "HDF5 files", ".bin": "binary files",
+    ".xls": "Excel workbooks before 2007", ".h5": "HDF5 files", ".hdf5": "HDF5 files", ".bin": "binary files",
 }  # fmt: skip
 DOCUMENTS = {
     ".md", ".rst", ".toml", ".json", ".py", ".ipynb", ".m", ".html", ".htm", ".pdf", ".png", ".jpg", ".svg",
@@ -47,8 +49,8 @@ class Found:
     """The files of a folder, as paths below it.
 
     `traces` are those that one config can read, `dialects` how some of them are written, `wider` those of
-    them that have further columns; `otherwise` are traces written in another way, `others` text files that
-    are none, `unreadable` files with the reason, `formats` counts the files that are no text by their suffix.
+    them that have further columns; `otherwise` are traces written in another way, `others` files that are
+    none, `unreadable` files with the reason, `formats` counts by suffix the files that sealfit cannot read.
     """
 
     folder: Path
@@ -71,6 +73,11 @@ class Found:
         usual = list(self.dialects.values())
         return next((one for one in usual if one.decimal), usual[0])
 
+    @property
+    def of_arrays(self) -> bool:
+        """Whether the traces are no text, so that nothing is to be said of their lines."""
+        return kind_of(self.traces[0]) in OF_ARRAYS
+
 
 def look(folder: Path) -> Found:
     """Return what lies in a folder.
@@ -78,7 +85,9 @@ def look(folder: Path) -> Found:
     Raises
     ------
     RequestError
-        If there is no such folder, or no trace file in it that is text.
+        If there is no such folder, or no trace file in it.
+    CampaignError
+        If the library that reads a file is not installed.
     """
     if not folder.is_dir():
         reason = "is a file, not a folder." if folder.is_file() else "there is no such folder."
@@ -142,7 +151,8 @@ def _sniffed(folder: Path, texts: Sequence[str]) -> tuple[dict[str, Dialect | No
         likely = None
         for file in evenly(members, SNIFFED):
             try:
-                text, whole = _text(folder, file)
+                text, whole = text_of(folder, file)
+                likely = "tab" if kind_of(file) in OF_ARRAYS else likely
                 dialects[file] = found = sniff(text, whole=whole, likely=likely)
                 likely = found.delimiter if found is not None else likely
             except BadFile as error:
@@ -157,10 +167,40 @@ def evenly(items: Sequence[str], count: int) -> list[str]:
     return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
 
 
-def _text(folder: Path, file: str) -> tuple[str, bool]:
+def text_of(folder: Path, file: str) -> tuple[str, bool]:
+    """Return a file as text, and whether it is the whole file; cells of sheets and arrays lie between tabs.
+
+    Raises
+    ------
+    BadFile
+        If it cannot be read.
+    CampaignError
+        If the library that reads it is not installed.
+    """
+    kind = kind_of(file)
+    if kind in OF_ARRAYS:
+        return _text_of_arrays(read_bytes(folder, file), file), True
+    if kind == "xlsx":
+        return read_sheet(read_bytes(folder, file), file, None, first=True).text.decode(), True
     whole = (folder / file).stat().st_size <= WHOLE_BYTES if (folder / file).exists() else True
     raw = read_bytes(folder, file, head=not whole)
     return as_utf8(raw, "auto", file, head=not whole).decode("utf-8", "replace"), whole
+
+
+def _text_of_arrays(raw: bytes, file: str) -> str:
+    """Return the header lines, names, units and first rows of a file of arrays."""
+    found = read_arrays(raw, file, TraceFormat())
+    lines = [*found.header]
+    if found.names:
+        lines += ["\t".join(found.names), "\t".join(_unit_in(found.header, name) for name in found.names)]
+    rows = zip(*(column[:ROWS].tolist() for column in found.columns), strict=True)
+    return "\n".join([*lines, *("\t".join(map(value_text, row)) for row in rows)])
+
+
+def _unit_in(header: Sequence[str], name: str) -> str:
+    """Return the unit of a channel by the properties of a TDMS file; "" if there is none."""
+    start = f"/{name}/unit_string\t"
+    return next((line.partition(start)[2] for line in header if start in line), "")
 
 
 def _by_form(tables: dict[str, Dialect]) -> tuple[dict[str, Dialect], dict[str, Dialect], dict[str, Dialect]]:
@@ -194,9 +234,7 @@ def _no_traces(
         return RequestError(f"no trace file can be read: {file} {reason}", file=folder, fix=fix)
     if formats:
         what = ", ".join(f"{count} {FORMATS[suffix]} ({suffix})" for suffix, count in formats.most_common())
-        reason = f"holds {what} and no trace file that is text."
-        fix = "Name their columns in a config (README: Excel, TDMS, MATLAB and Parquet)"
-        return RequestError(reason, file=folder, fix=f"{fix}, or export them as text (CSV).")
+        return RequestError(f"holds {what} and no trace file that can be read.", file=folder, fix=fix)
     shown = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
     reason = f"none of {len(files)} files holds a table of numbers with two columns or more ({shown})."
     return RequestError(reason, file=folder, fix=fix)
@@ -210,7 +248,7 @@ def read_tables(found: Found) -> dict[str, np.ndarray]:
     tables = {}
     for file in evenly(list(found.dialects), READ):
         dialect = found.dialects[file]
-        text, _ = _text(found.folder, file)
+        text, _ = text_of(found.folder, file)
         table = _numbers(text.split("\n")[len(dialect.header) :], found.dialect)
         if len(table) >= MIN_ROWS:
             tables[file] = table

@@ -163,7 +163,9 @@ def _without(names: Names, part: Part) -> Names:
 def source_keys(found: Found, source: Source, header: Collection[str], notes: Notes) -> None:
     """Add where files are, and what names and the table of runs say; `header` is what header lines give."""
     table = source.table
-    if table is not None and table.is_runs_csv:
+    if table is not None and table.is_read:
+        if not table.is_runs_csv:
+            notes.guess("files.runs_table", table.file, f"lists {table.named} of {len(found.traces)} traces")
         _table_keys(table, notes)
         if not table.whole_paths:
             column = next(theirs for theirs, ours in table.ours.items() if ours == "file")
@@ -174,20 +176,20 @@ def source_keys(found: Found, source: Source, header: Collection[str], notes: No
         _glob_keys(found, source, notes)
         if table is not None:
             _table_keys(table, notes)
-            reason = f"'{table.file}' lists {table.named} of the trace files, but only {RUNS_CSV} is read."
+            reason = f"'{table.file}' lists {table.named} of the trace files, but cannot be read as it is."
             fix = f"Copy it to {RUNS_CSV}; the columns below are those of this table."
             fix += " Without it, only names count."
             if not table.whole_paths:
                 fix += " Its names of files need their folders and suffixes."
             notes.doubt("files.runs_columns", reason, fix)
-    if table is None or not table.is_runs_csv or not set(AGING_CONDITION) <= table.given:
+    if table is None or not table.is_read or not set(AGING_CONDITION) <= table.given:
         told = table is not None or bool(set(header) & set(AGING_CONDITION))
         _name_keys(source.names, len(found.traces), told, notes)
     _otherwise({f: one for f, one in found.otherwise.items() if table is None or f != table.file}, notes)
     for file, reason in list(found.unreadable.items())[:3]:
         notes.doubt("files", f"{file} {reason}", "It is in no run.")
     for suffix, count in found.formats.items():
-        reason = f"{count} files ({suffix}) are no text and are not read."
+        reason = f"{count} files ({suffix}) are not read."
         notes.doubt("files", reason, "Export them as text (CSV) if they hold traces or the list of runs.")
 
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path, PurePosixPath
 
+from sealfit.draft.files_found import text_of
 from sealfit.draft.vocabulary import Unit, name_and_unit, setting
 from sealfit.errors import BadFile
-from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
+from sealfit.ingest.files import as_number, split_line
+from sealfit.ingest.formats import kind_of
 from sealfit.ingest.listing import RUNS_CSV
 
 NAMING = 0.5
@@ -40,13 +42,19 @@ class RunsTable:
         return self.file == RUNS_CSV
 
     @property
+    def is_read(self) -> bool:
+        """Whether it tells the files, as runs.csv or as `files.runs_table`."""
+        csv = PurePosixPath(self.file).suffix.lower() == ".csv"
+        return self.is_runs_csv or ((csv or kind_of(self.file) != "csv") and self.whole_paths)
+
+    @property
     def given(self) -> set[str]:
         """Our columns that it gives."""
         return set(self.ours.values())
 
 
 def find_table(folder: Path, others: Sequence[str], traces: Sequence[str]) -> RunsTable | None:
-    """Return the table of runs among text files other than traces: runs.csv, else the one that names most."""
+    """Return the table of runs among files other than traces: runs.csv, else the one that names most."""
     tables = [table for file in others if (table := _table(folder, file, traces)) is not None]
     return max(tables, key=lambda table: (table.is_runs_csv, table.named), default=None)
 
@@ -55,7 +63,7 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
     try:
         if (folder / file).stat().st_size > MAX_BYTES:
             return None
-        text = as_utf8(read_bytes(folder, file), "auto", file).decode()
+        text, _ = text_of(folder, file)
     except (BadFile, OSError):
         return None
     lines = [line for line in text.split("\n") if line.strip(" \t,;")]

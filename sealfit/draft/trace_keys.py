@@ -32,6 +32,8 @@ CHANNELS = ("temperature", "humidity", "pressure")
 
 def dialect_keys(found: Found, notes: Notes) -> None:
     """Add the keys of how the files are written."""
+    if found.of_arrays:
+        return
     one, sniffed = found.dialect, found.sniffed
     of = f"{len(sniffed)} of {len(sniffed)} files"
     if len(found.traces) > len(sniffed):

@@ -169,8 +169,11 @@ def column_role(name: str) -> tuple[str, int]:
 _SETTING_WORDS = (
     ("file", r"\bfile|datei"),
     ("started_at", r"\bstart|date\b|datum|begin|timestamp|zeitstempel|uhrzeit"),
-    ("temperature_C", r"^temp|(aging|ageing|alterungs?|auslagerungs?|lager|ofen|oven) ?temp|temp.*aging"),
-    ("aging_days", r"aging|ageing|\bage\b|alter|auslager|lager|\bdays?\b|\btage?\b"),
+    (
+        "temperature_C",
+        r"^temp|^oven$|^ofen$|(aging|ageing|alterungs?|auslagerungs?|lager|ofen|oven) ?temp|temp.*aging",
+    ),
+    ("aging_days", r"aging|ageing|\baged?\b|alter|auslager|lager|\bdays?\b|\btage?\b"),
     ("compression_ratio_pct", r"compress|verpress|stauch|height|hoehe"),
     ("speed_mm_s", r"speed|velocity|geschwind|vorschub|feed"),
     ("load_N", r"load\b|normal|auflast|\blast\b|anpress"),

@@ -355,10 +355,89 @@ def excel_us(folder: Path) -> Written:
     return written
 
 
+def tdms(folder: Path) -> Written:
+    """LabVIEW's TDMS: channels with units and the increment of a waveform, settings as properties."""
+    from nptdms import ChannelObject, RootObject, TdmsWriter
+
+    written = {}
+    for one in records():
+        file = f"log_{one.number:03d}.tdms"
+        wave = {"wf_increment": float(one.time_s[1]), "wf_start_offset": 0.0}
+        channels = [
+            ChannelObject("Messung", name, values, {**wave, "unit_string": unit})
+            for name, unit, values in (("Weg", "mm", one.displacement_mm), ("Kraft", "N", one.force_N))
+        ]
+        settings = {
+            "aging_days": float(one.days),
+            "oven_C": float(one.temperature),
+            "height_pct": float(one.compression),
+            "speed_mm_s": one.speed,
+            "repeat": one.repeat,
+        }
+        with TdmsWriter(str(folder / file)) as writer:
+            writer.write_segment([RootObject({**settings, "operator": "A"}), *channels])
+        written[file] = one
+    return written
+
+
+def matlab_structs(folder: Path) -> Written:
+    """MATLAB's save of a struct in each file, and a log kept in Excel, aging in hours."""
+    import openpyxl
+    from scipy.io import savemat
+
+    book, written = openpyxl.Workbook(), {}
+    book.active.append(
+        ("Trace file", "Date", "Oven temp (°C)", "Height (%)", "Aged (h)", "Speed (mm/s)", "Rep")
+    )
+    for one in records():
+        file = f"test{one.number:03d}.mat"
+        data = dict(zip(("Time_s", "Pos_mm", "Fx_N"), slots(one), strict=True))
+        savemat(folder / file, {"data": data, "operator": "MK"})
+        settings = (one.temperature, one.compression, 24 * one.days, one.speed, one.repeat)
+        book.active.append((file, one.started, *settings))
+        written[file] = one
+    book.save(folder / "Testlog.xlsx")
+    return written
+
+
+def parquet(folder: Path) -> Written:
+    """Parquet tables of a script, with the settings in the names of the files."""
+    import pandas as pd
+
+    written = {}
+    for one in records():
+        file = f"T{one.temperature}_C{one.compression}_d{one.days}_v{one.speed:g}_r{one.repeat}.parquet"
+        columns = zip(("time [s]", "position [mm]", "friction force [N]"), slots(one), strict=True)
+        pd.DataFrame(dict(columns)).to_parquet(folder / file)
+        written[file] = one
+    return written
+
+
+def workbooks(folder: Path) -> Written:
+    """Excel workbooks, one a test, with a title and units above the data, and a log beside them."""
+    import openpyxl
+
+    written, log = {}, openpyxl.Workbook()
+    log.active.append(("File", "Temperature [degF]", "Height [%]", "Aging [h]", "Speed [mm/s]", "Repeat"))
+    for one in records():
+        file, book = f"traces/test{one.number:02d}.xlsx", openpyxl.Workbook()
+        for row in (("Friction test",), (), ("Time", "Position", "Friction force"), ("s", "mm", "N")):
+            book.active.append(row)
+        for row in zip(*slots(one), strict=True):
+            book.active.append([float(value) for value in row])
+        (folder / "traces").mkdir(exist_ok=True)
+        book.save(folder / file)
+        settings = (1.8 * one.temperature + 32, one.compression, 24 * one.days, one.speed, one.repeat)
+        log.active.append((file, *settings))
+        written[file] = one
+    log.save(folder / "log.xlsx")
+    return written
+
+
 EXPORTS: dict[str, Callable[[Path], Written]] = {
     made.__name__: made
     for made in (
         german_daq, nested, labview, catman, dasylab, hbm, instron, zwick, mts, tribometer, benchvue, matlab,
-        excel_german, excel_us,
+        excel_german, excel_us, tdms, matlab_structs, parquet, workbooks,
     )
 }  # fmt: skip

@@ -289,7 +289,7 @@ SEPARATORS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", exports.EXPORTS)
+@pytest.mark.parametrize("name", SEPARATORS)
 def test_clevercsv_finds_the_separator_with_the_header_and_without(name, tmp_path):
     file = min(exports.EXPORTS[name](tmp_path))
     lines = as_utf8((tmp_path / file).read_bytes(), "auto", file).decode().split("\n")

@@ -1,6 +1,5 @@
-"""The draft of a config reads what others' programs export, with at most one edit; each edit is stated."""
+"""The draft of a config reads what others' programs export, without an edit."""
 
-import shutil
 from itertools import product
 from pathlib import Path
 
@@ -31,13 +30,6 @@ TELLS = {  # what is to be found of each file; all of it where nothing else is s
 }
 
 
-def copy_the_table(folder: Path) -> None:
-    shutil.copy(folder / "testplan.csv", folder / "runs.csv")
-
-
-EDITS = {"matlab": copy_the_table}  # the only one: only runs.csv is read, as the draft says
-
-
 def wanted(one: exports.Record) -> dict:
     return {
         "temperature_C": one.temperature,
@@ -50,10 +42,8 @@ def wanted(one: exports.Record) -> dict:
     }
 
 
-def read(folder: Path, edit=None):
+def read(folder: Path):
     made = draft(folder)
-    if edit is not None:
-        edit(folder)
     config = parse_config(made.text, "rig.toml")
     return made, config, ingest_campaign(folder, config)
 
@@ -83,7 +73,7 @@ def assert_values(folder, config, written):
 @pytest.mark.parametrize("name", exports.EXPORTS)
 def test_the_draft_reads_an_export(name, tmp_path):
     written = exports.EXPORTS[name](tmp_path)
-    _, config, ingested = read(tmp_path, EDITS.get(name))
+    _, config, ingested = read(tmp_path)
     assert_values(tmp_path, config, written)
     assert_settings(ingested, written, TELLS.get(name, ALL))
     assert set(ingested.tables["inputs"]["status"]) == {"used"}
@@ -92,7 +82,7 @@ def test_the_draft_reads_an_export(name, tmp_path):
 @pytest.mark.parametrize("name", sorted(set(exports.EXPORTS) - {"excel_german", "excel_us"}))
 def test_the_draft_leads_to_no_fault(name, tmp_path):
     exports.EXPORTS[name](tmp_path)
-    _, _, ingested = read(tmp_path, EDITS.get(name))
+    _, _, ingested = read(tmp_path)
     assert [str(fault) for fault in ingested.faults] == []
 
 

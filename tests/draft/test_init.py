@@ -148,6 +148,12 @@ def tdms(folder):
     (folder / "log.xlsx").write_bytes(b"PK\x03\x04" + bytes(100))
 
 
+def hdf5(folder):
+    folder.mkdir()
+    for number in range(3):
+        (folder / f"run{number}.h5").write_bytes(bytes(100))
+
+
 def empty_files(folder):
     folder.mkdir()
     (folder / "d1.csv").write_bytes(b"")
@@ -172,7 +178,8 @@ def only_a_table_of_runs(folder):
         (words, "none of 1 files holds a table of numbers", "export them as text"),
         (binary, "is not text", "export them as text"),
         (packed, "a zip archive or .xlsx workbook", "export them as text"),
-        (tdms, "3 TDMS (LabVIEW) (.tdms), 1 Excel workbooks (.xlsx)", "Name their columns in a config"),
+        (tdms, "cannot be read as ", "export them as text"),
+        (hdf5, "3 HDF5 files (.h5) and no trace file that can be read", "export them as text"),
         (empty_files, "is empty", "export them as text"),
         (values_over_days, "but no time and no force", "Give the folder that holds traces"),
         (only_a_table_of_runs, "none of 1 files holds a table of numbers", "export them as text"),
@@ -250,7 +257,7 @@ def test_documents_and_other_formats_do_not_disturb(tmp_path):
     made = draft(tmp_path)
     assert made.files == 12
     (doubt,) = made.doubts
-    assert "1 files (.tdms) are no text" in doubt.reason
+    assert doubt.reason.startswith("a.tdms holds no column of data")
 
 
 def test_a_draft_of_many_files_looks_at_some_and_says_so(tmp_path):
