@@ -15,6 +15,8 @@ from sealfit.draft.dialect import STRAYS
 from sealfit.draft.files_found import Found
 from sealfit.draft.header_lines import settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
+from sealfit.ingest.cells import seconds_of_day
+from sealfit.ingest.files import split_line
 from sealfit.units import Units, conversion
 
 LONG_S = 3600.0
@@ -140,7 +142,11 @@ def column_keys(
         _column_doubts(column, role, guesses[0].key, roles, notes)
     if roles.displacement is None and roles.speed is not None:
         helpers += _integrated(roles.speed, notes)
-    _missing_slots(roles, notes)
+    clock = _clock(found) if roles.time is None else None
+    if clock is not None:
+        evidence = f"column {clock[0]} '{clock[1]}': times of day; seconds count from the first"
+        notes.guess("trace.columns.time_s", clock[1] or clock[0], evidence)
+    _missing_slots(roles, clock is not None, notes)
     if roles.force is not None and roles.force.unit is not None:
         unit, words = roles.force.unit, plain(roles.force.label)
         if unit.dimension == "torque" or "torque" in words or "moment" in words:
@@ -218,7 +224,16 @@ def _rotation(angle: Unit, source: str, notes: Notes) -> None:
     notes.doubt("strokes", reason, fix, (f"turn = {conversion('turn', angle.name)(1.0):.10g}",))
 
 
-def _missing_slots(roles: Roles, notes: Notes) -> None:
+def _clock(found: Found) -> tuple[int, str] | None:
+    """Return position (from 1) and name of the first column of times of day; None if there is none."""
+    one = found.dialect
+    for i, cell in enumerate(split_line(one.first, one.delimiter)):
+        if i not in one.numbers and seconds_of_day([cell]) is not None:
+            return i + 1, one.names[i] if i < len(one.names) and one.names_are_cells else ""
+    return None
+
+
+def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:
     wanted = {
         "time": "no column of numbers rises evenly: there is no time.",
         "displacement": (
@@ -227,10 +242,9 @@ def _missing_slots(roles: Roles, notes: Notes) -> None:
         "force": "no column follows the motion: there is no force.",
     }
     for role, reason in wanted.items():
-        if getattr(roles, role) is None and not (role == "displacement" and roles.speed is not None):
+        other = {"displacement": roles.speed is not None, "time": has_clock}.get(role, False)
+        if getattr(roles, role) is None and not other:
             fix = f"Name it as {SLOTS[role]}, by the file's name of the column or by its position."
-            if role == "time":
-                fix += " A time of day must be exported as seconds."
             notes.doubt("trace.columns", reason, fix, (f"{SLOTS[role]} = 1",))
 
 

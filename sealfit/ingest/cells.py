@@ -105,7 +105,8 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 
 OVERLOAD = 1e30  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
-_CLOCK = re.compile(r"(.*\s)?\d+:\d+(:\d+([.,]\d+)?)?")
+_CLOCK = re.compile(r"(?:.*[\sT])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:\s*([ap])\.?m\.?)?Z?", re.IGNORECASE)
+_DAY_S = 86400.0
 _NUMBER = re.compile(r"\s*[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?(?=[\s,;])")
 
 
@@ -326,7 +327,8 @@ def _patient(
     faults: list[Fault] = []
     for i, name in numeric.items():
         cells = [row[i] if i < len(row) else None for row in rows]
-        columns[i] = numbers_of(cells, settings.decimal)
+        times = seconds_of_day(cells) if name == "time_s" else None
+        columns[i] = numbers_of(cells, settings.decimal) if times is None else times
         wrong = ~np.isfinite(columns[i])
         bad |= wrong
         column = ColumnOfFile(file, name, line, settings.decimal)
@@ -339,6 +341,32 @@ def _patient(
         words = any(cell is not None and as_number(cell, settings.decimal) is None for cell in cells)
         columns[i] = np.array(cells, dtype=object) if words else numbers_of(cells, settings.decimal)
     return Cells(columns, line, bad, tuple(faults))
+
+
+def seconds_of_day(cells: Sequence[str | None]) -> np.ndarray | None:
+    """Return seconds since the first of the times of day in cells, shape (n,); None if most hold none.
+
+    A date before the time is not read: where the time falls by more than half a day, midnight has passed.
+
+    Examples
+    --------
+    >>> seconds_of_day(["2026-03-01 23:59:59,5", "2026-03-02 00:00:00,0"])
+    array([0. , 0.5])
+    >>> seconds_of_day(["0.1", "0.2"]) is None
+    True
+    """
+    found = [_CLOCK.fullmatch(cell.strip()) if cell is not None else None for cell in cells]
+    if sum(match is not None for match in found) <= 0.5 * len(found):
+        return None
+    seconds = np.array([np.nan if match is None else _since_midnight(*match.groups()) for match in found])
+    known = np.flatnonzero(np.isfinite(seconds))
+    seconds[known] += _DAY_S * np.r_[0, np.cumsum(np.diff(seconds[known]) < -0.5 * _DAY_S)]
+    return seconds - seconds[known[0]]
+
+
+def _since_midnight(hours: str, minutes: str, seconds: str, half: str | None) -> float:
+    hour = int(hours) if half is None else int(hours) % 12 + 12 * (half.lower() == "p")
+    return 3600.0 * hour + 60.0 * int(minutes) + float(seconds.replace(",", "."))
 
 
 def numbers_of(cells: Iterable[str | None], decimal: str) -> np.ndarray:
@@ -370,8 +398,6 @@ def _cell_faults(
         elif i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in value):
             fix = "If this is a row of units, set units_row = true in the rig config; "
             fix += "otherwise delete the line."
-        elif _CLOCK.fullmatch(value):
-            fix = "Export the time as seconds, not as time of day."
         else:
             return column.not_a_number(i, cell)
         return column.fault(i, check, reason, value=value, fix=fix)

@@ -102,17 +102,6 @@ def test_a_displacement_is_integrated_from_a_speed(tmp_path):
     assert trace.columns["speed_column_mm_s"].unit == "mm/min"
 
 
-def test_a_time_of_day_is_a_doubt_with_its_fix(tmp_path):
-    for one in exports.records(days=(4,), repeats=(1,)):
-        lines = [
-            f"10:12:{i % 60:02d},{x:.4f},{f:.4f}"
-            for i, (_, x, f) in enumerate(zip(*exports.slots(one)))  # noqa: B905
-        ]
-        exports.write(tmp_path, f"d4_v{one.speed:g}.csv", "\n".join(["Clock,Position,Force", *lines]))
-    (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "there is no time" in doubt.reason]
-    assert "exported as seconds" in doubt.fix
-
-
 def test_a_time_in_no_unit_that_would_last_for_hours_is_in_ms(tmp_path):
     made = campaign(
         tmp_path, lambda one: [one.time_s * 1000, *exports.slots(one)[1:]], "Time,Position,Force\n"

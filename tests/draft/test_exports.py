@@ -1,5 +1,6 @@
 """The draft of a config reads what others' programs export, without an edit."""
 
+from datetime import timedelta
 from itertools import product
 from pathlib import Path
 
@@ -245,3 +246,15 @@ def test_a_rotating_rig_with_two_loads_needs_no_edit(angle, turn, tmp_path):
     assert len(runs) == 8  # of a rubber, a load and a speed
     assert sorted(runs.round(1).unique()) == [2.0, 20.0]  # in rpm
     assert list(ingested.faults) == []
+
+
+def test_times_of_day_are_found_as_the_time(tmp_path):
+    for name, one in zip("ab", exports.records(days=(1,), speeds=(1.0, 5.0), repeats=(1,)), strict=True):
+        times = [(one.started + timedelta(seconds=float(t))).isoformat(" ") for t in one.time_s]
+        rows = zip(times, one.displacement_mm, one.force_N, strict=True)
+        lines = ["Timestamp,Position [mm],Force [N]", *(f"{t},{x:.5f},{f:.5f}" for t, x, f in rows)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines) + "\n")
+    made, config, _ = read(tmp_path)
+    assert not any("there is no time" in doubt.reason for doubt in made.doubts)
+    table = read_trace(tmp_path, TraceRef("b.csv", {}), config).table
+    npt.assert_allclose(table["time_s"], one.time_s, atol=1e-5)

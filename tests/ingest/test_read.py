@@ -1,4 +1,5 @@
 import os
+from datetime import datetime, timedelta
 
 import numpy as np
 import numpy.testing as npt
@@ -172,13 +173,33 @@ def test_speed_within_tolerance_or_resting_agrees_and_a_slip_warns(tmp_path):
     assert read(tmp_path, csv_of(rests), speed_set_mm_s=5.0).faults == ()
 
 
-def test_units_rows_and_clocks_are_recognised_for_what_they_are(tmp_path):
+def test_units_rows_are_recognised_for_what_they_are(tmp_path):
     trace = read(tmp_path, csv_of(["[s],[mm],[N]", *ROWS]))
     assert len(trace.table) == 100
     assert all("units_row = true" in fault.fix for fault in trace.faults)
     assert read(tmp_path, csv_of(["[s],[mm],[N]", *ROWS]), "trace.units_row = true").faults == ()
-    clocks = [f"12:00:0{row}" for row in ROWS]
-    assert "as seconds" in refused(tmp_path, csv_of(clocks)).fix
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%Y-%m-%d %H:%M:%S.%f",
+        "%Y-%m-%dT%H:%M:%S.%fZ",
+        "%d.%m.%Y %H:%M:%S.%f",
+        "%H:%M:%S.%f",
+        "%I:%M:%S.%f %p",
+    ],
+)
+def test_times_of_day_are_seconds_since_the_first_past_midnight_too(form, tmp_path):
+    first = datetime(2026, 3, 1, 23, 59, 57)
+    times = [(first + timedelta(seconds=0.1 * i)).strftime(form) for i in range(len(ROWS))]
+    rows = [f"{time},{row.partition(',')[2]}" for time, row in zip(times, ROWS, strict=True)]
+    trace = read(tmp_path, csv_of(rows))
+    npt.assert_allclose(trace.table["time_s"], 0.1 * np.arange(len(ROWS)), atol=1e-9)
+    assert trace.faults == ()
+    rows[7] = f"noon,{rows[7].partition(',')[2]}"
+    (fault,) = read(tmp_path, csv_of(rows)).faults
+    assert (fault.line, fault.column, fault.value) == (9, "time_s", "noon")
 
 
 def test_many_short_strokes_with_rests_have_the_speed_of_their_plateaus(tmp_path):
