@@ -205,6 +205,8 @@ def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame
     try:
         store.require("close-loop")
     except StaleError as error:
+        if any(store.why_stale(step) for step in store.up_to("fit-steady")):
+            raise
         other = "or ask the declared model, without effects: --model before"
         raise StaleError(error.message, file=error.file, fix=f"{error.fix} ({other})") from error
     added = [effect for effect in store.read_json("closure")["effects"] if not effect["candidate"]]

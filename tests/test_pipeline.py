@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -120,6 +121,15 @@ def test_where_nothing_is_missing_after_is_before(first):
     assert sealfit(*asked[:-1], "--model", "both", code=1).stderr.startswith(
         "sealfit: there is no model 'both'."
     )
+
+
+@pytest.mark.parametrize(("lost", "offered"), [("closure.json", True), ("steady_fit.parquet", False)])
+def test_lifetime_offers_the_declared_model_where_its_fits_are_current(first, tmp_path, lost, offered):
+    shutil.copytree(first[0], tmp_path / "out")
+    (tmp_path / "out" / lost).unlink()
+    said = sealfit("lifetime", tmp_path / "out", "--threshold", "0.75", code=1).stderr
+    assert "Run: sealfit" in said
+    assert ("--model before" in said) == offered
 
 
 def test_a_run_ends_with_a_short_summary(first):

@@ -46,7 +46,8 @@ class Dialect:
     `names_back` and `units_back` count their lines back from the header's end, 1 the last; `names_are_cells`
     is False where the reader cuts the line of names in another way, as names hold the separator. `numbers`
     are the positions (from 0) that hold numbers, `first` is the first line of data, `odd_lines` counts lines
-    between the data that are none, `footer` are the lines below. `decimal` is "" where no number has one.
+    between the data without any of these numbers, `footer` are the lines below. `decimal` is "" where no
+    number has one.
     """
 
     delimiter: str
@@ -172,7 +173,7 @@ def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Di
     numeric = [_numeric(line, delimiter, block.decimal) for line in lines[start:]]
     is_data = [found is not None and core <= found for found in numeric]
     last = max(i for i, good in enumerate(is_data) if good)
-    odd = sum(not good and found is not None for good, found in zip(is_data[:last], numeric, strict=False))
+    odd = sum(found is not None and core.isdisjoint(found) for found in numeric[:last])
     below = [line for line in lines[start + last + 1 :] if line.strip()]
     data = [line for line, good in zip(lines[start : start + SAMPLE_LINES], is_data, strict=False) if good]
     trailing = _ends_in_separator(data, delimiter)

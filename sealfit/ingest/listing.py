@@ -6,7 +6,7 @@ import csv
 import io
 import os
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
@@ -214,16 +214,27 @@ def _our_names(header: list[str], table: str, config: Config) -> tuple[list[str]
         if theirs not in header:
             reason = "there is no such column, but files.runs_columns names it."
             add("missing_column", theirs, reason, suggestion(theirs, header))
-    wanted = [*dict.fromkeys([*KNOWN, *config.condition])]
+    faults += misspelt(names, names, config, {"file": table, "line": 1})
+    return names, faults
+
+
+def misspelt(
+    names: Iterable[str], beside: Collection[str], config: Config, place: Mapping[str, str | int]
+) -> list[Fault]:
+    """Return faults of columns whose names look like one that is not `beside` them; `place` says where."""
+    faults, wanted = [], [*dict.fromkeys([*KNOWN, *config.condition])]
     for name in names:
         close = nearest(name, wanted) if name not in wanted and name != "file" else ""
-        if close and close.lower() == name.lower() and close not in names:
-            reason = f"differs from '{close}' in the case of letters only."
-            add("column_name", name, reason, f"Write '{close}'.")
-        elif close and close not in names and SequenceMatcher(None, name, close).ratio() > 0.85:
+        if not close or close in beside:
+            continue
+        if close.lower() == name.lower():
+            reason, fix = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."
+            faults.append(Fault("column_name", reason, fix=fix, column=name, **place))
+        elif SequenceMatcher(None, name, close).ratio() > 0.85:
             reason = f"is kept as a channel; it looks like '{close}'."
-            add("column_name", name, reason, f"Write '{close}' if that is meant.", **KEPT)
-    return names, faults
+            fix = f"Write '{close}' if that is meant."
+            faults.append(Fault("column_name", reason, fix=fix, column=name, **place, **KEPT))
+    return faults
 
 
 def _posix(campaign: Path, file: str) -> str:

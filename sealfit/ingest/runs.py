@@ -54,7 +54,7 @@ from sealfit.ingest.file_names import (
 )
 from sealfit.ingest.files import bad_file, cut_files
 from sealfit.ingest.formats import kind_of, require_libraries
-from sealfit.ingest.listing import Entry, list_entries
+from sealfit.ingest.listing import Entry, list_entries, misspelt
 from sealfit.ingest.reader import read_header, read_trace
 from sealfit.ingest.start_times import add_order, join_date_and_time
 from sealfit.ingest.trace_checks import measured_speed, speed_factor
@@ -94,6 +94,8 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     faults += found
     columns, found = with_computed(entries, columns, config)
     faults += found
+    of_config = [name for name in columns if name not in cells]
+    faults += misspelt(of_config, columns, config, {"file": f"config '{config.name}'"})
     columns, measured, left_out, found = _from_traces(campaign, entries, columns, config)
     kept = [i for i in range(len(entries)) if i not in left_out]
     if not kept:

@@ -43,7 +43,8 @@ def campaign_folder(path: Path, config: Config) -> Path:
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
         names = sorted(child.name + ("/" if child.is_dir() else "") for child in path.iterdir())
         shown = ", ".join(names[:5] or ["none"]) + (", ..." if len(names) > 5 else ".")
-        fix = f"It lists the trace files; or set files.glob in a config (--config). Files here: {shown}"
+        fix = "It lists the trace files; or draft a config that finds them: "
+        fix += f"sealfit init {quoted(path)}. Files here: {shown}"
         if below:
             fix = "Did you mean " + " or ".join(quoted(folder) for folder in below[:3]) + "?"
         raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, fix=fix)])

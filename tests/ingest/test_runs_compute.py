@@ -1,7 +1,8 @@
 import pytest
-from trace_helpers import DAYS, campaign, channels, faults
+from trace_helpers import DAYS, campaign, channels, config, faults
 
 from sealfit.errors import ConfigError
+from sealfit.ingest.runs import list_traces
 
 LOG = "file,run_id,aging_days,mass_kg,hanger,lap\na.csv,r1,4,5,A,1\nb.csv,r2,4,5,B,2\nc.csv,r3,4,,B,3"
 
@@ -29,6 +30,13 @@ def test_a_constant_stands_where_the_log_has_no_value(tmp_path):
     folder = campaign(tmp_path, LOG)
     assert column(folder, "load_N", rig) == [49.03] * 3
     assert column(folder, "mass_kg", rig) == [5.0, 5.0, 6.0]
+
+
+def test_a_misspelt_name_of_the_config_is_said(tmp_path):
+    text = DAYS + "[runs]\nconstants = {loads_N = 49.03}\n"
+    _, (fault,) = list_traces(campaign(tmp_path, LOG), config(text))
+    assert fault.column == "loads_N"
+    assert fault.fix == "Write 'load_N' if that is meant."
 
 
 def test_a_computed_value_that_is_no_number_is_a_fault_of_its_row(tmp_path):
