@@ -123,34 +123,33 @@ def _gain(
 ) -> Gain:
     """Return the gain on rows held out by `masks`, about the means of the groups of level `around` if given.
 
-    Both residuals are whitened by the scatter estimated with the proposal. Without it the effect is part of
-    the scatter, and a specimen has almost no weight.
+    The means are over the rows of all folds: in one fold a specimen may have a single run, and nothing would
+    be left about its own mean. Both residuals are whitened by the scatter estimated with the proposal.
+    Without it the effect is part of the scatter, and a specimen has almost no weight.
     """
     rows, after = before.rows, proposal.fitted
-    squares, total, falls = np.zeros(2), 0.0, []
+    left = np.full((2, rows.force.size), np.nan)
     for number, out in enumerate(masks):
-        inside = covered(rows, out, proposal.term.channels)[out]
+        inside = covered(rows, out, proposal.term.channels) & out
         if not inside.any():
             continue
         held = rows.subset(out)
-        test = held.subset(inside)
-        weight, whitening = (
-            rows.weight[out][inside],
-            Whitening(after.scatter, before.friction[out][inside], test.groups),
-        )
-        total += float(weight.sum())
         if (*key, number) not in known:
             known[*key, number] = _heldout_residual(before, before.model, out, held)
-        white = []
-        for k, left in enumerate((known[*key, number], _heldout_residual(before, after.model, out, held))):
-            residual = about_means(left[inside], test, around)
-            squares[k] += float(weight @ residual**2)
-            white.append(test.groups.sums(whitening(residual[:, None])[:, 0] ** 2, proposal.unit))
-        falls.append(white[0] - white[1])
-    fall = np.concatenate(falls) if falls else np.zeros(1)
-    rmse = np.sqrt(squares / max(total, 1e-300))
+        left[:, inside] = np.array([known[*key, number], _heldout_residual(before, after.model, out, held)])[
+            :, inside[out]
+        ]
+    scored = np.isfinite(left[0])
+    if not scored.any():
+        return Gain(0.0, 0.0, 0.0, 0.0)
+    test, weight = rows.subset(scored), rows.weight[scored]
+    whitening = Whitening(after.scatter, before.friction[scored], test.groups)
+    about = [about_means(own, test, around) for own in left[:, scored]]
+    rmse = [float(np.sqrt(np.average(own**2, weights=weight))) for own in about]
+    white = [test.groups.sums(whitening(own[:, None])[:, 0] ** 2, proposal.unit) for own in about]
+    fall = white[0] - white[1]
     error = float(np.std(fall) * np.sqrt(fall.size))
-    return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(fall.sum()), error)
+    return Gain(rmse[0] - rmse[1], rmse[1], float(fall.sum()), error)
 
 
 def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:

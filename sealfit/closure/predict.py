@@ -184,10 +184,12 @@ def _conditions(
             like = conditions.index[(conditions["series"] == series) & (conditions["rubber"] == rubber)]
             lawful = [c for c in like if declared.index["a_c"][c] >= 0]
             if not lawful or not 0 <= days.iloc[k] < OVERLOAD:
-                notes[k].append(
-                    f"condition {name} was not tested and has no fitted aging law: give a tested condition, "
-                    "or other days of a tested series with three or more days"
-                )
+                fix = f"give a tested condition, such as {conditions['condition'].iloc[0]}"
+                law = ""
+                if config.aging:
+                    law = " and has no fitted aging law"
+                    fix += ", or other days of a tested series with three or more days"
+                notes[k].append(f"condition {name} was not tested{law}: {fix}")
                 continue
             known[name] = len(names)
             names.append(name)

@@ -72,6 +72,26 @@ def test_a_gain_is_weighed_by_the_scatter_that_is_left_with_the_effect_in(seed):
     assert gain.real
 
 
+def test_one_run_of_a_specimen_in_a_fold_is_compared_with_the_mean_of_all_its_runs():
+    """About the mean of the fold's own runs of a specimen, a single one would leave no error at all."""
+    tested = {"days": (1.0, 2.0, 4.0, 8.0, 16.0), "speeds": (1.0, 3.0, 10.0, 30.0, 90.0), "repeats": 1, "bins": 4}
+    bins = make_bins(
+        0,
+        **tested,
+        specimen=0.02,
+        run_channels={"pressure_bar": lambda rng: rng.uniform(2.0, 8.0)},
+        effect=lambda table, force: force + 0.5 * (table["pressure_bar"] - 5.0),
+    )
+    before = fit_declared(make_rows(bins, has_aging=True))
+    term = Term(EFFECTS["linear"], ("pressure_bar",), "force", "add", fixed={"x_ref": 5.0})
+    after = fit(before.model.with_term(term, {"A": 0.5}), before.rows, before.scatter, turns=2)
+    column = after.force - before.force
+    proposal = SimpleNamespace(term=term, fitted=after, unit="run", column=column)
+    gain = heldout_gain(before, proposal, 5, 0, None, {})
+    assert gain.real
+    assert gain.rmse_N > 0.2
+
+
 def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_another():
     bins = make_bins(temperatures=(60.0, 80.0), days=(4.0,), repeats=2, bins=4)
     order = bins.groupby("file", sort=True).ngroup()  # one condition after the other
