@@ -167,20 +167,13 @@ def source_keys(found: Found, source: Source, header: Collection[str], notes: No
         if not table.is_runs_csv:
             notes.guess("files.runs_table", table.file, f"lists {table.named} of {len(found.traces)} traces")
         _table_keys(table, notes)
-        if not table.whole_paths:
-            column = next(theirs for theirs, ours in table.ours.items() if ours == "file")
-            what = f"does not give whole paths, such as '{found.traces[0]}'"
-            fix = "Write paths relative to the folder, with the suffix."
-            notes.doubt("files.runs_columns", f"column '{column}' of {table.file} {what}.", fix)
     else:
         _glob_keys(found, source, notes)
         if table is not None:
             _table_keys(table, notes)
-            reason = f"'{table.file}' lists {table.named} of the trace files, but cannot be read as it is."
+            reason = f"'{table.file}' lists {table.named} of the trace files, but has not the ending .csv."
             fix = f"Copy it to {RUNS_CSV}; the columns below are those of this table."
             fix += " Without it, only names count."
-            if not table.whole_paths:
-                fix += " Its names of files need their folders and suffixes."
             notes.doubt("files.runs_columns", reason, fix)
     if table is None or not table.is_read or not set(AGING_CONDITION) <= table.given:
         told = table is not None or bool(set(header) & set(AGING_CONDITION))

@@ -25,15 +25,14 @@ MAX_BYTES = 4_000_000
 class RunsTable:
     """A table with a line for each trace file.
 
-    `ours` is our name of each of its columns, by theirs; `units` the units that their names carry;
-    `whole_paths` is whether its cells are paths of trace files as they stand, which is what the reader needs.
+    `ours` is our name of each of its columns, by theirs; `units` the units that their names carry; `named` is
+    how many of its cells name a trace file, with or without folders and suffix.
     """
 
     file: str
     ours: Mapping[str, str]
     units: Mapping[str, Unit]
     cells: Mapping[str, tuple[str, ...]]
-    whole_paths: bool
     named: int
 
     @property
@@ -45,7 +44,7 @@ class RunsTable:
     def is_read(self) -> bool:
         """Whether it tells the files, as runs.csv or as `files.runs_table`."""
         csv = PurePosixPath(self.file).suffix.lower() == ".csv"
-        return self.is_runs_csv or ((csv or kind_of(self.file) != "csv") and self.whole_paths)
+        return csv or kind_of(self.file) != "csv"
 
     @property
     def given(self) -> set[str]:
@@ -78,20 +77,18 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
     }
     naming = {name: _names_files(column, traces) for name, column in cells.items()}
     best = max(naming, key=lambda name: naming[name], default=None)
-    if best is None or naming[best][0] < NAMING * len(rows):
+    if best is None or naming[best] < NAMING * len(rows):
         return None
-    named, whole = naming[best]
     ours, units = _meanings(names, best, cells)
-    return RunsTable(file, ours, units, cells, whole == named, named)
+    return RunsTable(file, ours, units, cells, naming[best])
 
 
-def _names_files(column: Sequence[str], traces: Sequence[str]) -> tuple[int, int]:
-    """Return how many cells name a trace, with or without folders and suffix, and how many by whole path."""
-    paths = set(traces)
-    short = {PurePosixPath(file).name for file in traces} | {PurePosixPath(file).stem for file in traces}
-    posix = [cell.replace("\\", "/") for cell in column if cell]
-    whole = sum(cell in paths for cell in posix)
-    return sum(cell in paths or PurePosixPath(cell).name in short for cell in posix), whole
+def _names_files(column: Sequence[str], traces: Sequence[str]) -> int:
+    """Return how many cells name a trace, with or without folders and suffix."""
+    paths = [PurePosixPath(file) for file in traces]
+    known = {*traces, *(path.with_suffix("").as_posix() for path in paths)}
+    known |= {path.name for path in paths} | {path.stem for path in paths}
+    return sum(cell.replace("\\", "/") in known for cell in column if cell)
 
 
 def _meanings(

@@ -6,15 +6,16 @@ import csv
 import io
 import os
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from sealfit.config import Config
-from sealfit.errors import KEPT, BadFile, CampaignError, Fault, nearest, printable
+from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, Fault, nearest, printable
 from sealfit.ingest.categorical import Columns, mapped
 from sealfit.ingest.columns import suggestion
 from sealfit.ingest.files import as_number, inside, split_line
@@ -39,6 +40,9 @@ MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
 PASSED_OVER = {"severity": "info", "action": "file left out"}
 FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
 _BLANK = b" \t,;\n"  # a line of nothing else is none
+
+INDEX = ".tdms_index"
+"""Ending of the files that LabVIEW writes beside its traces."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +82,8 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, 
         if not files and not any(fault.severity == "error" for fault in faults):
             raise stopped("no_rows", "has a header but no rows.", "Write one row per trace file.", file=table)
         entries = [Entry(file, line, table) for file, line in zip(files, lines, strict=True)]
+        entries, found = _with_whole_paths(campaign, entries, table)
+        faults += found
     elif config.files.glob is not None:
         entries, faults = _by_glob(campaign, config)
     else:
@@ -242,6 +248,29 @@ def _posix(campaign: Path, file: str) -> str:
     if "\\" in file and not os.path.exists(campaign / file):
         file = file.replace("\\", "/")
     return os.path.normpath(file) if file else file
+
+
+def _with_whole_paths(campaign: Path, entries: list[Entry], table: str) -> tuple[list[Entry], list[Fault]]:
+    """Return the entries, and notes of those whose file is the only one of that name, below or with a suffix.
+
+    A log often has the name of a test, without folders and suffix.
+    """
+    listed = {e.file for e in entries if e.file and inside(campaign, e.file) is not None}
+    missing = {file for file in listed if not os.path.exists(campaign / file)}
+    named: dict[str, list[str]] = defaultdict(list)
+    for path in campaign.rglob("*") if missing else ():
+        own = path.relative_to(campaign)
+        if own.as_posix() != table and own.suffix != INDEX and path.is_file():
+            for name in {own.name, own.stem, own.with_suffix("").as_posix()} & missing:
+                named[name].append(own.as_posix())
+    whole = {name: files[0] for name, files in named.items() if len(files) == 1}
+    made, notes = [], []
+    for entry in entries:
+        made.append(replace(entry, file=whole.get(entry.file, entry.file)))
+        if entry.file in whole:
+            reason = f"is taken for '{whole[entry.file]}', the only file of that name."
+            notes.append(entry.fault("file_name", reason, "file", value=entry.file, **NOTED))
+    return made, notes
 
 
 def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:

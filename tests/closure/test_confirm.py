@@ -74,10 +74,11 @@ def test_a_gain_is_weighed_by_the_scatter_that_is_left_with_the_effect_in(seed):
 
 def test_one_run_of_a_specimen_in_a_fold_is_compared_with_the_mean_of_all_its_runs():
     """About the mean of the fold's own runs of a specimen, a single one would leave no error at all."""
-    tested = {"days": (1.0, 2.0, 4.0, 8.0, 16.0), "speeds": (1.0, 3.0, 10.0, 30.0, 90.0), "repeats": 1, "bins": 4}
     bins = make_bins(
-        0,
-        **tested,
+        days=(1.0, 2.0, 4.0, 8.0, 16.0),
+        speeds=(1.0, 3.0, 10.0, 30.0, 90.0),
+        repeats=1,
+        bins=4,
         specimen=0.02,
         run_channels={"pressure_bar": lambda rng: rng.uniform(2.0, 8.0)},
         effect=lambda table, force: force + 0.5 * (table["pressure_bar"] - 5.0),

@@ -357,16 +357,8 @@ def excel_us(folder: Path) -> Written:
 
 def tdms(folder: Path) -> Written:
     """LabVIEW's TDMS: channels with units and the increment of a waveform, settings as properties."""
-    from nptdms import ChannelObject, RootObject, TdmsWriter
-
     written = {}
     for one in records():
-        file = f"log_{one.number:03d}.tdms"
-        wave = {"wf_increment": float(one.time_s[1]), "wf_start_offset": 0.0}
-        channels = [
-            ChannelObject("Messung", name, values, {**wave, "unit_string": unit})
-            for name, unit, values in (("Weg", "mm", one.displacement_mm), ("Kraft", "N", one.force_N))
-        ]
         settings = {
             "aging_days": float(one.days),
             "oven_C": float(one.temperature),
@@ -374,10 +366,43 @@ def tdms(folder: Path) -> Written:
             "speed_mm_s": one.speed,
             "repeat": one.repeat,
         }
-        with TdmsWriter(str(folder / file)) as writer:
-            writer.write_segment([RootObject({**settings, "operator": "A"}), *channels])
+        file = f"log_{one.number:03d}.tdms"
+        write_tdms(folder / file, one, settings)
         written[file] = one
     return written
+
+
+def tdms_and_log(folder: Path) -> Written:
+    """LabVIEW's TDMS in a folder, and a log in Excel that names the tests without folder and suffix."""
+    import openpyxl
+
+    log, written = openpyxl.Workbook(), {}
+    log.active.append(
+        ("Messung", "Ofentemperatur [°C]", "Höhe [%]", "Alterung [h]", "Geschwindigkeit", "Wdh")
+    )
+    for one in records():
+        name = f"Messung_{one.number:03d}"
+        file = f"Rohdaten/{name}.tdms"
+        (folder / "Rohdaten").mkdir(exist_ok=True)
+        write_tdms(folder / file, one, {"operator": "A"})
+        (folder / f"{file}_index").write_bytes(b"TDSh")
+        log.active.append((name, one.temperature, one.compression, 24 * one.days, one.speed, one.repeat))
+        written[file] = one
+    log.save(folder / "Protokoll.xlsx")
+    return written
+
+
+def write_tdms(path: Path, one: Record, properties: dict) -> None:
+    """Write a record as a TDMS file with these properties."""
+    from nptdms import ChannelObject, RootObject, TdmsWriter
+
+    wave = {"wf_increment": float(one.time_s[1]), "wf_start_offset": 0.0}
+    channels = [
+        ChannelObject("Messung", name, values, {**wave, "unit_string": unit})
+        for name, unit, values in (("Weg", "mm", one.displacement_mm), ("Kraft", "N", one.force_N))
+    ]
+    with TdmsWriter(str(path)) as writer:
+        writer.write_segment([RootObject(properties), *channels])
 
 
 def matlab_structs(folder: Path) -> Written:
@@ -438,6 +463,6 @@ EXPORTS: dict[str, Callable[[Path], Written]] = {
     made.__name__: made
     for made in (
         german_daq, nested, labview, catman, dasylab, hbm, instron, zwick, mts, tribometer, benchvue, matlab,
-        excel_german, excel_us, tdms, matlab_structs, parquet, workbooks,
+        excel_german, excel_us, tdms, tdms_and_log, matlab_structs, parquet, workbooks,
     )
 }  # fmt: skip

@@ -275,16 +275,6 @@ def test_a_draft_of_many_files_looks_at_some_and_says_so(tmp_path):
     assert guess.evidence == "the separator in 24 of 24 files looked at, of 84"
 
 
-def test_runs_csv_with_paths_that_are_none_is_a_doubt(tmp_path):
-    for number in (1, 2):
-        (one,) = exports.records(days=(number,), speeds=(5.0,), repeats=(1,))
-        exports.write(tmp_path, f"raw/m{number}.csv", plain(one))
-    exports.write(tmp_path, "runs.csv", "Test,Days\nm1,1\nm2,4\n")
-    made = draft(tmp_path)
-    (doubt,) = [doubt for doubt in made.doubts if "whole paths" in doubt.reason]
-    assert "raw/m1.csv" in doubt.reason
-
-
 def test_a_table_of_runs_in_other_units_is_converted_and_its_doubts_are_said(tmp_path):
     for number in (1, 2):
         (one,) = exports.records(days=(number,), speeds=(5.0,), repeats=(1,))

@@ -328,3 +328,16 @@ def test_any_runs_csv_is_read_or_refused_with_a_fix(tmp_path_factory, lines, jun
     assert len(refs) > 0
     assert all({"run_id", "repeat", "specimen_id", "aging_days"} <= set(ref.channels) for ref in refs)
     assert len({(ref.channels["run_id"], ref.channels["repeat"]) for ref in refs}) == len(refs)
+
+
+def test_a_log_may_name_files_without_folders_and_suffix(tmp_path):
+    folder = campaign(tmp_path, "file,aging_days,load_N,speed_mm_s\nt1,4,49,5\nraw/t2,4,49,6\n")
+    (folder / "raw").mkdir()
+    for name in ("t1", "t2"):
+        (folder / "raw" / f"{name}.tdms").touch()
+    (folder / "raw" / "t1.tdms_index").touch()
+    listing, notes = list_traces(folder, config(DAYS))
+    assert listing.files == ["raw/t1.tdms", "raw/t2.tdms"]
+    assert [(n.line, n.value, n.severity) for n in notes] == [(2, "t1", "info"), (3, "raw/t2", "info")]
+    (folder / "t1.csv").touch()  # now it is not the only one
+    assert "t1" in list_traces(folder, config(DAYS))[0].files
