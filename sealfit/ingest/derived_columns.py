@@ -12,6 +12,7 @@ import numpy as np
 from sealfit.config import Config
 from sealfit.errors import KEPT, NOTED, ConfigError, Fault
 from sealfit.ingest.categorical import (
+    UNAGED,
     Column,
     Columns,
     condition_columns,
@@ -130,7 +131,7 @@ def of_its_kind(name: str, value: float) -> float | str:
     """Return a computed number as its column holds it: an integer for repeats or strokes, text for a name."""
     if name in COUNTS and value == int(value):
         return int(value)
-    return f"{value:g}" if name in TEXT_COLUMNS else value
+    return f"{value:.12g}" if name in TEXT_COLUMNS else value
 
 
 def to_values(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
@@ -395,6 +396,10 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
         if other != i:
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
             fix = "Give every file of a run its own repeat number, or each stroke of a repeat its number."
+            if conditions[i].startswith(UNAGED):
+                fix += (
+                    " Pieces of unaged rubber that were tested with several series need a specimen_id each."
+                )
             faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], fix=fix))
         for name, column in told.items():
             mine, theirs = column[i], column[j]

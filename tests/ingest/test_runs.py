@@ -341,3 +341,10 @@ def test_a_log_may_name_files_without_folders_and_suffix(tmp_path):
     assert [(n.line, n.value, n.severity) for n in notes] == [(2, "t1", "info"), (3, "raw/t2", "info")]
     (folder / "t1.csv").touch()  # now it is not the only one
     assert "t1" in list_traces(folder, config(DAYS))[0].files
+
+
+def test_unaged_rubber_of_several_series_needs_a_name_for_each_piece(tmp_path):
+    table = "file,temperature_C,compression_ratio_pct,aging_days,speed_mm_s,load_N,repeat\n"
+    (fault,) = faults(campaign(tmp_path, table + "a.csv,60,80,0,5,49,1\nb.csv,80,80,0,5,49,1\n"))
+    assert "unaged rubber" in fault.fix
+    assert "specimen_id" in fault.fix

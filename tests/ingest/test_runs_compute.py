@@ -92,3 +92,8 @@ def test_aged_rubber_needs_its_temperature_and_a_medium_may_be_fresh(tmp_path):
         ("used", 4.0),
         ("used", 0.0),
     ]
+
+
+def test_a_computed_name_keeps_its_digits(tmp_path):
+    rig = "[runs]\nconstants = {load_N = 49.03}\ncompute = {run_id = '1000000 * aging_days + lap'}\n"
+    assert column(campaign(tmp_path, LOG), "run_id", rig) == ["4000001", "4000002", "4000003"]
