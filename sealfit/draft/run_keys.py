@@ -70,7 +70,7 @@ def improved(names: Names, speeds: Mapping[str, float], found: Found, notes: Not
     """Return the names with speeds that agree with the measured ones, and repeats that tell files apart."""
     if names.pattern is None:
         return names
-    return _told_apart(_with_speed(names, speeds, notes), found, notes)
+    return _unaged_apart(_told_apart(_with_speed(names, speeds, notes), found, notes), found)
 
 
 def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Names:
@@ -143,6 +143,20 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
     fix = "It is not used; repeats are numbered in the order of the files."
     notes.doubt("files.name_pattern", reason, fix)
     return _without(names, repeat)
+
+
+def _unaged_apart(names: Names, found: Found) -> Names:
+    """Return the names with a specimen for each series, where files of unaged rubber are alike otherwise."""
+    series = [part for part in names.parts if part.ours in AGING_CONDITION and part.group]
+    if "specimen_id" in names.given or "aging_days" not in names.given or len(series) < 2:
+        return names
+    alike = names.given - {*AGING_CONDITION, "started_at"}
+    unaged = [one for one in values_by_file(names, found.traces).values() if one.get("aging_days") == 0]
+    keys = Counter(tuple(one.get(name) for name in sorted(alike)) for one in unaged)
+    if not keys or max(keys.values()) == 1:
+        return names
+    template = " ".join(f"{{{part.group}}}" for part in series)
+    return replace(names, columns={**names.columns, "specimen_id": template})
 
 
 def _without(names: Names, part: Part) -> Names:
@@ -269,7 +283,12 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
             notes.doubt("files.name_pattern", reason, "Check what it stands for.")
     for name, template in names.columns.items():
         evidence = "made of parts of the name"
-        if name == "specimen_id":
+        if name == "specimen_id" and not any(part.ours == name for part in names.parts):
+            evidence = "unaged rubber was tested with several series, in files that are alike otherwise"
+            reason = "each series is taken to have a piece of unaged rubber of its own."
+            fix = "If it was the same piece, number its repeats through and delete this line."
+            notes.doubt(f"files.columns.{name}", reason, fix)
+        elif name == "specimen_id":
             evidence = "the number of the piece of rubber, within its condition"
             reason = "files of a condition are taken as different pieces."
             fix = "call the part `repeat` in name_pattern and delete this line."

@@ -275,6 +275,18 @@ def test_a_draft_of_many_files_looks_at_some_and_says_so(tmp_path):
     assert guess.evidence == "the separator in 24 of 24 files looked at, of 84"
 
 
+def test_unaged_rubber_of_several_series_is_a_piece_in_each(tmp_path):
+    for temperature in (60, 80):
+        for one in exports.records(temperatures=(temperature,), days=(0, 4), repeats=(1,)):
+            exports.write(tmp_path, f"T{temperature}_d{one.days}_v{one.speed:g}_r1.csv", plain(one))
+    made = draft(tmp_path)
+    config = parse_config(made.text, "rig.toml")
+    assert config.files.columns["specimen_id"] == "{temperature_C} {aging_days}"
+    assert any("a piece of unaged rubber of its own" in doubt.reason for doubt in made.doubts)
+    runs = ingest_campaign(tmp_path, config).tables["runs"]
+    assert sorted(runs.loc[runs["aging_days"] == 0, "specimen_id"].unique()) == ["60 0", "80 0"]
+
+
 def test_a_table_of_runs_in_other_units_is_converted_and_its_doubts_are_said(tmp_path):
     for number in (1, 2):
         (one,) = exports.records(days=(number,), speeds=(5.0,), repeats=(1,))
