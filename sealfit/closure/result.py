@@ -138,9 +138,9 @@ def closure_document(
     elif only_inconclusive:
         verdict = "cannot_tell"
     else:
-        weak = any(item.weak and not item.negligible for item in selection.refused)
+        undecided = any(not item.negligible for item in selection.refused)
         unseen = undetectable and quality["state"] != "within_scatter"
-        verdict = "cannot_tell" if weak or unseen else "nothing_missing"
+        verdict = "cannot_tell" if undecided or unseen else "nothing_missing"
     return {
         "schema": 1,
         "verdict": verdict,

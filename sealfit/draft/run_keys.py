@@ -282,17 +282,7 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
             reason = f"'{_example(part)}': {part.doubt}."
             notes.doubt("files.name_pattern", reason, "Check what it stands for.")
     for name, template in names.columns.items():
-        evidence = "made of parts of the name"
-        if name == "specimen_id" and not any(part.ours == name for part in names.parts):
-            evidence = "unaged rubber was tested with several series, in files that are alike otherwise"
-            reason = "each series is taken to have a piece of unaged rubber of its own."
-            fix = "If it was the same piece, number its repeats through and delete this line."
-            notes.doubt(f"files.columns.{name}", reason, fix)
-        elif name == "specimen_id":
-            evidence = "the number of the piece of rubber, within its condition"
-            reason = "files of a condition are taken as different pieces."
-            fix = "call the part `repeat` in name_pattern and delete this line."
-            notes.doubt(f"files.columns.{name}", reason, f"If they are repeats with one piece, {fix}")
+        evidence = _specimens(names, notes) if name == "specimen_id" else "made of parts of the name"
         notes.guess(f"files.columns.{name}", template, evidence)
     for group, mapped in names.values.items():
         notes.guess(f"files.values.{group}", dict(mapped), "how these are written in the names")
@@ -300,6 +290,22 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         notes.guess(f"files.compute.{name}", expression, "computed from parts of the name")
     for name, unit in names.units.items():
         notes.guess(f"files.units.{name}", unit, "the unit of the number in the names")
+
+
+def _specimens(names: Names, notes: Notes) -> str:
+    """Add the doubt about what names say of specimens; return the evidence."""
+    if any(part.ours == "specimen_id" for part in names.parts):
+        evidence = "the number of the piece of rubber, within its condition"
+        reason = "files of a condition are taken as different pieces."
+        fix = (
+            "If they are repeats with one piece, call the part `repeat` in name_pattern and delete this line."
+        )
+    else:
+        evidence = "unaged rubber was tested with several series, in files that are alike otherwise"
+        reason = "each series is taken to have a piece of unaged rubber of its own."
+        fix = "If it was the same piece, number its repeats through and delete this line."
+    notes.doubt("files.columns.specimen_id", reason, fix)
+    return evidence
 
 
 def _example(part: Part) -> str:

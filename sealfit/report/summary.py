@@ -295,10 +295,12 @@ def untold_clause(closure: Mapping, units: Units) -> str:
         for effect in closure["effects"]
         if effect["candidate"]
     ]
+    undecided = closure["verdict"] == "cannot_tell"
     texts += [
-        f"{item['label']} (p = {item['p_value']:.1g}, weak evidence: test more)"
+        f"{item['label']} (p = {item['p_value']:.1g}, "
+        f"{'weak evidence: test more' if item['weak'] else 'refused: ' + item['reason']})"
         for item in closure.get("refused") or ()
-        if item["weak"]
+        if item["weak"] or undecided
     ][:NAMED]
     for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
         smallest, files = entry["smallest_pct"], entry["files_needed"]

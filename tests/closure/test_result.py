@@ -8,7 +8,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.channels import find_channels
-from sealfit.closure.confirm import AcceptedEffect, RefusedEffect
+from sealfit.closure.confirm import NO_GAIN, AcceptedEffect, RefusedEffect
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.result import (
     BeforeAfter,
@@ -108,24 +108,26 @@ def document(selection, after=None):
 
 def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted):
     item, after = accepted(fitted)
-    weak, strong = (RefusedEffect(WARMING, p, "it is too small") for p in (1e-4, 1e-7))
+    weak, strong = (RefusedEffect(WARMING, p, "it does not lower the error") for p in (1e-4, 1e-7))
+    small = RefusedEffect(WARMING, 1e-7, NO_GAIN)
     left = candidate("oil_ppm")
     verdicts = {
         "closed": document(replace(selection, added=(item,)), after),
         "unexplained": document(replace(selection, left=left)),
         "cannot_tell": document(replace(selection, inconclusive=item)),
-        "nothing_missing": document(replace(selection, refused=(strong,))),
+        "nothing_missing": document(replace(selection, refused=(small,))),
     }
     assert {name: found["verdict"] for name, found in verdicts.items()} == {name: name for name in verdicts}
     assert document(replace(selection, added=(item,), left=left), after)["verdict"] == "unexplained"
     assert (
         document(replace(selection, left=left, inconclusive=item))["verdict"] == "cannot_tell"
     )  # too few specimens show it
+    assert document(replace(selection, refused=(strong,)))["verdict"] == "cannot_tell"
     assert document(replace(selection, worse=(strong,), refused=(strong,)))["verdict"] == "unexplained"
     refused = document(replace(selection, refused=(weak, strong)))
     assert refused["verdict"] == "cannot_tell"
     assert [(entry["id"], entry["weak"], entry["reason"]) for entry in refused["refused"]] == [
-        ("warming_distance", True, "it is too small"), ("warming_distance", False, "it is too small"),
+        ("warming_distance", True, weak.reason), ("warming_distance", False, strong.reason),
     ]  # fmt: skip
 
 
