@@ -28,7 +28,7 @@ from sealfit.closure.criteria import LEAST_UNITS_OF_SLOPES as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.declared import SAME_SPEED
-from sealfit.fit.joint.rows import LEVELS, POWER, Rows, open_columns
+from sealfit.fit.joint.rows import LEVELS, POWER, Rows, one_load, open_columns
 from sealfit.ingest.quality import STILL_RISING
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
@@ -111,8 +111,8 @@ def find_channels(
         if values.dtype.kind == "f":
             if not (np.isfinite(values).all() and varies(values)):
                 continue
-            if name == "speed_mm_s" and values.max() <= SAME_SPEED * values.min():
-                continue  # one setting
+            if _one_setting(name, values):
+                continue
             values = settings(level_values(values, rows))
         elif not 2 <= np.unique(values).size <= MOST_LEVELS:
             continue
@@ -126,6 +126,13 @@ def find_channels(
             channel = replace(channel, grouping=True)
         found.append(channel)
     return found
+
+
+def _one_setting(name: str, values: np.ndarray) -> bool:
+    """Whether the speeds or loads of a campaign, shape (n,), are one setting."""
+    if name == "speed_mm_s":
+        return bool(values.max() <= SAME_SPEED * values.min())
+    return name == "load_N" and one_load(values)
 
 
 def varies(values: np.ndarray) -> bool:

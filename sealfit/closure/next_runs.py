@@ -109,6 +109,7 @@ def _alias(fitted: Fitted, term: Term, values: Mapping[str, float], column: np.n
 
 BEYOND = 0.5  # Share of a channel's range by which a run may exceed it.
 SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
+DISTINCT = 0.1  # Least difference between two models that a run is to show, as a share of the RMSE.
 TIE = 1e-9  # Relative difference below which two runs differ by rounding only.
 LONGER_STROKES = (
     "would show effects along the strokes, which end before the friction is steady: slide eleven times the "
@@ -136,7 +137,8 @@ def next_runs(
             chosen, own = item.proposal, item.proposal.fitted
             channels = (*chosen.term.channels, *rival.term.channels)
             found = largest_difference(own.model, rival.fitted.model, own.rows, channels, config)
-            if found is not None:
+            noise_N = float(np.sqrt(np.mean(own.residual**2)))
+            if found is not None and found[1] > DISTINCT * noise_N:
                 conditions, difference_N = found
                 tested = "more repeats of a tested run " if _is_tested(conditions, own.rows) else ""
                 forms = f"{describe(chosen.term)} from {describe(rival.term)}"

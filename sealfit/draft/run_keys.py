@@ -134,7 +134,7 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
     said = values_by_file(names, found.traces)
     of_run = names.given - {"started_at"}
     if aging := names.given & set(AGING_CONDITION):
-        of_run = {*aging, "rubber", "specimen_id", "speed_mm_s", "repeat"}
+        of_run = {*aging, "rubber", "specimen_id", "speed_mm_s", "speed_rpm", "load_N", "repeat"}
     keys = Counter(tuple((name, one.get(name)) for name in sorted(of_run)) for one in said.values() if one)
     if not keys or max(keys.values()) == 1:
         return names

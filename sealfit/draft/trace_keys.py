@@ -157,7 +157,7 @@ def column_keys(
     if helpers:
         evidence = "read for the columns computed below, no channels of their own"
         notes.guess("trace.drop_columns", helpers, evidence)
-    _other_columns(found, roles, notes)
+    _other_columns(found, roles, clock[1] if clock is not None else "", notes)
 
 
 def _evidence(column: Column, role: str, roles: Roles, read: int) -> str:
@@ -248,8 +248,8 @@ def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:
             notes.doubt("trace.columns", reason, fix, (f"{SLOTS[role]} = 1",))
 
 
-def _other_columns(found: Found, roles: Roles, notes: Notes) -> None:
-    """Add the columns kept as channels and say which are not used."""
+def _other_columns(found: Found, roles: Roles, clock: str, notes: Notes) -> None:
+    """Add the columns kept as channels and say which are not used; `clock` is that of times of day."""
     ignored, taken = [], {""}
     for column in roles.others:
         if name := _channel(column, taken):
@@ -257,7 +257,11 @@ def _other_columns(found: Found, roles: Roles, notes: Notes) -> None:
             notes.guess(f"trace.columns.{name}", column.key, f"{column.place}: kept as a channel")
         else:
             ignored.append(column)
-    texts = [name for i, name in enumerate(found.dialect.names) if name and i not in found.dialect.numbers]
+    texts = [
+        name
+        for i, name in enumerate(found.dialect.names)
+        if name and name != clock and i not in found.dialect.numbers
+    ]
     if roles.speed is not None and roles.displacement is not None:
         ignored.append(roles.speed)
     if ignored or texts or found.dialect.width > len(found.dialect.numbers):

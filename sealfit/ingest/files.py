@@ -114,7 +114,8 @@ def _read(campaign: Path, file: str, size: int | None = None) -> tuple[bytes, os
         os.close(handle)
     marks = [len(mark) for mark, _ in _BOMS if raw.startswith(mark)]
     if not raw[max(marks, default=0) :].strip(_BLANK):
-        raise bad_file(file, "empty_file", "is empty.", "Export it again, or take it out of runs.csv.")
+        fix = "Export it again, or leave it out: of runs.csv, or by files.exclude in the rig config."
+        raise bad_file(file, "empty_file", "is empty.", fix)
     return raw, status
 
 

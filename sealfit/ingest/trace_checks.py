@@ -51,7 +51,11 @@ def displacement_spikes(
     step = median(np.abs(np.diff(displacement_mm)))
     noise = displacement_noise_mm(displacement_mm)
     least = max(STEPS * step, APART * quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
-    spikes = np.flatnonzero(np.abs(off) > max(settings.spike_sigma * noise, least))
+    spikes = np.abs(off) > max(settings.spike_sigma * noise, least)
+    # At its ends the median of a motion that does not rest is a step behind.
+    for end, beside in ((0, slice(1, NEIGHBOURS)), (-1, slice(-NEIGHBOURS, -1))):
+        spikes[end] &= abs(off[end]) > STEPS * np.abs(np.diff(displacement_mm[beside])).max()
+    spikes = np.flatnonzero(spikes)
     if len(spikes) > settings.max_bad_rows * len(off):
         return keep, []
     keep[spikes] = False
@@ -241,7 +245,13 @@ def speed_fault(
     if 1 / GROSS <= ratio <= GROSS:
         fix = "Check the commanded speed, or slip in the drive."
         return Fault("speed_disagreement", reason, fix=fix, **place, **KEPT)
-    fix = _mix_up(ratio, time_s, displacement_mm, tolerance)
+    declared = [
+        f"{name} in {config.trace.columns[name].unit}"
+        for name in ("time_s", "displacement_mm")
+        if name in config.trace.columns and config.trace.columns[name].unit
+    ]
+    first = f"Is the unit in the rig config right ({', '.join(declared)})? " if declared else ""
+    fix = first + _mix_up(ratio, time_s, displacement_mm, tolerance)
     return Fault("speed_disagreement", reason, action="file left out", fix=fix, **place)
 
 

@@ -67,6 +67,17 @@ def test_a_text_of_more_than_a_hundred_values_is_no_channel():
     assert "noted_at" not in names
 
 
+@pytest.mark.parametrize(("share", "several"), [(0.002, False), (0.1, True)])
+def test_the_noise_of_one_load_is_no_channel(share, several):
+    """The force does not follow the noise of the load's sensor, and mu would seem to fall with it."""
+    bins = make_bins(bins=4, repeats=1)
+    rng = np.random.default_rng(0)
+    bins["load_N"] *= 1 + share * rng.uniform(-1, 1, len(bins))
+    names = {c.name for c in find_channels(make_rows(bins, has_aging=True))}
+    assert ({"load_N", "power"} <= names) == several
+    assert several or names.isdisjoint({"load_N", "power"})
+
+
 def test_a_serial_number_is_a_grouping_and_not_a_channel():
     bins = make_bins(repeats=2, bins=4)
     bins["serial"] = "no " + bins["file"]

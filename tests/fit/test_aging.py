@@ -1,4 +1,5 @@
 import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.testing as npt
@@ -9,7 +10,8 @@ from scipy.optimize import least_squares
 
 from sealfit.config import Config
 from sealfit.fit.aging.law import Values, fit_law, solve_law
-from sealfit.fit.aging.law_profiles import curve_errors, curve_intervals
+from sealfit.fit.aging.law_profiles import CurveInterval, curve_errors, curve_intervals
+from sealfit.fit.aging.law_table import Estimate, _judge
 from sealfit.fit.aging.series import aging_curves, between_scatter, fit_series
 from sealfit.fit.steady.fit import fit_conditions
 from sealfit.physics import aging_law
@@ -268,6 +270,19 @@ def test_rubber_that_does_not_age_has_no_b(campaign):
         assert not row.hi95 < 0
 
 
+@pytest.mark.parametrize(
+    ("error", "says", "identified"), [(1e-3, "may come before 1 d", False), (0.2, "no aging is seen", True)]
+)
+def test_no_aging_is_said_only_where_no_loss_is_seen(error, says, identified):
+    """An interval of a that contains 0 may also be that of a loss before the first day tested."""
+    found = Estimate(np.array([0.9, 0.02, np.log(0.01)]), np.diag([0.0, error**2, 0.0]), np.zeros(3))
+    assert found.loss(16.0) == pytest.approx((0.02 * np.log1p(1600.0), error * np.log1p(1600.0)))
+    curve = SimpleNamespace(days=[1.0, 16.0], unaged=True)
+    ends = CurveInterval((-0.01, 0.05), (0.0, 1.0), (0.0, 1.0))
+    assert says in _judge(curve, found, ends, 2.0)["a"][1]
+    assert _judge(curve, found, ends, 2.0)["a"][0] == identified
+
+
 def test_a_loss_in_proportion_to_time_leaves_only_its_slope(campaign):
     linear = {"mu_0": 0.9, "a": 9.0, "b": 1000.0}  # 0.009 per day
     laws = {(60.0, 80.0): (linear, linear | {"mu_0": 0.6})}
@@ -275,7 +290,7 @@ def test_a_loss_in_proportion_to_time_leaves_only_its_slope(campaign):
     fit = fit_series(fit_conditions(table, Config()), Config())
     row = law(fit, "mu_s", "b")
     assert not row.identified
-    assert "only a/b = 0.0091" in row.reason
+    assert "only its mean, 0.00889 per day" in row.reason
     assert not law(fit, "mu_s", "a").identified
     assert np.isnan(row.hi95)  # open
     assert np.isnan(law(fit, "mu_s", "a").hi95)

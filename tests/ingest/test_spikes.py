@@ -2,6 +2,7 @@
 
 import numpy as np
 import numpy.testing as npt
+import pytest
 
 from sealfit.config import Quality, Strokes
 from sealfit.ingest.strokes import find_strokes
@@ -38,3 +39,17 @@ def test_a_sample_far_off_its_neighbours_is_found_with_its_line():
     _, (fault,) = displacement_spikes("f.csv", x, np.arange(80) + 2, Quality())
     assert (fault.line, fault.column) == (62, "displacement_mm")
     npt.assert_allclose(float(fault.value), x[60])
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_the_ends_of_a_motion_that_does_not_rest_are_no_spikes(way):
+    """Speed steps: the usual step is that of the slow part, and the file ends in the fast one."""
+    steps = np.r_[np.full(900, 0.01), np.full(100, 0.6)]
+    displacement = np.cumsum(steps)[::way] * way
+    line = np.arange(displacement.size) + 2
+    keep, faults = displacement_spikes("a.csv", displacement, line, Quality())
+    assert keep.all()
+    assert faults == []
+    displacement[-1] += 40.0
+    keep, (fault,) = displacement_spikes("a.csv", displacement, line, Quality())
+    assert (np.flatnonzero(~keep).tolist(), fault.line) == ([999], 1001)

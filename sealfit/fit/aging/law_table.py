@@ -88,6 +88,14 @@ class Estimate:
         with np.errstate(invalid="ignore"):
             return float(np.sqrt(gradient @ self.covariance @ gradient))
 
+    def loss(self, days: float) -> tuple[float, float]:
+        """Return the loss a ln(1 + t / b) up to a day, and its standard error."""
+        _, a, u = self.x
+        share = days * np.exp(-u)
+        gradient = np.array([0.0, np.log1p(share), -a * share / (1.0 + share)])
+        with np.errstate(invalid="ignore"):
+            return float(a * gradient[1]), float(np.sqrt(gradient @ self.covariance @ gradient))
+
 
 def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, df: float) -> Iterator[dict]:
     """Return the rows of mu_0, a, b and c; `df` are the degrees of freedom of mu_0's interval."""
@@ -95,7 +103,7 @@ def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, df: float) -> I
     b, se = np.exp(u), np.sqrt(np.diag(found.covariance))
     beside, t = "" if df > 0 else NO_SCATTER, t_of_95(df)
     move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # the rest is rounding
-    judged = _judge(curve, a, b, ends)
+    judged = _judge(curve, found, ends, t)
     of_mu_0 = (mu_0 - t * se[0], mu_0 + t * se[0])
     for name, value, error, systematic, (low, high) in (
         ("mu_0", mu_0, se[0], move[0], of_mu_0),
@@ -117,15 +125,21 @@ def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, df: float) -> I
         ) | {"series": curve.series}
 
 
-def _judge(curve: Curve, a: float, b: float, ends: CurveInterval) -> dict[str, tuple[bool, str]]:
+def _judge(curve: Curve, found: Estimate, ends: CurveInterval, t: float) -> dict[str, tuple[bool, str]]:
     verdict = dict.fromkeys(LAW, (True, ""))
-    first, last = curve.days[0], curve.days[-1]
+    first, last, b = curve.days[0], curve.days[-1], float(np.exp(found.x[2]))
     low, high = ends.b
-    if ends.a[0] <= 0.0 <= ends.a[1]:
+    loss, error = found.loss(last)
+    if ends.a[0] <= 0.0 <= ends.a[1] and abs(loss) > t * error:
+        why = f"all of the loss of {loss:.3g} up to {last:g} d may come before {first:g} d, and a may be 0: "
+        why += "test earlier days."
+        verdict["a"] = (False, why)
+    elif ends.a[0] <= 0.0 <= ends.a[1]:
         why = f"no aging is seen up to {last:g} d: a may be 0, and b then has no meaning."
         verdict["a"] = (bool(np.all(np.isfinite(ends.a))), why)
     elif np.isinf(high):
-        why = f"the loss is as good as linear up to {last:g} d: only a/b = {a / b:.3g} per day is determined."
+        mean = f"{loss / last:.3g} per day"
+        why = f"the loss may be linear up to {last:g} d: only its mean, {mean}, is determined."
         verdict["a"] = (False, why)
     elif low == 0.0 or high > WIDE_B * low:
         span = f"from {low:.2g} to {high:.2g} d" if low > 0 else f"anything up to {high:.2g} d"

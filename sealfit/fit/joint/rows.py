@@ -112,6 +112,9 @@ ALONG = ("displacement_mm", "distance_mm", "time_s")
 # Derived channel if loads differ: load times |speed|, the power of friction over its coefficient.
 POWER = "power"
 
+SAME_LOAD = 1.05
+"""Ratio of the largest to the smallest load up to which it is one setting."""
+
 NOT_CHANNELS = {
     "file",
     "record",
@@ -252,7 +255,7 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     codes[0] = file * (int(stroke.max()) + 1) + stroke
     groups = Groups.of(dict(zip(LEVELS, codes, strict=True)))
     has_load = "load_N" in table and bool(table["load_N"].notna().all())
-    if has_load and POWER not in table and np.ptp(table["load_N"]) > 1e-3 * table["load_N"].abs().max():
+    if has_load and POWER not in table and not one_load(table["load_N"]):
         table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
     days = table["aging_days"].to_numpy(dtype=float) if has_aging else np.zeros(len(table))
     condition, names = pd.factorize(table["condition"], sort=True)
@@ -305,6 +308,14 @@ def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
             values = values.fillna(low.where(low == high, known.transform("mean")))
         found[name] = values.fillna(per_file.mean()).to_numpy()
     return found
+
+
+def one_load(load_N: np.ndarray | pd.Series) -> bool:
+    """Return whether loads, shape (n,), are one setting but for the noise of its sensor.
+
+    The force does not follow that noise, and friction as a share of the load then seems to depend on it.
+    """
+    return bool(np.abs(load_N).max() <= SAME_LOAD * np.abs(load_N).min())
 
 
 def sliding_power(load: np.ndarray | pd.Series, speed: np.ndarray | pd.Series) -> np.ndarray | pd.Series:
