@@ -11,7 +11,7 @@ import pandas as pd
 
 from sealfit.closure.channels import CALENDAR, Channel, channels_of, searched
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
-from sealfit.closure.criteria import HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
+from sealfit.closure.criteria import EQUAL_BIC, HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
 from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import propose, rivals
@@ -167,7 +167,11 @@ class _Loop:
             self.refused |= keys
             self.masked = []
         else:
+            count, deviance = len(self.added), self.fitted.deviance
             self.add(accepted)
+            if len(self.added) == count and self.fitted.deviance > deviance - EQUAL_BIC:
+                # It took the place of an earlier one and explains no more: the next round would be the same.
+                self.refused |= _no_stronger(open_, accepted.proposal) | {accepted.proposal.source}
         return False
 
     def search_model(self, number: int) -> _SearchResult:

@@ -40,3 +40,21 @@ def test_an_effect_is_asked_again_when_a_later_one_has_gone(monkeypatch):
 
 def test_a_ripple_is_not_dropped(monkeypatch):
     assert left(monkeypatch, [effect("a", periodic=True), effect("b"), effect("c")]) == "ac"
+
+
+def test_effects_that_take_the_place_of_others_in_turn_end_the_loop(monkeypatch):
+    """A new effect that is merged with an earlier one, and explains no more, is not asked again."""
+    loop = object.__new__(selection._Loop)
+    candidate = SimpleNamespace(key="c", channels=("x",), chi2=5.0)
+    proposal = SimpleNamespace(source="c", term=SimpleNamespace(channels=("x",)), chi2=9.0)
+    loop.fitted, loop.added, loop.refused = SimpleNamespace(deviance=10.0), ["earlier"], set()
+    loop.tests, loop.found = SimpleNamespace(fitted=loop.fitted), SimpleNamespace(claimable=[], laws=[])
+    loop.context = SimpleNamespace(config=SimpleNamespace(loop=SimpleNamespace(max_rounds=9)), effects={})
+    loop.channels, loop.unconfirmed = {}, []
+    monkeypatch.setattr(loop.__class__, "open_candidates", lambda own: [candidate])
+    monkeypatch.setattr(loop.__class__, "confirm", lambda own, *given: SimpleNamespace(proposal=proposal))
+    monkeypatch.setattr(loop.__class__, "add", lambda own, accepted: setattr(own, "added", ["merged"]))
+    monkeypatch.setattr(selection, "propose", lambda *given: [proposal])
+    monkeypatch.setattr(selection, "_related_candidates", lambda *given: [])
+    assert not loop.run_round(2)
+    assert loop.refused == {"c"}

@@ -8,7 +8,7 @@ import pytest
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
 from sealfit.fit.joint.declared import declare, speed_clusters
-from sealfit.fit.joint.estimate import fit, fit_declared, fit_with_effects
+from sealfit.fit.joint.estimate import _searched, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
 from sealfit.fit.joint.rows import make_rows, thin
 from sealfit.fit.joint.start import start_model
@@ -313,3 +313,19 @@ def test_an_effect_lowers_the_error_although_the_scatter_of_specimens_is_of_anot
     after = fit_with_effects(model, rows, before.scatter, before)
     assert after.rmse_N < 0.6 * before.rmse_N
     assert after.model.values[0]["A"] == pytest.approx(-2 * bins_helpers.TRUE["sigma_2"], rel=0.1)
+
+
+@pytest.mark.parametrize(("found", "searched"), [(-0.1, False), (0.03, True)])
+def test_a_search_on_few_rows_is_not_believed_against_all_rows(found, searched, monkeypatch):
+    """Without the rows at the start of strokes an effect there is not determined, and all may be wrong."""
+
+    def on_few_rows(model, *given):
+        return model.at(np.where(model.nonlinear, model.vector(), model.vector() * (1 + found)))
+
+    monkeypatch.setattr("sealfit.fit.joint.estimate.search_nonlinear", on_few_rows)
+    rows = rows_of(bins=6, repeats=1, noise_N=1.0)
+    before = fit_declared(rows)
+    term = Term(EFFECTS["linear"], ("distance_mm",), "mu", "multiply", {"x_ref": 0.0})
+    model = before.model.with_term(term, {"A": 0.0})
+    own = _searched(model, rows, before.scatter)
+    assert np.array_equal(own.vector(), model.vector()) != searched

@@ -38,6 +38,8 @@ TURNS = 3
 # Ratio of errors from which a re-estimated scatter counts as wrong. It was at most 1.02 in 36 simulated
 # campaigns whose scatter the components describe.
 WRONG_SCATTER = 1.1
+# Deviance per row by which a model is far better than that which the search on few rows has found.
+WRONG_SEARCH = 1.0
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ def fit(
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
         model = descend(model, rows, scatter, centre, tolerance=ROUGH)
     if turns and model.terms:
-        model = search_nonlinear(model, rows, scatter)
+        model = _searched(model, rows, scatter)
     for turn in range(turns):
         force, jacobian = evaluate(model, rows)
         scatter = estimate_scatter(
@@ -179,6 +181,16 @@ def fit(
         model = descend(model, rows, scatter, centre, friction, tolerance=COMPARED)
         return fitted_at(model, rows, scatter, friction)
     return fitted_at(model, rows, scatter)
+
+
+def _searched(model: Model, rows: Rows, scatter: Scatter) -> Model:
+    """Return the model from a search of v_s and b, or the model itself if that is far better on all rows.
+
+    The search has few rows of a stroke, which may not determine an effect at its start.
+    """
+    found = search_nonlinear(model, rows, scatter)
+    kept, own = (fitted_at(m, rows, scatter) for m in (model, found))
+    return model if kept.deviance + WRONG_SEARCH * rows.force.size < own.deviance else found
 
 
 def fit_with_effects(model: Model, rows: Rows, scatter: Scatter, former: Fitted) -> Fitted:
