@@ -255,8 +255,7 @@ def _with_whole_paths(campaign: Path, entries: list[Entry], table: str) -> tuple
 
     A log often has the name of a test, without folders and suffix.
     """
-    listed = {e.file for e in entries if e.file and inside(campaign, e.file) is not None}
-    missing = {file for file in listed if not os.path.exists(campaign / file)}
+    missing = {entry.file for entry in entries if not os.path.exists(campaign / entry.file)}
     named: dict[str, list[str]] = defaultdict(list)
     for path in campaign.rglob("*") if missing else ():
         own = path.relative_to(campaign)
