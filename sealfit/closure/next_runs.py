@@ -21,6 +21,7 @@ from sealfit.fit.joint.estimate import Fitted
 from sealfit.fit.joint.model import Model, Term, evaluate, mean_derivatives
 from sealfit.fit.joint.rows import POWER, Rows, sliding_power
 from sealfit.fit.joint.search import bounds_of
+from sealfit.ingest.categorical import condition_columns
 
 # ---------------------------------------------------------------- aliases
 # Effects that are not distinguishable from the model with these runs.
@@ -170,7 +171,7 @@ def _is_tested(conditions: Mapping[str, object], rows: Rows) -> bool:
 
 def _run_to_repeat(one: OutlierFile, config: Config) -> dict:
     """Return the run of a file that was left out."""
-    names = (*config.rubber, *config.condition, "speed_mm_s", "load_N")
+    names = (*condition_columns(config), "speed_mm_s", "load_N")
     side = "above" if one.deviation > 0 else "below"
     return {
         "why": f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and was left "
@@ -185,13 +186,13 @@ def _second_specimen(rows: Rows, config: Config) -> dict:
     return {
         "why": "would show the scatter of specimens, which is unknown in this campaign and in no interval: "
         "a second specimen of a tested condition",
-        "conditions": _settings(rows.table.iloc[k], (*config.rubber, *config.condition)),
+        "conditions": _settings(rows.table.iloc[k], condition_columns(config)),
     }
 
 
 def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
     """Yield the run that would show each alias; one run for aliases of the same channels."""
-    taken = tuple(name for name in (*config.condition, *config.rubber) if name != "aging_days")
+    taken = tuple(name for name in condition_columns(config) if name != "aging_days")
     by_channel: dict[tuple[str, ...], list[Alias]] = {}
     for alias in find_aliases(fitted, effects, taken):
         by_channel.setdefault(alias.term.channels, []).append(alias)
@@ -215,7 +216,7 @@ def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
     return {
         "why": f"{few} too few to distinguish {describe(item.proposal.term)} from the scatter of specimens: "
         "test a second specimen of the same conditions, here first",
-        "conditions": _settings(fitted.rows.table.iloc[k], (*config.rubber, *config.condition, "speed_mm_s")),
+        "conditions": _settings(fitted.rows.table.iloc[k], (*condition_columns(config), "speed_mm_s")),
     }
 
 
@@ -237,7 +238,7 @@ def largest_difference(
         apart = np.where(np.isfinite(apart), apart, 0.0)
         k = int(np.argmax(apart >= apart.max() * (1 - TIE)))  # the first of those equal but for rounding
         if apart[k] > (0.0 if best is None else best[1] * (1 + TIE)):
-            names = (*config.rubber, *config.condition, "speed_mm_s", *channels)
+            names = (*condition_columns(config), "speed_mm_s", *channels)
             best = (_settings(moved.table.iloc[k], names), float(apart[k]))
     return best
 
