@@ -251,13 +251,14 @@ def _is_grouping(channel: Channel, rows: Rows) -> bool:
 def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
     """Return the columns of a free shape, first a straight line: shape (n, k), each centred and scaled.
 
-    A cubic B-spline with knots at quantiles (of the logarithm if a positive channel spans a factor of 20), a
-    quadratic for few units; for categories, one column per level except the first.
+    A cubic B-spline with knots at quantiles (of the logarithm if a positive channel spans a factor of 20, but
+    not of the calendar, whose zero is arbitrary), a quadratic for few units; for categories, one column per
+    level except the first.
     """
     if not channel.numeric:
         levels = np.unique(channel.values)
         return (channel.values[:, None] == levels[None, 1:]).astype(float)
-    x = scaled(channel.values)
+    x = scaled(channel.values, even=channel.name in CALENDAR)
     distinct = np.unique(x)
     df = min(most, distinct.size - 1)
     columns = [x]
@@ -277,7 +278,7 @@ def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
 
 def kinks(channel: Channel) -> np.ndarray:
     """Return centred columns that are linear up to an inner channel value and constant beyond it, (n, k)."""
-    x = scaled(channel.values)
+    x = scaled(channel.values, even=channel.name in CALENDAR)
     columns = np.minimum(x[:, None], np.unique(x)[1:-1])
     return columns - columns.mean(axis=0)
 
@@ -294,13 +295,13 @@ def shifted_from_zero(values: np.ndarray) -> np.ndarray:
     return values + values[values > 0].min() if values.min() == 0 < values.max() else values
 
 
-def scaled(values: np.ndarray) -> np.ndarray:
-    """Return a channel mapped to [-1, 1], logarithmically if it spans a factor of 20.
+def scaled(values: np.ndarray, *, even: bool = False) -> np.ndarray:
+    """Return a channel mapped to [-1, 1], logarithmically if it spans a factor of 20 unless `even`.
 
     A channel that starts at 0, such as days of aging, is shifted by its smallest positive value first.
     """
     values = shifted_from_zero(values)
     low, high = float(values.min()), float(values.max())
-    if low > 0 and high / low >= WIDE:
+    if low > 0 and high / low >= WIDE and not even:
         values, low, high = np.log(values), np.log(low), np.log(high)
     return np.clip(2 * (values - low) / (high - low) - 1, -1.0, 1.0)

@@ -45,7 +45,7 @@ MOST_SET_VALUES = 50
 """A channel with more groups of values than this is used as measured, not as settings."""
 
 UNEQUAL_RUNS = 1e4
-"""Factor on the p-value of an F test against the scatter of runs, which need not scatter alike.
+"""Factor on the p-value of an F test against the scatter of runs or files, which need not scatter alike.
 
 With two or three runs per parameter the jackknife needs t above 10 where F has p = 1e-15.
 """
@@ -57,10 +57,10 @@ PROMISING = 1e-3
 """The jackknife is computed if the unadjusted p-value of what the columns explain is below this."""
 
 TESTED_AGAINST_RUNS = 0.05
-"""Columns constant in runs are tested against the scatter of runs if the unadjusted p-value is below this."""
+"""Columns constant in runs or files are tested against their scatter if the unadjusted p-value is smaller."""
 
 CONSTANT_IN_RUNS = 0.9
-"""Columns are constant in runs if at least this share of their variance is one number per run."""
+"""Columns are constant in runs (or files) if at least this share of their variance is one number for each."""
 
 IDENTIFIABLE = 0.01
 """An amplitude is identifiable if the model leaves at least this share of the column's variance."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from sealfit.closure import small_sample_test
-from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES
+from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES, UNEQUAL_RUNS
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of, score_statistic
 from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, slope_log_p
 from sealfit.fit.joint.estimate import Fitted
@@ -84,7 +84,16 @@ def critical_small_sample(fitted: Fitted, tests: Sequence[SmallSampleTest], leve
     units = ClusterTests(fitted, tests[0].level)
     for test in tests:
         units.numbers(test.target)
-    return float(np.quantile(_least_small_sample(units, tests, np.random.default_rng(0), FLIPS), level))
+    least = _least_small_sample(units, tests, np.random.default_rng(0), FLIPS)
+    return float(np.quantile(least, level) - np.log(_unequal(units.level)))
+
+
+def _unequal(level: str) -> float:
+    """Return the factor on p-values of F tests of one number per unit of a level.
+
+    A slope of their own in each run scatters the files of one run unequally.
+    """
+    return UNEQUAL_RUNS if level == "file" else 1.0
 
 
 def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int) -> np.ndarray:
@@ -132,7 +141,9 @@ def adjust_small_sample(
         count = max(results[k].units for k in tried)
         least = _drawn(lambda: _least_small_sample(units, tests, rng, draws), logs.min(), count)
         # Bonferroni is for p-values that are smaller than the draws resolve.
-        p_values[tried] = np.minimum(_adjusted(logs, least), len(tried) * np.exp(logs))
+        p_values[tried] = _unequal(units.level) * np.minimum(
+            _adjusted(logs, least), len(tried) * np.exp(logs)
+        )
     return p_values
 
 

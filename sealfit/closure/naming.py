@@ -71,11 +71,14 @@ def propose(
     ):
         return named_among(fitted, _best_few(found))
     # Conditions are tested one after the other, so the calendar is correlated with them: other channels come
-    # first.
+    # first, unless a named form along the calendar fits much better.
     others, calendar = (
         _refitted(fitted, part) for part in (_best_few(others), _best_few(calendar)[:CALENDAR_RIVALS])
     )
-    return _ordered(fitted, others) + sorted(calendar, key=lambda p: p.bic)
+    calendar.sort(key=lambda p: p.bic)
+    if calendar[0].named and calendar[0].bic < min(p.bic for p in others) - RIVAL_BIC:
+        return _ordered(fitted, [*calendar, *others])
+    return _ordered(fitted, others) + calendar
 
 
 def propose_ripples(

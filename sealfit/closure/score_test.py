@@ -47,10 +47,10 @@ from sealfit.fit.joint.tangent import OwnColumns, Tangent
 # thirty units on the estimate is therefore also tested against its jackknife over whole units (CV3;
 # MacKinnon, Nielsen & Webb 2023, doi:10.1016/j.jeconom.2022.04.001). A few runs may have nearly all of the
 # leverage and agree by chance, so what the columns explain must be significant too: by chi-squared, or by F
-# against the scatter of runs if they are one number per run. With fewer than thirty specimens, what is
-# constant in them is tested against their own scatter (`small_sample`), and what varies within them against
-# the scatter of their slopes (`slopes`). With fewer than thirty runs, what is constant in runs is tested
-# against their scatter (`small_sample`).
+# against the scatter of runs (files) if they are one number per run (file). With fewer than thirty specimens,
+# what is constant in them is tested against their own scatter (`small_sample`), and what varies within them
+# against the scatter of their slopes (`slopes`). With fewer than thirty runs, what is constant in runs or in
+# files is tested against their scatter too (`small_sample`).
 
 # A unit alone determines a direction if the eigenvalue of what is left without the unit is smaller.
 OWN = 1e-6
@@ -210,9 +210,8 @@ class ScoreTests:
         tests = tuple(contrast_test(self.fitted, left, between) for left in variants)
         if any(test is None for test in tests):
             return None
-        return weakest._replace(
-            slopes=tests, small_sample=self._test_of_runs(variants, between, level, target)
-        )
+        constant = between in ("file", "run") and self._test_of_constants(variants, target)
+        return weakest._replace(slopes=tests, small_sample=constant or None)
 
     def _specimens_agree(self, left: np.ndarray) -> bool:
         """Return whether two to four specimens agree in what columns along strokes explain together."""
@@ -223,19 +222,19 @@ class ScoreTests:
         explained = explained[:, None]
         return not along_strokes(fitted, explained)[0] or bool(specimens_agree(fitted, explained)[0])
 
-    def _test_of_runs(
-        self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
+    def _test_of_constants(
+        self, variants: Sequence[np.ndarray], target: tuple[str, str]
     ) -> SmallSampleTest | None:
-        """Return the weakest F test of all variants of columns that are constant in each of a few runs.
+        """Return the weakest F test of all variants of columns that are constant in each run, or each file.
 
-        It is exact; the variance of a slope from half a dozen runs has two or three degrees of freedom.
+        None if they are not. It is exact; the variance of a slope from half a dozen runs has two or three
+        degrees of freedom.
         """
-        if not between == level == "run":
-            return None
-        tests = [self.cluster_tests["run"].test(left, target) for left in variants]
-        if any(test is None or test.share <= CONSTANT_IN_RUNS for test in tests):
-            return None
-        return max(tests, key=lambda test: test.log_p)
+        for level in ("run", "file"):
+            tests = [self.cluster_tests[level].test(left, target) for left in variants]
+            if all(test is not None and test.share > CONSTANT_IN_RUNS for test in tests):
+                return max(tests, key=lambda test: test.log_p)
+        return None
 
     def _score_test(self, left: np.ndarray, level: str, target: tuple[str, str]) -> ScoreTestResult | None:
         fitted = self.fitted
@@ -252,15 +251,15 @@ class ScoreTests:
         log_p = float(log_p_of(score_statistic(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
         if units >= JACKKNIFE_UNITS:
-            explained, against_runs = _log(chdtrc(left.shape[1], total @ total)), 0.0
-            if level == "run" and explained < np.log(TESTED_AGAINST_RUNS):
-                test = self.cluster_tests["run"].test(left, target)
-                if test is not None and test.share > CONSTANT_IN_RUNS:
-                    against_runs = test.log_p
-                    explained = min(explained, against_runs)
+            explained, against_units = _log(chdtrc(left.shape[1], total @ total)), 0.0
+            if level in ("file", "run") and explained < np.log(TESTED_AGAINST_RUNS):
+                test = self._test_of_constants([left], target)
+                if test is not None:
+                    against_units = test.log_p
+                    explained = min(explained, against_units)
             if explained < np.log(PROMISING):
                 jackknife = max(self._jackknife(left, level), explained)
-                jackknife = min(jackknife, against_runs + np.log(UNEQUAL_RUNS))
+                jackknife = min(jackknife, against_units + np.log(UNEQUAL_RUNS))
         return ScoreTestResult(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
     def _jackknife(self, left: np.ndarray, level: str) -> float:

@@ -338,11 +338,10 @@ class _Search:
         tail = self.level / 2 / self.many
         spread = length / (np.sqrt(own * k * fdtri(k, units - k, 1 - tail)) + beyond)
         explained = length / (np.sqrt(chdtri(k, tail)) + beyond)
-        if level == "run":
-            runs = ClusterTests(noise, "run"), ClusterTests(effect, "run")
-            explained = max(
-                explained, _by_numbers(*runs, left, candidate.target, tail, least=CONSTANT_IN_RUNS)
-            )
+        for one in ("file", "run") if level in ("file", "run") else ():
+            units = ClusterTests(noise, one), ClusterTests(effect, one)
+            by_units = _by_numbers(*units, left, candidate.target, tail, least=CONSTANT_IN_RUNS)
+            explained = max(explained, by_units)
         return max(margin, min(spread, explained))
 
 

@@ -12,6 +12,7 @@ from sealfit.closure.channels import (
     unit_of,
 )
 from sealfit.closure.forms import terms_of
+from sealfit.closure.naming import propose
 from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
 from sealfit.effects import EFFECTS
@@ -216,6 +217,43 @@ def test_a_step_between_runs_is_seen_although_repeats_are_far_more_precise(late)
     assert {c.name: c.unit for c in find_channels(rows)}["elapsed_h"] == "file"
     found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     assert any(c.p_value < 0.001 for c in found if c.channels == ("elapsed_h",)) == (late > 0)
+
+
+def passes(seed=3, drift=0.0):
+    """Sixteen runs, repeated in three passes of four hours; the last hour is measured on the next day."""
+    few = {"temperatures": (50.0, 60.0, 80.0), "days": (4.0,), "speeds": (0.5, 2.0, 8.0, 32.0)}
+    bins = make_bins(seed, bins=4, noise_N=0.02, gain=0.004, **few)
+    run = bins["run_id"].factorize()[0]
+    hours = 4.0 * (bins["repeat"] - 1) + 0.25 * np.random.default_rng(seed).permutation(16)[run]
+    hours += 12.0 * (hours >= 11.0)
+    oil = 50.0 + hours + np.random.default_rng(seed).normal(0, 3, run.max() + 1)[run]
+    force = bins["force_N"] * (1 + drift * (hours - hours.mean()))
+    return make_rows(bins.assign(elapsed_h=hours, oil_age_h=oil, force_N=force), has_aging=True)
+
+
+def test_a_drift_between_repeats_of_few_runs_is_seen_and_named_by_the_calendar():
+    fitted = fit_declared(passes(drift=0.02))
+    channels = {c.name: c for c in find_channels(fitted.rows)}
+    assert channels["elapsed_h"].unit == "file"
+    found = search(ScoreTests(fitted), list(channels.values()), np.random.default_rng(0))
+    assert found[0].channels == ("elapsed_h",)
+    assert found[0].p_value < 1e-6
+    named = propose(fitted, [c for c in found if c.p_value < 0.005], channels, EFFECTS)[0]
+    assert named.term.effect.id == "campaign_drift"
+    assert named.fitted.model.values[-1]["A"] == pytest.approx(0.02, rel=0.25)
+
+
+def test_repeats_of_few_runs_that_drift_each_its_own_way_are_no_drift():
+    """Each run has a slope of its own along its repeats: the files of one run scatter unequally."""
+    alarms = 0
+    for seed in range(12):
+        rows = passes(seed)
+        own = np.random.default_rng(seed).normal(0, 0.01, 16)[rows.codes("run")]
+        force = rows.force * (1 + own * (rows.values("repeat") - 2.0))
+        rows = make_rows(rows.table.assign(force_N=force), has_aging=True)
+        found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+        alarms += min(c.p_value for c in found) < 0.005
+    assert alarms == 0
 
 
 def test_means_of_runs_are_tested_only_where_they_hold_most_of_a_channel():
