@@ -97,7 +97,7 @@ def predict(
     effects_folder: Path | None = None,
     progress: Silent | None = None,
 ) -> dict:
-    """Write the answers to `points` (CSV) to `output` (CSV) and return how many rows were answered.
+    """Write the answers to `points` (CSV) to `output` (CSV); return how many rows, and the effects in them.
 
     `effects_folder` is run: it holds the user's own effects, which the model may need.
 
@@ -121,7 +121,9 @@ def predict(
     except RequestError as error:
         place = {"file": points, "line": 1} if error.column else {}
         raise RequestError(error.message, column=error.column, fix=error.fix, **place) from error
-    return {"out": str(store.out), "output": str(output), **write_answers(asked, answers, output)}
+    effects = [one["label"] for one in store.read_json("closure")["effects"] if not one["candidate"]]
+    written = write_answers(asked, answers, output)
+    return {"out": str(store.out), "output": str(output), **written, "includes": effects}
 
 
 def answers_to(points: pd.DataFrame, store: Store) -> pd.DataFrame:

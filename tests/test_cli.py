@@ -519,7 +519,10 @@ def test_predict_gives_back_the_points_as_written_and_their_answers(sealfit, don
     assert list(answers["speed_mm_s"]) == ["1.50", "2"]
     assert list(answers["force_after_N"]) == ["1.0", ""]
     assert answers["note"][1] == "cannot be answered"
-    assert predict(sealfit, done, tmp_path, "speed_mm_s\n1\n", "--json").json["rows"] == 1
+    told = predict(sealfit, done, tmp_path, "speed_mm_s\n1\n", "--json").json
+    assert told["rows"] == 1
+    assert told["includes"] == [e["label"] for e in fake_parts.CLOSURE["effects"] if not e["candidate"]]
+    assert ("force_after_N is what the sensor would read" in ended.stdout) == bool(told["includes"])
 
 
 @pytest.mark.parametrize(

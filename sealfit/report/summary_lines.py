@@ -227,7 +227,11 @@ def predict_lines(part: Mapping) -> list[str]:
     text += f", {part['extrapolated']} extrapolated"
     if refused := part["rows"] - part["answered"]:
         text += f"; {_count(refused, 'row')} not predicted (reason in column note)"
-    return [line("points", text), line("output", part["output"])]
+    found = [line("points", text), line("output", part["output"])]
+    if part["includes"]:
+        effects = "; ".join(part["includes"])
+        found.append(line("includes", f"{effects}: force_after_N is what the sensor would read"))
+    return found
 
 
 def line(title: str, text: str) -> str:
