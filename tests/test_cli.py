@@ -281,7 +281,7 @@ def test_run_does_every_step_and_says_so_in_a_few_lines(sealfit, parts, campaign
     assert "  before    not identified: mu_s in 1 of 3. Too few speeds." in lines
     sentence = "one effect was added; no significant residual remains; the error is within the scatter"
     assert f"verdict     closed: {sentence} of repeats" in lines
-    assert "            + lead-screw ripple: A 0.25 N, n unknown" in lines
+    assert "            + lead-screw ripple: A 0.25 [0.2, 0.3] N, n unknown" in lines
     assert "              reference state of the coefficients: mean over a wavelength" in lines
     assert (
         "error (N)   rmse 0.4 -> 0.2; held out 0.5 -> unknown; run means 0.3 -> 0.3; largest 1.5 -> 1.5"
@@ -394,7 +394,7 @@ def test_an_effect_that_is_not_named_or_not_applied_is_said_so(sealfit, parts, c
     parts.closure = {**fake_parts.CLOSURE, "effects": [unnamed, candidate]}
     lines = sealfit("run", campaign, "--out", out).stdout.splitlines()
     assert "            + smooth in time: no closed form fits as well" in lines
-    assert "            candidate, not applied: lead-screw ripple: A 0.25 N, n unknown" in lines
+    assert "            candidate, not applied: lead-screw ripple: A 0.25 [0.2, 0.3] N, n unknown" in lines
     assert "closed: one effect was added" in "".join(lines)
 
 

@@ -195,7 +195,12 @@ def _left(left: Mapping, verdict: str, unit: str) -> str:
 
 
 def _value(parameter: Mapping) -> str:
-    return f"{parameter['name']} {_number(parameter['value'])} {parameter['unit'] or ''}".rstrip()
+    """Return a parameter with its 95 % interval, e.g. "A 0.4 [0.38, 0.42] N"."""
+    ends = ""
+    if None not in parameter["ci95"]:
+        low, high = map(_number, parameter["ci95"])
+        ends = f" [{low}, {high}]"
+    return f"{parameter['name']} {_number(parameter['value'])}{ends} {parameter['unit'] or ''}".rstrip()
 
 
 def _acts(way: Mapping) -> str:
