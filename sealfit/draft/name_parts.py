@@ -154,7 +154,7 @@ def settings_with(pattern: str, parts: Sequence[Part], middle: tuple[int, int] |
         elif part.expression or (part.group.startswith("_") and part.ours != "specimen_id"):
             compute[part.ours] = (part.expression or "{}").format(part.group)
     columns = _date_template(pattern) | _specimen_template(parts)
-    compute |= _signed_speed(parts, compute)
+    compute |= signed_speed(parts, compute)
     units = {part.ours: part.unit for part in parts if part.unit}
     return Names(pattern, tuple(parts), values, compute, columns, units)
 
@@ -176,7 +176,7 @@ def _specimen_template(parts: Sequence[Part]) -> dict[str, str]:
     return {"specimen_id": " ".join("{" + name + "}" for name in [*settings, "_specimen"])}
 
 
-def _signed_speed(parts: Sequence[Part], compute: Mapping[str, str]) -> dict[str, str]:
+def signed_speed(parts: Sequence[Part], compute: Mapping[str, str]) -> dict[str, str]:
     """Return the expression of a speed with the sign of its direction, where names say it in a word."""
     if not any(part.ours == "direction" for part in parts):
         return {}

@@ -16,7 +16,7 @@ from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import Dialect
 from sealfit.draft.file_names import HEIGHT_FROM
 from sealfit.draft.files_found import Found
-from sealfit.draft.name_parts import Names, Part
+from sealfit.draft.name_parts import Names, Part, signed_speed
 from sealfit.draft.runs_table import RunsTable
 from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import channels_of, name_parts
@@ -67,10 +67,38 @@ def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, 
 
 
 def improved(names: Names, speeds: Mapping[str, float], found: Found, notes: Notes) -> Names:
-    """Return the names with speeds that agree with the measured ones, and repeats that tell files apart."""
+    """Return the names with speeds that agree with the measured ones, and repeats that tell files apart.
+
+    `speeds` are the measured ones, negative backward.
+    """
     if names.pattern is None:
         return names
-    return _unaged_apart(_told_apart(_with_speed(names, speeds, notes), found, notes), found)
+    names = _with_direction(_with_speed(names, speeds, notes), speeds)
+    return _unaged_apart(_told_apart(names, found, notes), found)
+
+
+def _with_direction(names: Names, speeds: Mapping[str, float]) -> Names:
+    """Return the names with the direction that a word says: one in all files that go forward, one backward.
+
+    A condition for each word would hide what differs between the directions.
+    """
+    said = values_by_file(names, speeds)
+    for part in names.parts:
+        ways = {(one[part.ours], speeds[file] > 0) for file, one in said.items() if part.ours in one}
+        signs = {word: 1.0 if forward else -1.0 for word, forward in sorted(ways)}
+        if part.ours.startswith("label_") and len(ways) == len(signs) == len(set(signs.values())) == 2:
+            why = "a word that follows the direction of the displacement"
+            made = replace(part, ours="direction", group="_direction", why=why, doubt="")
+            parts = tuple(made if p is part else p for p in names.parts)
+            values = {group: mapped for group, mapped in names.values.items() if group != part.group}
+            return replace(
+                names,
+                pattern=names.pattern.replace(f"(?P<{part.group}>", "(?P<_direction>"),
+                values={**values, "_direction": signs},
+                compute={**names.compute, **signed_speed(parts, names.compute)},
+                parts=parts,
+            )
+    return names
 
 
 def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Names:
@@ -94,7 +122,7 @@ def _ratio(said: Mapping[str, object], measured: Mapping[str, float]) -> float |
     named = {f: abs(v) for f, v in said.items() if isinstance(v, int | float) and v and measured.get(f)}
     if len(set(named.values())) < 2:
         return None
-    ratios = sorted(speed / measured[file] for file, speed in named.items())
+    ratios = sorted(speed / abs(measured[file]) for file, speed in named.items())
     middle = ratios[len(ratios) // 2]
     agree = sum(abs(ratio / middle - 1) <= AGREES for ratio in ratios)
     return middle if agree >= MOSTLY * len(ratios) else None

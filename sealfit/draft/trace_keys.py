@@ -344,7 +344,10 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
 def motion_keys(
     roles: Roles, units: Mapping[str, Unit | None], files: Sequence[str], notes: Notes
 ) -> dict[str, float]:
-    """Say whether strokes go both ways and how many speeds a file has; return each file's measured speed."""
+    """Say whether strokes go both ways and how many speeds a file has; return each file's measured speed.
+
+    It is negative where all strokes of the file go backward.
+    """
     if roles.time is None or (roles.displacement is None and roles.speed is None):
         return {}
     given = {role: unit.name for role, unit in units.items() if unit is not None}
@@ -369,7 +372,11 @@ def motion_keys(
     if _turns(roles):  # these speeds are not in mm/s
         return {}
     one_speed = {file: found for file, found in speeds.items() if found and file not in several}
-    return {file: float(np.median(np.abs(found))) for file, found in one_speed.items()}
+    return {file: float(np.median(np.abs(found)) * _sign(found)) for file, found in one_speed.items()}
+
+
+def _sign(speeds: Sequence[float]) -> int:
+    return -1 if max(speeds) < 0 else 1
 
 
 def _shown_speeds(several: Mapping[str, Sequence[float]], files: Sequence[str]) -> str:

@@ -335,6 +335,21 @@ def test_a_repeat_that_does_not_tell_files_apart_is_not_used(tmp_path):
     assert sorted(ref.channels["repeat"] for ref in listing) == [1, 1, 2, 2, 3, 4]
 
 
+def test_two_words_that_follow_the_displacement_are_the_direction(tmp_path):
+    for one in exports.records(days=(1,), speeds=(1.0, 5.0)):
+        name = f"{one.speed:g}mms_{{}}_r{one.repeat}.csv"
+        exports.write(tmp_path, name.format("p"), plain(one))
+        back = [one.time_s, 60.0 - one.displacement_mm, -one.force_N]
+        exports.write(tmp_path, name.format("q"), "Time_s,Pos_mm,Force_N\n" + exports.table(back, ",", 4))
+    made = draft(tmp_path)
+    config = parse_config(made.text, "rig.toml")
+    assert config.condition == ["state"]
+    assert config.files.values == {"_direction": {"p": 1.0, "q": -1.0}}
+    ingested = ingest_campaign(tmp_path, config)
+    assert sorted(ingested.tables["steady"]["speed_set_mm_s"].unique()) == [1.0, 5.0]
+    assert ingested.tables["steady"].groupby("direction")["repeat"].nunique().to_dict() == {-1: 2, 1: 2}
+
+
 def test_unreadable_folders_raise_what_the_user_can_mend(tmp_path):
     with pytest.raises(RequestError, match="there is no such folder"):
         draft(tmp_path / "nowhere")

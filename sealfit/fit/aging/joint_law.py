@@ -327,8 +327,8 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
     if conditions < len(names):
         raise FitError(
             f"{conditions} conditions do not determine the {len(names)} parameters of the law '{loss}'.",
-            fix="Test more days, or choose a law with fewer parameters. Conditions whose fit does not identify "
-            "the value do not count: the report says why.",
+            fix="Test more days, or choose a law with fewer parameters. Conditions where the value is not "
+            "identified do not count; the report says why.",
         )
     empty = JointLaw(
         aged, shape, acts_on, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf
