@@ -367,6 +367,8 @@ def _hdf5_value(item) -> np.ndarray | float | str | None:
 # ---------------------------------------------------------------- Parquet
 
 _OF_WRITERS = (b"pandas", b"ARROW:schema")  # what writers keep for themselves
+MOST_CELLS = 2 * 10**8
+"""Largest number of cells of a Parquet file, 1.6 GB as numbers: equal rows are compressed to next to nothing."""
 
 
 def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
@@ -380,6 +382,10 @@ def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays
     header = [_header_line(name, text) for name, text in about.items() if name.encode() not in _OF_WRITERS]
     if head:
         return Arrays(tuple(header))
+    rows, columns = opened.metadata.num_rows, opened.metadata.num_columns
+    if rows * columns > MOST_CELLS:
+        reason = f"has {rows} rows of {columns} columns; at most {MOST_CELLS:,} cells are read from one file."
+        raise bad_file(file, "too_large", reason, "Divide it into a file for each run.")
     table = opened.read(use_threads=False)
     names = [name for name in table.column_names if not name.startswith("__index_level_")]
     if len(set(names)) < len(names):

@@ -26,6 +26,7 @@ from trace_helpers import config
 
 from sealfit.commands import check
 from sealfit.errors import BadFile, CampaignError
+from sealfit.ingest import formats
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_header, read_trace
@@ -411,3 +412,12 @@ def test_a_page_of_parquet_that_is_not_what_its_checksum_says_is_damage(tmp_path
     raw[raw.index(table()["force_N"].to_numpy().tobytes()[:64])] ^= 1
     (tmp_path / "t.parquet").write_bytes(raw)
     assert "cannot be read as a Parquet file" in refused(tmp_path, "t.parquet").reason
+
+
+def test_a_parquet_file_with_too_many_cells_is_left_out(tmp_path, monkeypatch):
+    as_parquet(tmp_path / "t.parquet", table())
+    cells = table().size
+    monkeypatch.setattr(formats, "MOST_CELLS", cells)
+    assert read(tmp_path, "t.parquet") is not None
+    monkeypatch.setattr(formats, "MOST_CELLS", cells - 1)
+    assert f"at most {cells - 1:,} cells" in refused(tmp_path, "t.parquet").reason
