@@ -65,6 +65,7 @@ DISTANCE = Column("distance_mm", "distance slid since the start of the motion")
 TIME = Column("time_s", "time in the file; from the start of the motion in a file of several strokes")
 RUN_ORDER = Column("run_order", "place of the file in the order of started_at; null if not given")
 ELAPSED = Column("elapsed_h", "time since the campaign's first file; null if not given")
+CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 
 KEYS = (FILE, RUN, REPEAT, STROKE, DIRECTION, SPECIMEN, CONDITION, SERIES, RUBBER)
 

@@ -30,10 +30,10 @@ from sealfit.effects.free import WIDE
 from sealfit.fit.joint.declared import SAME_SPEED
 from sealfit.fit.joint.rows import LEVELS, POWER, Rows, one_load, open_columns
 from sealfit.ingest.quality import STILL_RISING
+from sealfit.tables import CALENDAR
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 ROUNDING = 1e-9  # Relative rounding error of the mean of equal numbers.
-CALENDAR = ("run_order", "elapsed_h")  # correlated with conditions, which are tested one after the other
 ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")  # proportional to one another at steady speed
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, level_values, settings, unit_of, varies
+from sealfit.closure.channels import level_values, settings, unit_of, varies
 from sealfit.closure.criteria import (
     CURVE_P,
     HALVED,
@@ -34,6 +34,7 @@ from sealfit.fit.joint.estimate import Fitted, fit, with_reml_smoothness
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
+from sealfit.tables import CALENDAR
 
 LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 """Least and most settings for which interpolation is tested: fewer have no inner one, and more are dense."""

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import fdtrc
 
-from sealfit.closure.channels import CALENDAR, FINER, Channel, even_knots, scaled
+from sealfit.closure.channels import FINER, Channel, even_knots, scaled
 from sealfit.closure.criteria import (
     FREE_DF,
     JACKKNIFE_UNITS,
@@ -29,6 +29,7 @@ from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_eff
 from sealfit.fit.joint.estimate import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Term, mean_derivatives, shape_of
 from sealfit.fit.joint.rows import Rows
+from sealfit.tables import CALENDAR
 
 # ---------------------------------------------------------------- forms
 # The forms that are fitted for a candidate, and the grids of their nonlinear parameters.

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, Channel
+from sealfit.closure.channels import Channel
 from sealfit.closure.criteria import (
     CONTENDER_SHARE,
     EQUAL_BIC,
@@ -35,6 +35,7 @@ from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint.estimate import Fitted, fit, reestimated
 from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening
+from sealfit.tables import CALENDAR
 
 REFITTED = 8  # Proposals that are refitted jointly.
 FORMS_EACH = 2  # Proposals that are refitted for each further quantity.

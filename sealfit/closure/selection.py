@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import CALENDAR, Channel, channels_of, searched
+from sealfit.closure.channels import Channel, channels_of, searched
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
 from sealfit.closure.criteria import EQUAL_BIC, HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
 from sealfit.closure.forms import AGING, richer_laws
@@ -32,6 +32,7 @@ from sealfit.fit.joint.estimate import Fitted, fit, fit_declared, fit_with_effec
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter
+from sealfit.tables import CALENDAR
 
 
 class Start(NamedTuple):

@@ -17,7 +17,7 @@ from sealfit.config import Config, Quality
 from sealfit.errors import KEPT, NOTED, STROKE_OUT, ConfigError, Fault
 from sealfit.ingest.strokes import Stroke
 from sealfit.ingest.trace_checks import resolution
-from sealfit.tables import QUALITY, STEADY
+from sealfit.tables import CALENDAR, QUALITY, STEADY
 from sealfit.units import conversion
 
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
@@ -274,7 +274,6 @@ def _as_text(value: str | float | None) -> str | None:
 # Share of the files that have a value, from which the search for effects still looks at a column.
 LEAST_KNOWN = 0.8
 NO_VALUE = "(no value)"  # level of a category in files without one
-CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 
 
 def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) -> list[Fault]:

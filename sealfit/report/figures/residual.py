@@ -43,6 +43,7 @@ from sealfit.report.style import (
     log_axis,
     value_ticks,
 )
+from sealfit.tables import CALENDAR
 from sealfit.units import Units
 
 LEVELS = ("specimen", "run", "file", "stroke", "sample")
@@ -205,7 +206,7 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     """
     numeric = rows["x"].notna().all() and channel != "direction"
     x = rows["x"].to_numpy(float) if numeric else np.arange(len(rows), dtype=float)
-    log = numeric and is_logarithmic(x, LOG_SPAN)
+    log = numeric and channel not in CALENDAR and is_logarithmic(x, LOG_SPAN)
     if numeric and channel in ("speed_mm_s", "speed_set_mm_s"):  # as force against speed is drawn
         log = bool(x.min() > 0 and x.max() / x.min() > SPEED_SPAN)
     # The two stages are drawn side by side, so that neither hides the other.
@@ -327,7 +328,7 @@ def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> N
         ax.plot(x, free, color=FLOOR, linestyle="--", linewidth=1.1)
         ax.plot(x, value, color=AFTER)
         ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
-        if is_logarithmic(x, LOG_SPAN):
+        if channel not in CALENDAR and is_logarithmic(x, LOG_SPAN):
             log_axis(ax)
     else:
         x = np.arange(len(rows))
