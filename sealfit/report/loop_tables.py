@@ -8,10 +8,9 @@ import pandas as pd
 from markupsafe import Markup
 
 from sealfit.config import Config
-from sealfit.report.figures.residual import LEVELS
+from sealfit.report.figures.residual import LEVELS, shape_label, shape_scale
 from sealfit.report.notation import (
     NOTHING,
-    by_gain,
     capital,
     channel_label,
     channel_words,
@@ -28,10 +27,11 @@ from sealfit.report.notation import (
     together,
     true_units,
 )
-from sealfit.report.summary import level_words
+from sealfit.report.summary import by_gain, level_words
 from sealfit.report.words import acts, meaning, target_html
 
 MOST_TESTS = 40
+CURVE_PLACES = 7  # of a free shape that a card lists
 FREE = {
     "smooth": "free smooth shape",
     "levels": "one level per category",
@@ -105,8 +105,11 @@ def _change(before: float, after: float) -> str:
     return f"{percent:+d}\u00a0%".replace("-", "−") if percent else "0\u00a0%"
 
 
-def effect_cards(closure: Mapping, config: Config) -> list[dict]:
-    """Return every effect, added or candidate, with the content of its card; the largest gain first."""
+def effect_cards(closure: Mapping, shapes: pd.DataFrame, config: Config) -> list[dict]:
+    """Return every effect, added or candidate, with the content of its card; the largest gain first.
+
+    A free shape has places of its curve in table `shapes`, and no parameters.
+    """
     cards, unit = [], config.units.unit("force")
     for effect in by_gain(closure["effects"]):
         gain, left = effect.get("heldout_gain_N"), effect.get("heldout_rmse_N")
@@ -124,7 +127,8 @@ def effect_cards(closure: Mapping, config: Config) -> list[dict]:
                 "reference": effect.get("reference") or "",
                 "level": level_words(effect["level"]),
                 "channels": _labels(effect["channels"], config),
-                "parameters": [_parameter(p, effect) for p in effect["parameters"]],
+                "parameters": [_parameter(p, effect) for p in effect["parameters"] if effect["named"]],
+                "curve": None if effect["named"] else _curve(effect, shapes, closure, config),
                 "p": p_value(effect.get("p_value")),
                 "gain": _sized(gain, unit),
                 "left": of_unit(number(left), unit) if known(left) else "",
@@ -155,6 +159,25 @@ def _parameter(p: Mapping, effect: Mapping) -> dict:
     value, interval = measured(p["value"], *(p.get("ci95") or (None, None)))
     return {"symbol": symbol_html(p["name"]), "meaning": meaning(effect["id"], p["name"]), "value": value,
             "interval": interval, "unit": p.get("unit") or ""}  # fmt: skip
+
+
+def _curve(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Config) -> dict | None:
+    """Return the head and a few places of a free shape along its first channel; None for a candidate."""
+    own = shapes[shapes["effect"] == closure["effects"].index(effect)]
+    if own.empty:
+        return None
+    rows = own[own["channel"] == own["channel"].iloc[0]]
+    step = max(1, (len(rows) - 1) // (CURVE_PLACES - 1))
+    rows, scale = rows.iloc[::step], shape_scale(effect)
+    places = rows["label"].where(rows["x"].isna(), rows["x"].map(given))
+    values = [
+        measured(*(scale * v for v in row)) for row in rows[["value", "lo95", "hi95"]].itertuples(index=False)
+    ]
+    return {
+        "place": channel_label(rows["channel"].iloc[0], config.units),
+        "value": shape_label(rows, effect, config.units),
+        "rows": [(place, *texts) for place, texts in zip(places, values, strict=True)],
+    }
 
 
 def _rival(rival: Mapping, config: Config) -> Markup:

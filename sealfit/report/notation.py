@@ -329,11 +329,6 @@ def split_channels(text: str | None, known: Collection[str]) -> list[str]:
     return names
 
 
-def by_gain(effects: Sequence[Mapping]) -> list[Mapping]:
-    """Return effects of closure.json, the largest reduction of the held-out error first."""
-    return sorted(effects, key=lambda effect: -(effect.get("heldout_gain_N") or 0.0))
-
-
 def effect_label(effect: Mapping, units: Units) -> str:
     """Return an effect's label in words, slots by their quantity, without the target.
 

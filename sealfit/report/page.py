@@ -127,18 +127,22 @@ def _finding(group: list[Fault], config: Config) -> dict:
     return row if one_reason(group) else {**row, "reason": ""}
 
 
-def provenance_facts(provenance: Mapping) -> dict:
-    """Return provenance.json with every key that the page reads, and the name of the campaign."""
+def provenance_facts(provenance: Mapping, config: Config) -> dict:
+    """Return provenance.json with every key that the page reads, and the config's name, or the folder's."""
     found = {"version": "", "python": "", "system": "", "packages": {}, "campaign": "", "table": None}
     found |= {"config": {"name": "", "path": None, "text": ""}, "inputs": [], "steps": [], **provenance}
     return {
         **found,
-        "name": found["table"] or PurePath(found["campaign"]).name or found["campaign"],
+        "name": _own_name(config) or found["table"] or PurePath(found["campaign"]).name or found["campaign"],
         "inputs": found["inputs"][:MOST_INPUTS],
         "inputs_in_all": len(found["inputs"]),
         "bytes": sum(entry["size"] for entry in found["inputs"]),
         "steps": [{**step, "finished_at": _instant(step["finished_at"])} for step in found["steps"]],
     }
+
+
+def _own_name(config: Config) -> str:
+    return config.name if config.name != Config().name else ""
 
 
 def _instant(text: str) -> str:
@@ -271,7 +275,7 @@ def _content(
         "undecided": undecided(closure, config),
         "facts": campaign_facts(tables, config),
         "errors": error_rows(closure, config) if closure else [],
-        "cards": effect_cards(closure, config) if closure else [],
+        "cards": effect_cards(closure, tables["shapes"], config) if closure else [],
         "scatter": scatter_rows(closure) if closure else [],
         "sensitivity": sensitivity_rows(closure, config) if closure else [],
         "refused": refused_rows(closure, config) if closure else [],
@@ -294,7 +298,7 @@ def _content(
         "counts": quality_counts(tables["quality"]),
         "findings": findings,
         "findings_in_all": in_all,
-        "provenance": provenance_facts(provenance),
+        "provenance": provenance_facts(provenance, config),
     }
 
 

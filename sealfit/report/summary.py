@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -160,7 +160,8 @@ def of_dynamic(fit: pd.DataFrame) -> dict:
 def of_closure(closure: Mapping, units: Units) -> dict:
     """Return the verdict, the errors before and after, the effects and the remaining residual."""
     found = {key: closure[key] for key in CLOSURE_KEYS} | {"sentence": verdict_sentence(closure, units)}
-    return found | {"effects": [{key: effect[key] for key in EFFECT_KEYS} for effect in closure["effects"]]}
+    effects = [{key: effect[key] for key in EFFECT_KEYS} for effect in by_gain(closure["effects"])]
+    return found | {"effects": effects}
 
 
 def of_after(store: Store) -> dict:
@@ -172,6 +173,11 @@ def of_after(store: Store) -> dict:
         "fit_aging": of_fit(store.read("aging_fit_after"), "series"),
         "fit_dynamic": of_dynamic(store.read("dynamic_fit_after")),
     }
+
+
+def by_gain(effects: Sequence[Mapping]) -> list[Mapping]:
+    """Return effects of closure.json, the largest reduction of the held-out error first."""
+    return sorted(effects, key=lambda effect: -(effect.get("heldout_gain_N") or 0.0))
 
 
 def verdict_sentence(closure: Mapping, units: Units) -> str:

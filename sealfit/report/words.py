@@ -29,7 +29,14 @@ from sealfit.report.notation import (
     together,
     true_units,
 )
-from sealfit.report.summary import level_words, outlier_clause, power_clause, quality_clause, untold_clause
+from sealfit.report.summary import (
+    by_gain,
+    level_words,
+    outlier_clause,
+    power_clause,
+    quality_clause,
+    untold_clause,
+)
 
 if TYPE_CHECKING:
     from sealfit.effects.contract import Parameter
@@ -56,7 +63,8 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
     if closure["verdict"] == "cannot_tell":
         untold = untold_clause(closure, config.units)
         return _sentences(f"these files do not decide whether an effect is missing: {untold}", *errors)
-    added = [(k, e) for k, e in enumerate(closure["effects"]) if not e["candidate"]]
+    effects = closure["effects"]
+    added = [(effects.index(e), e) for e in by_gain(effects) if not e["candidate"]]
     lacked = left = ""
     if added:
         many = f"{COUNTED.get(len(added), len(added))} effects: " if len(added) > 1 else ""

@@ -155,7 +155,10 @@ def test_a_card_has_target_parameters_and_alternatives(pages):
     text = pages["closed"].text
     assert "It scales the friction coefficient μ and depends on time (s), which varies along strokes." in text
     assert "share of friction lost when warm" in text
-    assert "Not distinguishable from it with these data: warming by sliding (distance), acting on μ" in text
+    assert (
+        "Not distinguishable from it with these data: 1 other form warming by sliding (distance), acting on μ"
+        in text
+    )
     assert "candidate, not applied" in text
     assert "Replicate specimens would show" in text
 

@@ -10,6 +10,7 @@ from sealfit.report import page
 from sealfit.report.drawing import draw
 from sealfit.report.figures.aging import aging
 from sealfit.report.figures.speed import force_speed
+from sealfit.report.loop_tables import effect_cards
 from sealfit.report.page import build_report
 from sealfit.report.parameter_tables import break_away_rows, parameter_tables
 from sealfit.report.style import condition_misfits, spread, telling
@@ -144,7 +145,32 @@ def test_break_aways_are_cut_and_counted():
 
 def test_inputs_are_cut_and_counted():
     every = [{"file": f"{k}.csv", "size": 10, "sha256": "ab"} for k in range(2500)]
-    found = page.provenance_facts({"inputs": every})
+    found = page.provenance_facts({"inputs": every}, Config())
     assert (len(found["inputs"]), found["inputs_in_all"], found["bytes"]) == (2000, 2500, 25000)
     html = build_report({}, None, {"inputs": every}, Config()).html
     assert "The first 2000 of 2500; inputs.parquet has all." in html
+
+
+def test_the_page_is_called_what_the_config_is():
+    facts = {"campaign": "/data/csv", "table": None}
+    assert page.provenance_facts(facts, Config(name="emps"))["name"] == "emps"
+    assert page.provenance_facts(facts, Config())["name"] == "csv"
+
+
+def test_a_free_shape_is_a_table_of_its_curve_and_has_no_coefficients():
+    place = np.linspace(0.0, 60.0, 61)
+    ends = {"value": 0.1 + 0 * place, "lo95": 0.09 + 0 * place, "hi95": 0.11 + 0 * place}
+    shapes = pd.DataFrame({"effect": 0, "channel": "time_s", "x": place, "label": None, **ends, "unit": ""})
+    coefficients = [{"name": "c_2", "value": 0.2, "ci95": [0.1, 0.3], "unit": ""}]
+    free = {
+        "id": "smooth", "label": "smooth in time_s, factor on mu", "channels": ["time_s"], "acts_on": "mu",
+        "operation": "multiply", "named": False, "candidate": False, "parameters": coefficients,
+        "form": "natural cubic spline", "level": "trace", "reference": "mean",
+    }  # fmt: skip
+    (card,) = effect_cards({"effects": [free]}, shapes, Config())
+    assert card["parameters"] == []
+    assert card["curve"]["value"] == "change of μ (%)"
+    assert [row[0] for row in card["curve"]["rows"]] == ["0", "10", "20", "30", "40", "50", "60"]
+    assert card["curve"]["rows"][0][1:] == ("10.0", "[9.0, 11.0]")
+    (candidate,) = effect_cards({"effects": [free | {"candidate": True}]}, shapes.iloc[:0], Config())
+    assert candidate["curve"] is None

@@ -14,7 +14,6 @@ from sealfit.config import Config
 from sealfit.report.drawing import explain
 from sealfit.report.figures.speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.notation import (
-    by_gain,
     capital,
     channel_label,
     channel_words,
@@ -43,6 +42,7 @@ from sealfit.report.style import (
     log_axis,
     value_ticks,
 )
+from sealfit.report.summary import by_gain
 from sealfit.tables import CALENDAR
 from sealfit.units import Units
 
