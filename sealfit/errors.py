@@ -42,7 +42,7 @@ class Fault:
         if self.column is not None:
             parts.append(f"column '{self.column}'")
         if self.value is not None:
-            parts.append(shortened(repr(self.value)))
+            parts.append(_shown(self.value))
         head = ": ".join(parts)
         text = f"{head}: {self.reason}" if head else self.reason
         return printable(f"{text} {self.fix}".strip())
@@ -58,6 +58,11 @@ NOTED = {"severity": "info", "action": "kept"}
 STROKE_OUT = {"severity": "error", "action": "stroke left out"}
 LONGEST_VALUE = 80  # characters of a cell that a message shows
 LONGEST_PATH = 400  # and of the path of a file
+
+
+def _shown(value: str | float) -> str:
+    """Return a value as a message shows it: text in quotes, a number with six digits."""
+    return f"{value:.6g}" if isinstance(value, float) else shortened(repr(value))
 
 
 def shortened(text: str, most: int = LONGEST_VALUE) -> str:
@@ -87,7 +92,7 @@ RUNS_TABLES = ("runs.csv", "runs.xlsx", "runs.parquet")  # their lines are trace
 def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
     """Return the faults, grouped if more than `EXAMPLES` places share them, in the order of their first.
 
-    A place is a line, or a file. Faults are shared that differ in the file, the line, the value and in
+    A place is a line, a stroke or a file. Faults are shared that differ in their place, their value and in
     numbers of their reason only.
     """
     order: dict[int, int] = {}
@@ -97,7 +102,7 @@ def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
         alike.setdefault(_shared(fault), []).append(fault)
     found = []
     for group in alike.values():
-        shared = len({(fault.file, fault.line) for fault in group}) > EXAMPLES
+        shared = len({(fault.file, fault.stroke, fault.line) for fault in group}) > EXAMPLES
         found += [group] if shared else [[fault] for fault in group]
     return sorted(found, key=lambda group: order[id(group[0])])
 
@@ -119,10 +124,11 @@ def told(group: Sequence[Fault]) -> str:
 
 
 def how_many(group: Sequence[Fault]) -> str:
-    """Return how many files a group concerns, or lines of one file, and how often where that is more."""
+    """Return how many files a group concerns, or lines or strokes of one, and how often if that is more."""
     files = len({_file(fault) for fault in group})
-    if files == 1 and group[0].line is not None:
-        return f"{len({fault.line for fault in group})} lines of {group[0].file}"
+    for what in ("line", "stroke") if files == 1 else ():
+        if getattr(group[0], what) is not None:
+            return f"{len({getattr(fault, what) for fault in group})} {what}s of {group[0].file}"
     return f"{files} files" if files == len(group) else f"{files} files, {len(group)} times"
 
 
@@ -131,11 +137,12 @@ def examples(group: Sequence[Fault]) -> list[str]:
     whole, places = one_reason(group), {}
     several = len({fault.file for fault in group}) > 1
     for fault in group:
-        places.setdefault(_file(fault) if several else (fault.file, fault.line), fault)
+        places.setdefault(_file(fault) if several else (fault.file, fault.stroke, fault.line), fault)
     found = []
     for fault in list(places.values())[:EXAMPLES]:
         place = f"{fault.file or ''}{'' if fault.line is None else f':{fault.line}'}"
-        value = "" if fault.value is None else shortened(repr(fault.value))
+        place += "" if fault.stroke is None else f" stroke {fault.stroke}"
+        value = "" if fault.value is None else _shown(fault.value)
         said = value if whole else fault.reason.rstrip(".")
         found.append(": ".join(part for part in (place, said) if part))
     return found

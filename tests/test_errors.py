@@ -113,6 +113,21 @@ def test_the_nearest_name_beside_a_path_that_is_not_there_or_nothing(tmp_path, m
     assert nearest("Force", ["time"]) == ""
 
 
+def test_a_fault_that_many_strokes_share_is_one_message():
+    def fault(file, stroke):
+        return Fault("no_plateau", "never settles.", file=file, stroke=stroke, value=31.13122889305816)
+
+    (one_file,) = grouped([fault("a.csv", stroke) for stroke in range(1, 6)])
+    assert told(one_file).startswith(
+        "5 strokes of a.csv: never settles. For example a.csv stroke 1: 31.1312;"
+    )
+    (files,) = grouped([fault(file, stroke) for file in ("a.csv", "b.csv") for stroke in (1, 2)])
+    assert told(files).startswith(
+        "2 files, 4 times: never settles. For example a.csv stroke 1: 31.1312; b.csv"
+    )
+    assert len(grouped([fault("a.csv", stroke) for stroke in (1, 2, 3)])) == 3
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

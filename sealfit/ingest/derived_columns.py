@@ -24,7 +24,7 @@ from sealfit.ingest.categorical import (
     where,
 )
 from sealfit.ingest.cells import OVERLOAD
-from sealfit.ingest.expression import evaluate, parse
+from sealfit.ingest.expression import evaluate, parse, require_columns
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import Entry, stopped
@@ -97,6 +97,7 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
         expression = parse(text)
         read = {column: columns[column] for column in expression.names if column in columns}
         try:
+            require_columns(expression, columns)
             values = evaluate(expression, {column: _as_array(cells) for column, cells in read.items()})
         except ConfigError as error:
             place = {"file": f"config '{config.name}'", "column": f"runs.compute.{name}"}

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import ast
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, reduce
 
 import numpy as np
 
-from sealfit.errors import ConfigError
+from sealfit.errors import ConfigError, nearest
 
 MAX_CHARACTERS = 1000
 """Longest text of an expression: nobody writes a longer one by hand, and the parser's memory is bounded."""
@@ -103,6 +103,15 @@ def parse(text: str, *, condition: bool = False) -> Expression:
     return Expression(text, frozenset(checked.names), compute)
 
 
+def require_columns(expression: Expression, known: Collection[str]) -> None:
+    """Raise ConfigError if an expression reads a column that is not known."""
+    for name in sorted(expression.names):
+        if name not in known:
+            fix = f"Did you mean '{close}'? " if (close := nearest(name, known)) else ""
+            fix += f"Known: {', '.join(sorted(known)) or 'none'}."
+            raise ConfigError(f"in {expression.text!r}: there is no column '{name}'.", column=name, fix=fix)
+
+
 def evaluate(expression: Expression, values: Values) -> np.ndarray:
     """Return the expression's value: an array of shape (n,), or of shape () if only constants are read.
 
@@ -115,12 +124,7 @@ def evaluate(expression: Expression, values: Values) -> np.ndarray:
     ConfigError
         If a name is not in `values`, or stands for text where a number is wanted.
     """
-    for name in sorted(expression.names):
-        if name not in values:
-            known = ", ".join(sorted(values)) or "none"
-            raise ConfigError(
-                f"in {expression.text!r}: there is no column '{name}'.", column=name, fix=f"Known: {known}."
-            )
+    require_columns(expression, values)
     with np.errstate(all="ignore"):
         return np.asarray(expression.compute(values))
 

@@ -72,7 +72,7 @@ def _unsettled(stroke: Stroke) -> Fault:
     )
     fix = "Drive at a constant speed; lower strokes.speed_tolerance where steps of the speed are smaller."
     speed = float(stroke.speed_mm_s)
-    return Fault("no_plateau", reason, column="displacement_mm", value=speed, fix=fix, **KEPT)
+    return Fault("no_plateau", reason, column="speed_mm_s", value=speed, fix=fix, **KEPT)
 
 
 def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:

@@ -57,6 +57,12 @@ def test_an_expression_that_cannot_be_meant_stops_the_run(tmp_path, text, said):
     assert fault.fix
 
 
+def test_a_mistyped_column_of_an_expression_is_answered_with_the_nearest(tmp_path):
+    (fault,) = faults(campaign(tmp_path, LOG), DAYS + "[runs]\ncompute = {load_N = '2 * mas_kg'}\n")
+    assert fault.fix.startswith("Did you mean 'mass_kg'? Known: ")
+    assert "hanger" in fault.fix
+
+
 def test_an_expression_that_is_none_is_refused_with_its_key(tmp_path):
     with pytest.raises(ConfigError, match=r"runs\.compute\.load_N"):
         channels(tmp_path, "[runs]\ncompute = {load_N = '__import__(1)'}\n")
