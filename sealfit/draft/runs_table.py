@@ -62,7 +62,7 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
     try:
         if (folder / file).stat().st_size > MAX_BYTES:
             return None
-        text, _ = text_of(folder, file)
+        text, _ = text_of(folder, file, first_sheet=True)
     except (BadFile, OSError):
         return None
     lines = [line for line in text.split("\n") if line.strip(" \t,;")]

@@ -16,7 +16,9 @@ from sealfit.draft.files_found import Found
 from sealfit.draft.header_lines import settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
-from sealfit.ingest.files import split_line
+from sealfit.ingest.files import read_bytes, split_line
+from sealfit.ingest.formats import kind_of
+from sealfit.ingest.workbooks import longest_sheet
 from sealfit.units import Units, conversion
 
 LONG_S = 3600.0
@@ -32,10 +34,19 @@ CHANNELS = ("temperature", "humidity", "pressure")
 # ---------------------------------------------------------------- dialect
 
 
+def _sheet_key(found: Found, notes: Notes) -> None:
+    """Add the sheet of the workbooks, if they have several."""
+    if kind_of(found.traces[0]) == "xlsx":
+        sheet, filled = longest_sheet(read_bytes(found.folder, found.traces[0]), found.traces[0])
+        if filled > 1:
+            notes.guess("trace.sheet", sheet, f"has the most rows of the {filled} sheets of a workbook")
+
+
 def dialect_keys(found: Found, notes: Notes) -> None:
     """Add the keys of how the files are written."""
     if found.of_arrays:
         return
+    _sheet_key(found, notes)
     one, sniffed = found.dialect, found.sniffed
     of = f"{len(sniffed)} of {len(sniffed)} files"
     if len(found.traces) > len(sniffed):

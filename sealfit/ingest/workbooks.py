@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -82,6 +82,17 @@ def read_sheet(
         return Sheet("\n".join(lines).encode("utf-8", "replace"), () if head else _merged(raw, title))
 
 
+def longest_sheet(raw: bytes, file: str) -> tuple[str, int]:
+    """Return the name of the sheet with the most rows, and how many have cells; errors as `read_sheet`."""
+    _refuse_others(raw, file)
+    openpyxl = library("openpyxl", file)
+    with damage_named(file, "xlsx"), _book(openpyxl, raw, formulas=True) as book:
+        rows = {
+            sheet.title: sum(map(_has_cell, sheet.iter_rows(values_only=True))) for sheet in book.worksheets
+        }
+    return max(rows, key=rows.get), sum(count > 0 for count in rows.values())
+
+
 @contextmanager
 def _book(openpyxl, raw: bytes, *, formulas: bool) -> Iterator:
     """Open a workbook to be read row by row, with its formulas or with the values that Excel kept of them."""
@@ -137,7 +148,11 @@ def _listed(titles: list[str]) -> str:
 
 
 def _is_filled(sheet) -> bool:
-    return any(cell is not None for row in sheet.iter_rows(values_only=True) for cell in row)
+    return any(map(_has_cell, sheet.iter_rows(values_only=True)))
+
+
+def _has_cell(row: Sequence[object]) -> bool:
+    return any(cell is not None for cell in row)
 
 
 def _lines(sheet, decimal: str, head: bool) -> tuple[list[str], list[tuple[int, int]]]:

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import exports
+import pandas as pd
 import pytest
 
 from sealfit import cli
@@ -333,6 +334,21 @@ def test_a_repeat_that_does_not_tell_files_apart_is_not_used(tmp_path):
     assert any("does not tell 6 files apart" in doubt.reason for doubt in made.doubts)
     listing, _ = list_traces(tmp_path, config)
     assert sorted(ref.channels["repeat"] for ref in listing) == [1, 1, 2, 2, 3, 4]
+
+
+def test_the_sheet_with_the_most_rows_holds_the_trace(tmp_path):
+    for one in exports.records():
+        about, data = pd.DataFrame({"Operator": ["Ada"]}), pd.DataFrame(exports.slots(one)).T
+        data.columns = ["Time [s]", "Stroke [mm]", "Force [N]"]
+        with pd.ExcelWriter(tmp_path / f"{one.days}d_{one.speed:g}mms_r{one.repeat}.xlsx") as book:
+            about.to_excel(book, sheet_name="Info", index=False)
+            data.to_excel(book, sheet_name="Data", index=False)
+    made = draft(tmp_path)
+    config = parse_config(made.text, "rig.toml")
+    assert config.trace.sheet == "Data"
+    assert made.files == 12
+    ingested = ingest_campaign(tmp_path, config)
+    assert not [fault for fault in ingested.faults if fault.severity == "error"]
 
 
 def test_two_words_that_follow_the_displacement_are_the_direction(tmp_path):
