@@ -111,6 +111,8 @@ class TraceFormat(Strict):
     """A row of units follows the names."""
     trailing_separator: bool = False
     """Lines end in stray separators; they are stripped."""
+    footer: str | None = Field(None, min_length=1)
+    """How the first line below the data begins, such as "*** END"; it and all lines below are not read."""
     drop_first_rows: int = Field(0, ge=0, le=MOST)
     """Data rows to leave out at the start of each file."""
     columns: FileColumns = Field(

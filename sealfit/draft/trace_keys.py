@@ -34,6 +34,19 @@ CHANNELS = ("temperature", "humidity", "pressure")
 # ---------------------------------------------------------------- dialect
 
 
+def _footer_key(footers: Sequence[Sequence[str]], sniffed: int, notes: Notes) -> None:
+    """Add how the first line below the data begins, if it does so in words in all files that have one."""
+    if not footers:
+        return
+    what = f"{len(footers)} of {sniffed} files end in lines that are no data, such as '{footers[0][0][:60]}'"
+    begins = re.match(r"[^\d\t;,]*", footers[0][0])[0]
+    if any(map(str.isalpha, begins)) and all(footer[0].startswith(begins) for footer in footers):
+        notes.guess("trace.footer", begins, what)
+        return
+    fix = "They are left out, and `check` lists them. If they begin alike, set trace.footer to that."
+    notes.doubt("trace", f"{what}.", fix)
+
+
 def _sheet_key(found: Found, notes: Notes) -> None:
     """Add the sheet of the workbooks, if they have several."""
     if kind_of(found.traces[0]) == "xlsx":
@@ -66,12 +79,7 @@ def dialect_keys(found: Found, notes: Notes) -> None:
     if trailing:
         evidence = f"lines of data end in separators in {trailing} of {len(sniffed)} files"
         notes.guess("trace.trailing_separator", True, evidence)
-    footers = [other.footer for other in sniffed if other.footer]
-    if footers:
-        what = f"end in lines that are no data, such as '{footers[0][0][:60]}'"
-        fix = "A config cannot name them: these lines are left out, and `check` lists them."
-        fix += " Delete them in the files, or leave them out of the export."
-        notes.doubt("trace", f"{len(footers)} of {len(sniffed)} files {what}.", fix)
+    _footer_key([other.footer for other in sniffed if other.footer], len(sniffed), notes)
     odd = [other.odd_lines for other in sniffed if other.odd_lines]
     if odd:
         reason = f"in {len(odd)} of {len(sniffed)} files up to {max(odd)} lines between the data are none."

@@ -380,6 +380,18 @@ def without_strays(line: str, settings: TraceFormat) -> str:
     return line.rstrip(",; \t" + (settings.delimiter if len(settings.delimiter) == 1 else ""))
 
 
+def without_footer(text: bytes, footer: str | None) -> bytes:
+    """Return a text up to the first line that begins as the footer does; all of it without a footer.
+
+    Examples
+    --------
+    >>> without_footer(b"0,1\\n1,2\\n*** END ***\\n", "*** END")
+    b'0,1\\n1,2\\n'
+    """
+    at = -1 if footer is None else text.find(b"\n" + footer.encode())
+    return text if at < 0 else text[: at + 1]
+
+
 def _header_lines(lines: list[str], settings: TraceFormat, file: str) -> int:
     if settings.header_ends_at is not None:
         for number, line in enumerate(lines, start=1):

@@ -36,6 +36,7 @@ from sealfit.ingest.files import (
     refuse_marked_up,
     split_line,
     whole_lines,
+    without_footer,
 )
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays
 from sealfit.ingest.trace_checks import speed_fault
@@ -195,14 +196,15 @@ def _text(
 ) -> tuple[bytes, Layout, TraceFormat]:
     """Return a text file or workbook sheet as UTF-8, its layout, and the settings with its delimiter."""
     if kind_of(file, settings) == "csv":
-        text = as_utf8(raw, settings.encoding, file, head=head)
+        text = without_footer(as_utf8(raw, settings.encoding, file, head=head), settings.footer)
         refuse_marked_up(text, file)
         return text, find_layout(text, settings, file), settings
     sheet = read_sheet(raw, file, settings.sheet, decimal=settings.decimal, head=head)
     settings = settings.model_copy(update={"delimiter": "tab"})
-    layout = find_layout(sheet.text, settings, file)
+    text = without_footer(sheet.text, settings.footer)
+    layout = find_layout(text, settings, file)
     sheet.check(layout.first_line, file)
-    return sheet.text, layout, settings
+    return text, layout, settings
 
 
 def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | str]:

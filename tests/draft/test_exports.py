@@ -87,15 +87,14 @@ def test_the_draft_leads_to_no_fault(name, tmp_path):
     assert [str(fault) for fault in ingested.faults] == []
 
 
-@pytest.mark.parametrize("name", ["excel_german", "excel_us"])
-def test_lines_below_the_data_are_a_doubt_as_no_config_can_name_them(name, tmp_path):
+@pytest.mark.parametrize(("name", "footer"), [("excel_german", None), ("excel_us", "Average")])
+def test_lines_below_the_data_are_named_by_how_they_begin(name, footer, tmp_path):
     exports.EXPORTS[name](tmp_path)
-    made, _, ingested = read(tmp_path)
-    assert any("end in lines that are no data" in doubt.reason for doubt in made.doubts)
-    assert {fault.line for fault in ingested.faults} <= {
-        263,
-        264,
-    }  # one line in each file, below the 260 rows
+    made, config, ingested = read(tmp_path)
+    assert config.trace.footer == footer
+    assert any("end in lines that are no data" in doubt.reason for doubt in made.doubts) == (footer is None)
+    places = {264} if footer is None else set()  # the line below the 260 rows
+    assert {fault.line for fault in ingested.faults} == places
 
 
 # ---------------------------------------------------------------- what single exports need
