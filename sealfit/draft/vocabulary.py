@@ -1,8 +1,12 @@
-"""What columns, parts of file names and header lines are called, in English and German, and their units."""
+"""What columns, parts of file names and header lines are called, and their units.
+
+The words are English and German; of columns the usual French, Italian and Spanish ones too.
+"""
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass
 
 # ---------------------------------------------------------------- units
@@ -123,31 +127,33 @@ _COLUMN_WORDS = (
     ("none", r"\bcof\b|\bmue?\b|coefficient|reibwert|reibungszahl|reibzahl|\bindex\b|\bscan\b|\bsample\b"
              r"|\bnr\b|\bno\b|count|segment|cycle|zyklus|comment|kommentar|alarm"
              r"|\bsoll|set ?point|command|target|demand|stress|strain|spannung|dehnung|volt|\braw\b"),
-    ("temperature", r"temp"),
+    ("temperature", r"temp(?!s\b|o\b)"),
     ("humidity", r"humid|feucht"),
     ("pressure", r"pressure|druck(?!kraft)"),
-    ("time", r"time|zeit|x.?value|elapsed|sekunde"),
+    ("time", r"time|zeit|x.?value|elapsed|sekunde|temps\b|tempo\b|tiempo"),
     ("load", r"normal|\bfz\b|\bfn\b|anpress|auflast|andruck|vertical"),
-    ("speed", r"speed|velocity|geschwind|\bvel\b|drehzahl"),
+    ("speed", r"speed|velocity|geschwind|\bvel\b|drehzahl|vitesse|velocit|velocid"),
     ("torque", r"torque|moment"),
-    ("force", r"force|kraft|friction|reib|tangential|load.?cell|kmd|\bfx\b|\bft\b|\bfr\b|\bfy\b|\bload\b"),
-    ("displacement", r"displace|position|extension|crosshead|weg|verschieb|travel|traverse|\bhub\b|stroke"
-                     r"|lvdt|verfahr|\bpos\b|path|distance|auslenk|slide|schlitten"
+    ("force", r"force|kraft|friction|reib|tangential|load.?cell|effort|forza|fuerza"
+              r"|kmd|\bfx\b|\bft\b|\bfr\b|\bfy\b|\bload\b"),
+    ("displacement", r"displace|deplace|spostam|desplaz|position|extension|crosshead|weg|verschieb|travel"
+                     r"|traverse|\bhub\b|stroke|lvdt|verfahr|\bpos\b|path|distance|auslenk|slide|schlitten"
                      r"|angle|winkel|rotation|revolution|umdrehung"),
 )  # fmt: skip
 _LETTERS = {"t": "time", "f": "force", "v": "speed", **dict.fromkeys("xys", "displacement")}
 
 
 def plain(text: str) -> str:
-    """Return a name in small letters, umlauts spelled out, words apart.
+    """Return a name in small letters, umlauts spelled out, accents left out, words apart.
 
     Examples
     --------
-    >>> plain("Prüfzeit_1"), plain("FileName")
-    ('pruefzeit 1', 'file name')
+    >>> plain("Prüfzeit_1"), plain("FileName"), plain("Déplacement")
+    ('pruefzeit 1', 'file name', 'deplacement')
     """
     apart = re.sub(r"(?<=[a-zäöü])(?=[A-Z])", " ", text)
-    return re.sub(r"[^a-z0-9%]+", " ", apart.lower().translate(_UMLAUTS)).strip()
+    letters = unicodedata.normalize("NFKD", apart.lower().translate(_UMLAUTS))
+    return re.sub(r"[^a-z0-9%]+", " ", re.sub(r"[\u0300-\u036f]", "", letters)).strip()
 
 
 def column_role(name: str) -> tuple[str, int]:
@@ -215,16 +221,18 @@ BEFORE = {
 }
 AFTER = {
     **dict.fromkeys(("C", "degC", "°C", "grad", "deg"), ("temperature_C", "")),
+    **dict.fromkeys(("F", "degF", "°F"), ("temperature_C", "degF")),
     **dict.fromkeys(("pct", "%", "percent", "prozent"), ("compression_ratio_pct", "")),
-    **dict.fromkeys(("d", "day", "days", "tag", "tage"), ("aging_days", "")),
-    **dict.fromkeys(("h", "hours", "std"), ("aging_days", "h")),
+    **dict.fromkeys(("d", "day", "days", "tag", "tage", "j", "jours"), ("aging_days", "")),
+    **dict.fromkeys(("h", "hr", "hrs", "hours", "std"), ("aging_days", "h")),
     **dict.fromkeys(("w", "wk", "weeks", "wochen"), ("aging_days", "week")),
     **dict.fromkeys(("mms", "mm s", "mmps", "mm/s", "mmpers"), ("speed_mm_s", "")),
     **dict.fromkeys(("mmmin", "mm min", "mmpmin", "mmpermin"), ("speed_mm_s", "mm/min")),
     **dict.fromkeys(("ums", "um s"), ("speed_mm_s", "um/s")),
-    **dict.fromkeys(("ipm", "inmin", "in min"), ("speed_mm_s", "in/min")),
+    **dict.fromkeys(("ipm", "inmin", "in min", "inpmin", "inpermin"), ("speed_mm_s", "in/min")),
     **dict.fromkeys(("cms",), ("speed_mm_s", "cm/s")),
     **dict.fromkeys(("N",), ("load_N", "")),
+    **dict.fromkeys(("kN",), ("load_N", "kN")),
     **dict.fromkeys(("kg", "kgf"), ("load_N", "kgf")),
     **dict.fromkeys(("lbf", "lbs"), ("load_N", "lbf")),
     **dict.fromkeys(("bar",), ("pressure_bar", "")),

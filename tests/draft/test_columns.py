@@ -173,10 +173,11 @@ def test_strokes_are_counted(strokes, sign):
         ("Load Cell", "force"), ("Normalkraft", "load"), ("Fz", "load"), ("Reibungszahl", "none"),
         ("COF", "none"),
         ("Probentemperatur", "temperature"), ("Geschwindigkeit", "speed"), ("Drehmoment", "torque"),
-        ("MX440B_CH 1", ""),
+        ("MX440B_CH 1", ""), ("Temps", "time"), ("Tempo", "time"), ("Déplacement", "displacement"),
+        ("Effort tangentiel", "force"), ("Vitesse", "speed"), ("Température", "temperature"),
     ],
 )  # fmt: skip
-def test_names_of_columns_in_two_languages(name, role):
+def test_names_of_columns_in_several_languages(name, role):
     assert column_role(name)[0] == role
 
 

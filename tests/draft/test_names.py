@@ -45,6 +45,11 @@ def test_a_way_of_naming_files_is_read(template, expected):
     ("files", "expected"),
     [
         (made("{h}h_v{v}.csv", h=(96, 24), v=(1, 2)), {"aging_days": 4.0, "speed_mm_s": 1.0}),
+        (
+            made("{h}hr_{T}F_{v}inpermin.csv", h=(96, 24), T=(140, 176), v=(60, 120)),
+            {"aging_days": 4.0, "temperature_C": 60.0, "speed_mm_s": 25.4},
+        ),
+        (made("essai_{j}j_{N}kN.asc", j=(4, 8), N=(0.1, 0.2)), {"aging_days": 4.0, "load_N": 100.0}),
         (made("{w}weeks_v{v}.csv", w=(2, 4), v=(1, 2)), {"aging_days": 14.0, "speed_mm_s": 1.0}),
         (made("{v}mmmin_d{d}.csv", v=(300, 60), d=(1, 2)), {"speed_mm_s": 5.0, "aging_days": 1.0}),
         (made("{N}N_d{d}.csv", N=(50, 100), d=(1, 2)), {"load_N": 50.0, "aging_days": 1.0}),
