@@ -30,6 +30,7 @@ NO_CONDITION = {
 }  # fmt: skip
 AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
+_CLOCK = re.compile(r"\d{1,2}:\d{2}(?::\d{2})?")
 SPEED_UNITS = ("mm/min", "m/s", "cm/s", "um/s", "in/min", "in/s")
 MOST_LISTED = 20  # files that are excluded by name; more are said in a sentence
 
@@ -361,15 +362,24 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
         notes.doubt("files.runs_columns", f"compressions up to {max(numbers):g} % {like}.", fix)
     if "started_at" not in cells:
         _dates_doubt(table, notes)
+    if unknown := [f"'{name}'" for name in table.cells if name not in table.ours and not name.isidentifier()]:
+        reason = (
+            f"what {', '.join(unknown)} of {table.file} hold{'s' * (len(unknown) == 1)} is not known here."
+        )
+        notes.doubt(
+            "files.runs_columns", reason, "Name a load, a temperature or the like by our name for it."
+        )
 
 
 def _dates_doubt(table: RunsTable, notes: Notes) -> None:
+    clock = next((name for name, cells in table.cells.items() if all(map(_CLOCK.fullmatch, cells))), None)
     dates = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}")
     for name, cells in table.cells.items():
         full = [cell for cell in cells if cell]
         if name not in table.ours and full and all(dates.search(cell) for cell in full):
             what = f"holds dates that are not ISO 8601, such as '{full[0]}'"
-            fix = f"Name it, started_at = '{name}', and give files.date_format, such as '%d.%m.%Y %H:%M'."
+            started = f"'{name}'" if clock is None else f"{{ date = '{name}', time = '{clock}' }}"
+            fix = f"Set files.started_at = {started}, and files.date_format, such as '%d.%m.%Y %H:%M'."
             notes.doubt("files.runs_columns", f"column '{name}' of {table.file} {what}.", fix)
             return
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path, PurePosixPath
 
+from sealfit.config import AGING_CONDITION
 from sealfit.draft.files_found import text_of
-from sealfit.draft.vocabulary import Unit, name_and_unit, setting
+from sealfit.draft.vocabulary import UNAGED, Unit, name_and_unit, setting
 from sealfit.errors import BadFile
 from sealfit.ingest.files import as_number, split_line
 from sealfit.ingest.formats import kind_of
@@ -100,6 +101,8 @@ def _meanings(
     for name in [*exact, *names]:
         base, unit = name_and_unit(name)
         meaning = setting(base) or setting(name)
+        if not meaning and unit is not None and unit.dimension == "speed":
+            meaning = "speed_mm_s"
         if not meaning or name in ours or meaning in ours.values() or not _fits(meaning, cells.get(name, ())):
             continue
         ours[name] = meaning
@@ -117,6 +120,8 @@ def _fits(meaning: str, column: Sequence[str]) -> bool:
         return all(_is_iso(cell) for cell in full)
     if meaning in ("specimen_id", "run_id", "rubber", "file"):
         return True
+    if meaning in AGING_CONDITION:  # the words for unaged rubber
+        full = [cell for cell in full if cell.lower() not in UNAGED]
     numbers = [cell for cell in full if as_number(cell) is not None or as_number(cell, ",") is not None]
     return len(numbers) > 0.8 * len(full)
 

@@ -336,6 +336,21 @@ def test_a_repeat_that_does_not_tell_files_apart_is_not_used(tmp_path):
     assert sorted(ref.channels["repeat"] for ref in listing) == [1, 1, 2, 2, 3, 4]
 
 
+def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_known_is_said(tmp_path):
+    rows = ["File,Ofen,Tage,Datum,Uhrzeit,Gewicht [kg],v [mm/min]"]
+    for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
+        exports.write(tmp_path, f"M{number}.csv", plain(one))
+        oven = one.temperature if one.days else "RT"
+        rows.append(f"M{number}.csv,{oven},{one.days},03.03.2024,08:{number:02d},5.0,{60 * one.speed:g}")
+    exports.write(tmp_path, "log.csv", "\n".join(rows) + "\n")
+    made = draft(tmp_path)
+    columns = parse_config(made.text, "rig.toml").files.runs_columns
+    assert (columns["temperature_C"].name, columns["speed_mm_s"].unit) == ("Ofen", "mm/min")
+    doubts = " ".join(f"{doubt.reason} {doubt.fix}" for doubt in made.doubts)
+    assert "files.started_at = { date = 'Datum', time = 'Uhrzeit' }" in doubts
+    assert "what 'Gewicht [kg]' of log.csv holds is not known here" in doubts
+
+
 def test_the_sheet_with_the_most_rows_holds_the_trace(tmp_path):
     for one in exports.records():
         about, data = pd.DataFrame({"Operator": ["Ada"]}), pd.DataFrame(exports.slots(one)).T
