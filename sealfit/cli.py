@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import sys
 import traceback
 from collections.abc import Callable
@@ -315,6 +316,8 @@ def fit_aging(
     asked = {"names": tuple(properties or ()), "force": force} | ({"batch": batch} if batch else {})
     work = partial(pipeline.fit_properties, values, new or out, config, **asked)
     _do("fit-aging", profile, as_json, work)
+    if not as_json:
+        typer.echo(f"next        sealfit report {shlex.quote(str(new or out))}")
 
 
 _fit_command("fit-dynamic", "Fit sigma_0 and sigma_1 to the pre-sliding part.")

@@ -140,11 +140,14 @@ def test_without_scripts_the_page_is_whole(tmp_path):
     assert images[1] == images[2] == str(html_of(aging_campaign).count("<img"))
 
 
-def test_the_page_prints(tmp_path):
+def test_the_page_prints_on_a4(tmp_path):
     page, printed = tmp_path / "page.html", tmp_path / "page.pdf"
     page.write_text(html_of(aging_campaign), "utf-8")
     browsed(page, tmp_path, f"--print-to-pdf={printed}")
-    assert printed.read_bytes().startswith(b"%PDF")
+    document = printed.read_bytes()
+    assert document.startswith(b"%PDF")
+    sheets = set(re.findall(rb"/MediaBox ?\[0 0 (\d+)\S* (\d+)", document))
+    assert sheets == {(b"594", b"841")}  # points
 
 
 def loaded(around, page, folder):
