@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -86,6 +87,8 @@ MOST_BREAK_AWAYS = 600
 # not shown: for programs that read the Parquet tables
 HIDDEN = ("covariance", "sensor_shift", "effect_shift")
 
+SHARED = 3  # rows with one note, from which it is said once
+_NUMBERS = re.compile(r"(?<![\w<;&#.])\d+(?:\.\d+)?(?![\w.]*[<;])")  # not those in symbols or in markup
 Rows = dict[tuple[str, str], dict]  # of one condition or series, by parameter and unit
 
 
@@ -114,6 +117,7 @@ class ParameterTable:
     single: bool = False  # values only: statistics have neither interval nor u_sys
     note: str = ""  # the number of rows shown, where there are too many
     compared: bool = False  # whether cells have the value before
+    remarks: tuple[Markup, ...] = ()  # notes that several rows share, below the table
 
     @property
     def width(self) -> int:
@@ -209,7 +213,31 @@ def _table(
     heads = (key, "quantity") if several else (key,)
     groups = tuple((symbol_html(p), u) for p, u in parameters)
     title = _title(key, quantities, after=compared)
-    return ParameterTable(title, heads, groups, tuple(found), compared=compared)
+    rows, remarks = _said_once(found)
+    return ParameterTable(title, heads, groups, rows, compared=compared, remarks=remarks)
+
+
+def _said_once(rows: Sequence[tuple]) -> tuple[tuple[tuple, ...], tuple[Markup, ...]]:
+    """Return the rows without the notes that several share but for a number, and these notes, each once."""
+    alike: dict[str, list[Markup]] = {}
+    for *_, note in rows:
+        if note:
+            alike.setdefault(_NUMBERS.sub("\0", note), []).append(note)
+    shared = {form: notes for form, notes in alike.items() if len(notes) >= SHARED}
+    kept = tuple((*row, Markup("") if _NUMBERS.sub("\0", note) in shared else note) for *row, note in rows)
+    remarks = []
+    for form, notes in shared.items():
+        of = "all rows" if len(notes) == len(rows) else f"{len(notes)} of {len(rows)} rows"
+        numbers = iter(map(_range, zip(*map(_NUMBERS.findall, notes), strict=True)))
+        text = re.sub("\0", lambda _, own=numbers: next(own), form)
+        remarks.append(Markup(f"{text} ({of})"))
+    return kept, tuple(remarks)
+
+
+def _range(numbers: Sequence[str]) -> str:
+    """Return equal numbers as one, others as the smallest to the largest."""
+    low, high = min(numbers, key=float), max(numbers, key=float)
+    return low if low == high else f"{low} to {high}"
 
 
 def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Config) -> ParameterTable:

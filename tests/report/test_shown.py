@@ -130,6 +130,18 @@ def test_long_parameter_tables_are_cut_and_say_where_the_rest_is():
     assert parameter_tables(fits(200), "condition", Config())[0].note == ""
 
 
+def test_a_note_that_rows_share_but_for_a_number_is_said_once_with_its_range():
+    many = fits(4)
+    many["reason"] = [f"at most {bound} N s/mm." for bound in (0.83, 1.2, 1.0, 0.9)]
+    (found,) = parameter_tables(many, "condition", Config())
+    assert [row[-1] for row in found.rows] == ["", "", "", ""]
+    (remark,) = found.remarks
+    assert remark.endswith("at most 0.83 to 1.2 N s/mm. (all rows)")
+    (found,) = parameter_tables(many.assign(reason=["", "", *many["reason"][2:]]), "condition", Config())
+    assert [bool(row[-1]) for row in found.rows] == [False, False, True, True]  # two are no repetition
+    assert found.remarks == ()
+
+
 def test_break_aways_are_cut_and_counted():
     one = {"quantity": "break_away", "direction": 1, "unit": "", "identified": True, "lo95": 1.0, "hi95": 2.0}
     rows = [
