@@ -156,8 +156,10 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
     """Return the condition of use after checks; see `lifetime` for the errors raised."""
     for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_pct):
         if name in law.names and value is None:
+            argument = {"temperature": "temperature_C"}.get(what, "compression_pct")
             raise RequestError(
-                f"the rubber was aged at more than one {what}.", fix=f"Say which with --{what}."
+                f"the rubber was aged at more than one {what}.",
+                fix=f"Say which: --{what}, in Python {argument}.",
             )
         if value is not None and not least <= value <= most:
             raise RequestError(
@@ -287,7 +289,7 @@ def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
     if (threshold is None) == (loss_pct is None):
         raise RequestError(
             "what ends a life is not said." if threshold is None else "two ends of life were given.",
-            fix="Give --threshold VALUE or --loss PERCENT.",
+            fix="Give --threshold VALUE or --loss PERCENT; in Python threshold or loss_pct.",
         )
     if threshold is not None and not np.isfinite(threshold):
         raise RequestError(f"--threshold {threshold:g} is no value to reach.", fix="Give a number.")
