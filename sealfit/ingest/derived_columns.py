@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from sealfit.config import Config
-from sealfit.errors import KEPT, NOTED, ConfigError, Fault
+from sealfit.errors import KEPT, NOTED, CampaignError, ConfigError, Fault
 from sealfit.ingest.categorical import (
     UNAGED,
     Column,
@@ -100,6 +101,7 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
             require_columns(expression, columns)
             values = evaluate(expression, {column: _as_array(cells) for column, cells in read.items()})
         except ConfigError as error:
+            _refuse_words(entries, error.column, read.get(error.column, ()), name)
             place = {"file": f"config '{config.name}'", "column": f"runs.compute.{name}"}
             raise stopped("config", error.message, error.fix, **place) from error
         values = np.broadcast_to(values, len(entries)).astype(float)
@@ -116,6 +118,15 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
             for value, fine in zip(values.tolist(), good, strict=True)
         ]
     return {name: column for name, column in columns.items() if not name.startswith("_")}, faults
+
+
+def _refuse_words(entries: list[Entry], column: str, cells: Sequence, computed: str) -> None:
+    """Raise CampaignError for the first word among numbers in a column that an expression reads."""
+    words = [i for i, cell in enumerate(cells) if isinstance(cell, str) and as_number(cell) is None]
+    if words and len(words) < (1 - _MOSTLY) * len(cells):
+        reason = f"is not a number, and runs.compute.{computed} reads it."
+        fault = entries[words[0]].fault("not_a_number", reason, column, value=cells[words[0]])
+        raise CampaignError([replace(fault, action="stopped", fix="Correct the cell, or leave it empty.")])
 
 
 def _is_fine(value: float | str) -> bool:

@@ -28,7 +28,7 @@ def join_date_and_time(entries: list[Entry], columns: Columns, config: Config) -
     two = config.files.started_at
     if two is None:
         return columns, []
-    place = {"file": "runs.csv", "line": 1} if entries[0].line is not None else {}
+    place = {"file": entries[0].table, "line": 1} if entries[0].line is not None else {}
     missing = [name for name in (two.date, two.time) if name not in columns]
     if missing:
         reason = "there is no such column, but files.started_at names it."

@@ -63,6 +63,13 @@ def test_a_mistyped_column_of_an_expression_is_answered_with_the_nearest(tmp_pat
     assert "hanger" in fault.fix
 
 
+def test_a_word_among_numbers_that_an_expression_reads_is_named_with_its_cell(tmp_path):
+    log = "file,run_id,aging_days,mass_kg\na.csv,r1,4,5\nb.csv,r2,4,five\nc.csv,r3,4,5"
+    (fault,) = faults(campaign(tmp_path, log), DAYS + "[runs]\ncompute = {load_N = '2 * mass_kg'}\n")
+    assert (fault.file, fault.line, fault.column, fault.value) == ("runs.csv", 3, "mass_kg", "five")
+    assert "runs.compute.load_N reads it" in fault.reason
+
+
 def test_an_expression_that_is_none_is_refused_with_its_key(tmp_path):
     with pytest.raises(ConfigError, match=r"runs\.compute\.load_N"):
         channels(tmp_path, "[runs]\ncompute = {load_N = '__import__(1)'}\n")
