@@ -312,12 +312,13 @@ def fit_aging(
     if (out is None) == (new is None):
         raise typer.BadParameter("give the folder of results once: --values TABLE --out OUT.")
     from sealfit import pipeline
+    from sealfit.report import summary_lines
 
     asked = {"names": tuple(properties or ()), "force": force} | ({"batch": batch} if batch else {})
     work = partial(pipeline.fit_properties, values, new or out, config, **asked)
     _do("fit-aging", profile, as_json, work)
     if not as_json:
-        typer.echo(f"next        sealfit report {shlex.quote(str(new or out))}")
+        typer.echo(summary_lines.line("next", f"sealfit report {shlex.quote(str(new or out))}"))
 
 
 _fit_command("fit-dynamic", "Fit sigma_0 and sigma_1 to the pre-sliding part.")

@@ -91,7 +91,7 @@ def critical_small_sample(fitted: Fitted, tests: Sequence[SmallSampleTest], leve
 def _unequal(level: str) -> float:
     """Return the factor on p-values of F tests of one number per unit of a level.
 
-    A slope of their own in each run scatters the files of one run unequally.
+    Files of one run scatter unequally where each run has a slope of its own.
     """
     return UNEQUAL_RUNS if level == "file" else 1.0
 

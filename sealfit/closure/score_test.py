@@ -210,8 +210,8 @@ class ScoreTests:
         tests = tuple(contrast_test(self.fitted, left, between) for left in variants)
         if any(test is None for test in tests):
             return None
-        constant = between in ("file", "run") and self._test_of_constants(variants, target)
-        return weakest._replace(slopes=tests, small_sample=constant or None)
+        constant = self._test_of_constants(variants, target) if between in ("file", "run") else None
+        return weakest._replace(slopes=tests, small_sample=constant)
 
     def _specimens_agree(self, left: np.ndarray) -> bool:
         """Return whether two to four specimens agree in what columns along strokes explain together."""

@@ -27,7 +27,7 @@ _DAYS = (
     (re.compile(r"20\d\d/[01]\d/[0-3]\d"), "%Y/%m/%d"),
     (re.compile(r"[0-3]?\d/[0-3]?\d/20\d\d"), "%m/%d/%Y"),
 )
-_CLOCK = re.compile(
+CLOCK = re.compile(
     r"(?P<clock>[0-2]?\d:[0-5]\d(?P<second>:[0-5]\d)?)(?:[.,]\d+)?(?P<half>\s*[AP]M)?", re.IGNORECASE
 )
 
@@ -95,7 +95,7 @@ def started_in(headers: Sequence[Sequence[str]]) -> When | None:
 def _with_clock(headers, number: int, line: str, match: re.Match, spelled: str) -> When | None:
     """Return the date with the time of day after it in the same line, or in the next line."""
     start = _leading(line[: match.start()])
-    clock = _CLOCK.search(line, match.end())
+    clock = CLOCK.search(line, match.end())
     if clock is not None:
         between = line[match.end() : clock.start()]
         full = f"{spelled}{between.replace('%', '%%')}{_clock_format(clock)}"
@@ -104,7 +104,7 @@ def _with_clock(headers, number: int, line: str, match: re.Match, spelled: str) 
         return When(pattern, full, number, line.strip()) if _everywhere(pattern, headers) else None
     pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(match.group())) + ")"
     following = headers[0][number] if number < len(headers[0]) else ""
-    beside = _CLOCK.search(following)
+    beside = CLOCK.search(following)
     if not _everywhere(pattern, headers):
         return None
     if beside is None:

@@ -16,6 +16,7 @@ from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import Dialect
 from sealfit.draft.file_names import HEIGHT_FROM
 from sealfit.draft.files_found import Found
+from sealfit.draft.header_lines import CLOCK
 from sealfit.draft.name_parts import Names, Part, signed_speed
 from sealfit.draft.runs_table import RunsTable
 from sealfit.errors import ConfigError
@@ -30,7 +31,6 @@ NO_CONDITION = {
 }  # fmt: skip
 AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
-_CLOCK = re.compile(r"\d{1,2}:\d{2}(?::\d{2})?")
 SPEED_UNITS = ("mm/min", "m/s", "cm/s", "um/s", "in/min", "in/s")
 MOST_LISTED = 20  # files that are excluded by name; more are said in a sentence
 
@@ -88,17 +88,9 @@ def _with_direction(names: Names, speeds: Mapping[str, float]) -> Names:
         ways = {(one[part.ours], speeds[file] > 0) for file, one in said.items() if part.ours in one}
         signs = {word: 1.0 if forward else -1.0 for word, forward in sorted(ways)}
         if part.ours.startswith("label_") and len(ways) == len(signs) == len(set(signs.values())) == 2:
-            why = "a word that follows the direction of the displacement"
-            made = replace(part, ours="direction", group="_direction", why=why, doubt="")
-            parts = tuple(made if p is part else p for p in names.parts)
-            values = {group: mapped for group, mapped in names.values.items() if group != part.group}
-            return replace(
-                names,
-                pattern=names.pattern.replace(f"(?P<{part.group}>", "(?P<_direction>"),
-                values={**values, "_direction": signs},
-                compute={**names.compute, **signed_speed(parts, names.compute)},
-                parts=parts,
-            )
+            made = _renamed(names, part, "direction", "_direction", "follows the displacement")
+            compute = {**made.compute, **signed_speed(made.parts, made.compute)}
+            return replace(made, values={**made.values, "_direction": signs}, compute=compute)
     return names
 
 
@@ -114,7 +106,7 @@ def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Name
         if part.ours.startswith("part_") and len(part.texts) > 1:
             ratio = _ratio({f: v.get(part.ours) for f, v in said.items()}, speeds)
             if ratio is not None and abs(ratio - 1) <= AGREES:
-                return _renamed(names, part, "speed_mm_s", "agrees with the measured speed")
+                return _as_speed(names, part)
     return names
 
 
@@ -143,16 +135,23 @@ def _speed_in_unit(names: Names, ratio: float, notes: Notes) -> Names:
     return replace(names, units={**names.units, "speed_mm_s": unit}, parts=parts)
 
 
-def _renamed(names: Names, part: Part, ours: str, why: str) -> Names:
+def _as_speed(names: Names, part: Part) -> Names:
+    """Return the names with a number as the speed, signed if a word says the direction."""
     signed = any(other.ours == "direction" for other in names.parts)
-    group = "_speed" if signed else ours
+    group = "_speed" if signed else "speed_mm_s"
     compute = {name: text for name, text in names.compute.items() if name != "direction_set"}
-    compute |= {ours: "_direction * _speed"} if signed else {}
+    compute |= {"speed_mm_s": "_direction * _speed"} if signed else {}
+    made = _renamed(names, part, "speed_mm_s", group, "agrees with the measured speed")
+    return replace(made, compute=compute)
+
+
+def _renamed(names: Names, part: Part, ours: str, group: str, why: str) -> Names:
+    """Return the names with another column, and group of the pattern, for a part."""
     made = replace(part, ours=ours, group=group, why=f"{part.why}; {why}", doubt="")
     parts = tuple(made if p is part else p for p in names.parts)
     values = {(group if key == part.group else key): value for key, value in names.values.items()}
     pattern = names.pattern.replace(f"(?P<{part.group}>", f"(?P<{group}>")
-    return replace(names, pattern=pattern, compute=compute, parts=parts, values=values)
+    return replace(names, pattern=pattern, parts=parts, values=values)
 
 
 def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
@@ -372,7 +371,7 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
 
 
 def _dates_doubt(table: RunsTable, notes: Notes) -> None:
-    clock = next((name for name, cells in table.cells.items() if all(map(_CLOCK.fullmatch, cells))), None)
+    clock = next((name for name, cells in table.cells.items() if all(map(CLOCK.fullmatch, cells))), None)
     dates = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}")
     for name, cells in table.cells.items():
         full = [cell for cell in cells if cell]

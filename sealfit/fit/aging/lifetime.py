@@ -156,7 +156,7 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
     """Return the condition of use after checks; see `lifetime` for the errors raised."""
     for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_pct):
         if name in law.names and value is None:
-            argument = {"temperature": "temperature_C"}.get(what, "compression_pct")
+            argument = "temperature_C" if what == "temperature" else "compression_pct"
             raise RequestError(
                 f"the rubber was aged at more than one {what}.",
                 fix=f"Say which: --{what}, in Python {argument}.",
