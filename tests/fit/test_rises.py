@@ -1,5 +1,7 @@
 """Bristles followed along strokes, against a loop and differences; ramps against their true motion."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.testing as npt
 import pytest
@@ -30,6 +32,18 @@ def test_the_recurrence_is_that_of_a_loop_however_far_it_goes(scale):
         now = np.exp(-slid[:, row]) * now + added[:, row]
         expected.append(now)
     npt.assert_allclose(_followed(slid, added), np.array(expected).T, rtol=1e-12)
+
+
+def test_a_curve_that_is_hardly_known_stays_positive_when_moved_by_its_uncertainty():
+    size = np.array([300.0, 200.0, 40.0, 2.0])
+    against = np.eye(4)
+    against[0, 1] = against[1, 0] = -0.9  # where F_s is larger, F_c is smaller
+    vague = replace(CURVE, covariance=against * np.outer(size, size))
+    moved = list(vague.moved())
+    assert len(moved) == 4
+    for curve in moved:
+        assert min(curve.static_N, curve.coulomb_N, curve.v_s) > 0
+        assert np.isfinite(Rises(list(strokes()), curve).best_of_grid()[0]).all()
 
 
 @pytest.mark.parametrize("at", [(np.log(80.0), 0.0), (np.log(110.0), 0.004), (np.log(3000.0), 0.01)])

@@ -129,17 +129,18 @@ class Curve:
         return bool(np.isfinite(self.v_s))
 
     def moved(self) -> Iterator[Curve]:
-        """Yield the curve changed by one standard deviation along each principal axis of its covariance."""
+        """Yield the curve changed by one standard deviation along each principal axis of its covariance.
+
+        Each keeps at least a tenth of its value, as the model needs them positive.
+        """
         size = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         unit = np.where(size > 0, size, 1.0)
         variance, axes = np.linalg.eigh(self.covariance / np.outer(unit, unit))
         at = np.array([self.static_N, self.coulomb_N, self.v_s, self.sigma_2])
         for step in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
             if np.abs(step).max() > 1e-9:
-                static, coulomb, v_s, sigma_2 = at + step * size
-                yield replace(
-                    self, static_N=static, coulomb_N=coulomb, v_s=max(v_s, 0.1 * self.v_s), sigma_2=sigma_2
-                )
+                static, coulomb, v_s, sigma_2 = np.maximum(at + step * size, 0.1 * at).tolist()
+                yield replace(self, static_N=static, coulomb_N=coulomb, v_s=v_s, sigma_2=sigma_2)
 
     def limit_N(self, speed_mm_s: np.ndarray) -> np.ndarray:
         """Return G, the bristle force in steady sliding in N, shape of the speed."""
