@@ -197,6 +197,8 @@ def settings(values: np.ndarray) -> np.ndarray:
     Settings are groups of values with gaps between them; a continuous channel has none.
     """
     distinct, place = np.unique(values, return_inverse=True)
+    if distinct.size == 1:
+        return values
     at = scaled(distinct)
     first = np.flatnonzero(np.r_[True, np.diff(at) > SAME_VALUE])
     widest = float((at[np.r_[first[1:] - 1, at.size - 1]] - at[first]).max())

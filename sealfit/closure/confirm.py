@@ -20,11 +20,13 @@ from sealfit.closure.criteria import (
     MOST_WITHIN,
     RIPPLE_CONFIRMED_P,
     SAMPLES_PER_VALUE,
+    VAGUER,
     WEAK_P,
     WITHIN_P,
 )
 from sealfit.closure.forms import describe
-from sealfit.closure.heldout import blocks, covered, foldable, folds, whole_settings
+from sealfit.closure.heldout import between_speeds, blocks, covered, foldable, folds, whole_settings
+from sealfit.closure.intervals import mean_se
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
 from sealfit.closure.ripples import agreement, pass_shifts
@@ -345,7 +347,21 @@ def _reason_refused(
         )
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
         return "it does not predict held-out settings between those it was fitted to"
+    if vague_between_speeds(fitted, proposal):
+        return "with it the force between the tested speeds is less certain than the error that it removes"
     return None
+
+
+def vague_between_speeds(before: Fitted, proposal: Proposal) -> bool:
+    """Whether the largest standard error of the force between tested speeds doubles and exceeds the residual.
+
+    A free shape beside the Stribeck curve may fit the tested speeds and leave the force between them open.
+    """
+    points, fits = between_speeds(before.rows), (before, proposal.fitted)
+    if points.speed.size == 0:
+        return False
+    largest = [float(mean_se(evaluate(f.model, points)[1], f.covariance).max()) for f in fits]
+    return largest[1] > max(VAGUER * largest[0], before.rmse_N)
 
 
 def _changes_the_curve(proposal: Proposal) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from sealfit.closure.channels import level_values, settings
 from sealfit.closure.criteria import (
     BLOCKS_OF_A_FOLD,
     LEAST_GROUPS_HELD_OUT,
@@ -13,7 +14,7 @@ from sealfit.closure.criteria import (
     OUTSIDE,
     SAME_SETTING,
 )
-from sealfit.fit.joint.rows import LEVELS, Rows
+from sealfit.fit.joint.rows import LEVELS, POWER, Rows, point_rows, sliding_power
 
 
 def heldout_level(rows: Rows) -> str:
@@ -155,3 +156,26 @@ def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
         out = _without_lost_edges(values == setting, rows.condition, rows)
         if out.any():
             yield out
+
+
+def between_speeds(rows: Rows) -> Rows:
+    """Return rows moved halfway, on a log scale, to the next higher tested speed of their series."""
+    speed = settings(level_values(np.abs(rows.speed), rows))
+    series = rows.conditions["series"].to_numpy()[rows.condition]
+    halfway = np.full(speed.size, np.nan)
+    for own in np.unique(series):
+        here = series == own
+        tested, place = np.unique(speed[here], return_inverse=True)
+        halfway[here] = np.r_[np.sqrt(tested[1:] * tested[:-1]), np.nan][place]
+    there = np.isfinite(halfway)
+    table = rows.table[there].assign(**{name: values[there] for name, values in rows.filled.items()})
+    table["speed_mm_s"] = np.sign(rows.speed[there]) * halfway[there]
+    if POWER in table:
+        table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
+    return point_rows(
+        table.reset_index(drop=True),
+        rows.condition[there],
+        rows.conditions,
+        has_load=rows.has_load,
+        has_aging=rows.has_aging,
+    )

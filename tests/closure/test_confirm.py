@@ -13,9 +13,10 @@ from sealfit.closure.confirm import (
     gain_between_settings,
     heldout_gain,
     rounding_error_N,
+    vague_between_speeds,
     varies_within,
 )
-from sealfit.closure.heldout import blocks
+from sealfit.closure.heldout import between_speeds, blocks
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared
@@ -107,6 +108,30 @@ SAMPLES = pd.DataFrame({"force_N": np.random.default_rng(0).normal(size=50), "st
 FORCE = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0), values=lambda channel: channel))
 
 
+FOUR = (1.0, 3.0, 10.0, 100.0)
+
+
+def test_points_between_speeds_are_halfway_to_the_next_speed_in_both_directions():
+    bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=2, speeds=FOUR)
+    points = between_speeds(make_rows(bins, has_aging=True))
+    expected = np.sqrt([3.0, 30.0, 1000.0])
+    assert np.unique(np.abs(points.speed)) == pytest.approx(expected, rel=0.01)
+    assert set(points.table) >= {"load_N", "time_s", "distance_mm"}
+    one = make_rows(make_bins(0, temperatures=(60.0,), days=(4.0,), bins=2, speeds=(3.0,)), has_aging=True)
+    assert between_speeds(one).speed.size == 0
+
+
+def test_a_free_shape_of_few_speeds_beside_the_stribeck_curve_leaves_the_force_between_them_open():
+    bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=4, speeds=FOUR)
+    before = fit_declared(make_rows(bins, has_aging=True))
+    term = Term(EFFECTS["log_rate"], ("speed_mm_s",), "mu", "multiply", {"speed_mm_s_ref": 10.0})
+    bent = before.refitted(before.model.with_term(term, {"A": 0.01}))
+    assert vague_between_speeds(before, SimpleNamespace(fitted=bent))
+    lost = Term(EFFECTS["exponential_approach"], ("distance_mm",), "mu", "multiply")
+    warmed = before.refitted(before.model.with_term(lost, {"A": -0.004, "tau": 3.0}))
+    assert not vague_between_speeds(before, SimpleNamespace(fitted=warmed))
+
+
 def proposal(effect="smooth", channels=("run_order",), acts_on="mu", p_value=1e-9, physical=False):
     own = SimpleNamespace(id=effect, physical=physical, label=effect, periodic=False)
     term = SimpleNamespace(effect=own, channels=channels, acts_on=acts_on, operation="multiply")
@@ -117,10 +142,11 @@ def proposal(effect="smooth", channels=("run_order",), acts_on="mu", p_value=1e-
 def decide(monkeypatch):
     """Decide on proposals with given gains: held out by groups and by settings, and the force they add."""
 
-    def decided(proposals, gains, settings=(), added=1.0, samples=SAMPLES, **more):
+    def decided(proposals, gains, settings=(), added=1.0, samples=SAMPLES, vague=False, **more):
         held = dict(zip(map(id, proposals), gains, strict=True))
         monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda before, p, *args: held[id(p)])
         monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: settings)
+        monkeypatch.setattr("sealfit.closure.confirm.vague_between_speeds", lambda *args: vague)
         monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
         monkeypatch.setattr(
             "sealfit.closure.confirm.unit_of", lambda name, rows: "sample" if name == "time_s" else "run"
@@ -199,6 +225,7 @@ STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id":
             "lowers the error on held-out data by less than 0.01% of the force",
         ),
         ({"settings": [GOOD, Gain(-0.1, 1.0, 1.0)]}, "does not predict held-out settings"),
+        ({"vague": True}, "between the tested speeds"),
     ],
 )
 def test_why_a_proposal_is_refused_is_said(decide, given, reason):
