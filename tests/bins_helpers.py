@@ -41,8 +41,7 @@ def make_bins(
     """Return `bins` of a campaign; `effect(table, force)` returns the force with what nobody declared."""
     rng = np.random.default_rng(seed)
     conditions = [(23.0, 100.0, 0.0), *((t, 80.0, d) for t in temperatures for d in days)]
-    tables = []
-    files = 0
+    files, forces, gains, waves = [], [], [], []
     for temperature, compression, day in conditions:
         piece = rng.normal(0, specimen)
         series = (
@@ -52,17 +51,15 @@ def make_bins(
         mu_s = TRUE["mu_s0"] - TRUE["a_s"] * np.log1p(day / TRUE["b_s"])
         mu_c = TRUE["mu_c0"] - TRUE["a_c"] * np.log1p(day / TRUE["b_c"])
         for speed in speeds:
+            mu = mu_c + (mu_s - mu_c) * np.exp(-((speed / TRUE["v_s"]) ** 2))
             for sign in directions:
                 set_up = rng.normal(0, setup)
                 own = {name: draw(rng) for name, draw in (run_channels or {}).items()}
                 for repeat in range(1, repeats + 1):
-                    files += 1
-                    x = (np.arange(bins) + 0.5) * 40.0 / bins
-                    mu = mu_c + (mu_s - mu_c) * np.exp(-((speed / TRUE["v_s"]) ** 2))
-                    force = np.full(bins, sign * (LOAD_N * mu + TRUE["sigma_2"] * speed))
-                    table = pd.DataFrame(
+                    number = len(files) + 1
+                    files.append(
                         {
-                            "file": f"f{files:04d}.csv",
+                            "file": f"f{number:04d}.csv",
                             "run_id": f"{condition}|{sign * speed:g}",
                             "repeat": repeat,
                             "stroke": 1,
@@ -71,29 +68,52 @@ def make_bins(
                             "condition": condition,
                             "series": series,
                             "rubber": "rubber",
-                            "bin": np.arange(bins),
                             "speed_mm_s": sign * speed,
                             "speed_set_mm_s": speed,
                             "load_N": LOAD_N,
-                            "displacement_mm": x if sign > 0 else 40.0 - x,
-                            "distance_mm": x,
-                            "time_s": x / speed,
-                            "run_order": float(files),
-                            "elapsed_h": 0.1 * files,
+                            "run_order": float(number),
+                            "elapsed_h": 0.1 * number,
                             "temperature_C": temperature,
                             "compression_ratio_pct": compression,
                             "aging_days": day,
                             **own,
                         }
                     )
-                    if effect is not None:
-                        force = effect(table, force)
-                    wave = rng.normal(0, 1, bins)
-                    for k in range(1, bins):
-                        wave[k] = autocorrelation * wave[k - 1] + np.sqrt(1 - autocorrelation**2) * wave[k]
-                    force = force * (1 + piece + set_up + rng.normal(0, gain)) + noise_N * wave
-                    tables.append(table.assign(force_N=force, force_sd_N=2 * noise_N, n=20))
-    return pd.concat(tables, ignore_index=True)
+                    forces.append(sign * (LOAD_N * mu + TRUE["sigma_2"] * speed))
+                    waves.append(_wave(rng, bins, autocorrelation))
+                    gains.append(1 + piece + set_up + rng.normal(0, gain))
+    # One table for all files: a table for each would take most of the time of many tests.
+    table = _along_strokes(pd.DataFrame(files), bins)
+    force = np.repeat(forces, bins)
+    if effect is not None:
+        for first in range(0, len(table), bins):
+            own = slice(first, first + bins)
+            force[own] = effect(table.iloc[own], force[own])
+    force = force * np.repeat(gains, bins) + noise_N * np.concatenate(waves)
+    return table.assign(force_N=force, force_sd_N=2 * noise_N, n=20)
+
+
+def _wave(rng: np.random.Generator, bins: int, autocorrelation: float) -> np.ndarray:
+    """Return noise along a stroke, an autoregression of first order with variance 1."""
+    wave = rng.normal(0, 1, bins)
+    if autocorrelation:
+        for k in range(1, bins):
+            wave[k] = autocorrelation * wave[k - 1] + np.sqrt(1 - autocorrelation**2) * wave[k]
+    return wave
+
+
+def _along_strokes(files: pd.DataFrame, bins: int) -> pd.DataFrame:
+    """Return a row per bin from one per file, with what changes along a stroke."""
+    table = files.iloc[np.repeat(np.arange(len(files)), bins)].reset_index(drop=True)
+    x = np.tile((np.arange(bins) + 0.5) * 40.0 / bins, len(files))
+    table = table.assign(
+        bin=np.tile(np.arange(bins), len(files)),
+        displacement_mm=np.where(table["direction"] > 0, x, 40.0 - x),
+        distance_mm=x,
+        time_s=x / table["speed_set_mm_s"].to_numpy(),
+    )
+    names = list(files)
+    return table[[*names[:9], "bin", *names[9:12], "displacement_mm", "distance_mm", "time_s", *names[12:]]]
 
 
 def warm(table: pd.DataFrame, force: np.ndarray) -> np.ndarray:

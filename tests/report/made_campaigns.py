@@ -145,12 +145,20 @@ def aging_campaign(
                     "elapsed_h": order * 0.11,
                     "operator": "AB"[order % 2],
                 }
-                frame = pd.DataFrame({**key, "bin": np.arange(bins_per_file), "force_N": force, "n": 50})
-                frame = frame.assign(
-                    displacement_mm=displacement, distance_mm=displacement - 2.0, time_s=time
-                )
-                # "before" is the same mean with part of the warming everywhere, between slow and fast runs
-                bins.append(frame.assign(force_sd_N=0.3, before=mean * (1 - 0.6 * drop), after=mean * warm))
+                own = {
+                    **key,
+                    "bin": np.arange(bins_per_file),
+                    "force_N": force,
+                    "n": 50,
+                    "displacement_mm": displacement,
+                    "distance_mm": displacement - 2.0,
+                    "time_s": time,
+                    "force_sd_N": 0.3,
+                    # the same mean with part of the warming everywhere, between slow and fast runs
+                    "before": mean * (1 - 0.6 * drop),
+                    "after": mean * warm,
+                }
+                bins.append(pd.DataFrame(own))
                 files.append(
                     {
                         **key,

@@ -352,15 +352,19 @@ def channels(found):
             if values.nunique() > 12 and numeric
             else values
         )
-        for _, index in values.groupby(group).groups.items():
+        means = {
+            stage: frame.groupby([group.rename("group"), "run_id"])["residual_N"].mean()
+            for stage, frame in found.items()
+        }
+        for key, index in values.groupby(group).groups.items():
             row = {
                 "channel": name,
                 "x": values[index].mean() if numeric else None,
                 "label": None if numeric else values[index].iloc[0],
                 "n": len(index),
             }
-            for stage, frame in found.items():
-                units = frame.loc[index].groupby("run_id")["residual_N"].mean()
+            for stage in found:
+                units = means[stage][key]
                 row |= {
                     f"{stage}_N": units.mean(),
                     f"{stage}_se_N": units.std() / np.sqrt(len(units)) if len(units) > 1 else None,
