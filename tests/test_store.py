@@ -569,40 +569,67 @@ def test_every_folder_in_which_a_step_puts_files_is_synced(tmp_path, campaign, m
 
 
 # ---------------------------------------------------------------- kills and full disks
+# Each line that comes in is the number of a call: `do_all` is killed there, in a process forked for it.
 KILLED = """
-import os, signal, sys
+import os, signal, sys, traceback
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 import test_store
 from sealfit.store import staged_writes
 
-real_replace, real_write, calls = os.replace, staged_writes.sync, 0
+calls = 0
 
-def count(real):
+def kill_at(at, real):
     def counted(*args):
         global calls
         calls += 1
-        if calls == {at}:
+        if calls == at:
             os.kill(os.getpid(), signal.SIGKILL)
         return real(*args)
     return counted
 
-os.replace = count(real_replace)
-staged_writes.sync = count(real_write)
-test_store.do_all(Path({out!r}), Path({campaign!r}), rows=5)
+def do_all_until(at):
+    os.replace, staged_writes.sync = kill_at(at, os.replace), kill_at(at, staged_writes.sync)
+    try:
+        test_store.do_all(Path({out!r}), Path({campaign!r}), rows=5)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)
+
+for line in sys.stdin:
+    pid = os.fork()
+    if pid == 0:
+        do_all_until(int(line))
+    print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
 """
 MOMENTS_PER_STEP = 14  # files written and moved, folders synced
 
 
-def test_a_kill_at_any_moment_leaves_complete_tables(out, campaign):
+@pytest.fixture
+def kill_at(out, campaign):
+    """Do all steps in another process, killed at a call of that number; return its exit code."""
+    program = KILLED.format(tests=str(HERE), out=str(out), campaign=str(campaign))
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", program], **pipes) as forking:
+
+        def ask(at):
+            print(at, file=forking.stdin, flush=True)
+            return int(forking.stdout.readline())
+
+        yield ask
+        forking.stdin.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_kill_at_any_moment_leaves_complete_tables(out, campaign, kill_at):
     do_all(out, campaign, rows=2)
     reached_end = []
     for at in range(1, MOMENTS_PER_STEP * len(STEPS) + 2, 5):
         (campaign / "a.csv").write_text(f"changed before kill {at}")
-        program = KILLED.format(tests=str(HERE), out=str(out), campaign=str(campaign), at=at)
-        run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-        reached_end.append(run.returncode == 0)
-        assert run.returncode in (0, -signal.SIGKILL), run.stderr
+        code = kill_at(at)
+        reached_end.append(code == 0)
+        assert code in (0, -signal.SIGKILL)
         store = Store.open(out)
         for step in STEPS:
             rows = len(store.read(OUTPUTS[step]))  # reads whole, or this raises
