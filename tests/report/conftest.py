@@ -1,4 +1,5 @@
 import pytest
+from matplotlib.figure import Figure
 
 from sealfit.report import drawing
 
@@ -7,17 +8,19 @@ SAVED = drawing._saved
 
 @pytest.fixture
 def unsaved(monkeypatch):
-    """Draw plots and save none, for tests of what the page says: saving is most of a report's time."""
+    """Draw panels and save none, for tests of what the page says: saving is most of a report's time."""
+    monkeypatch.setattr(drawing, "compose", lambda plot: Figure())
     monkeypatch.setattr(drawing, "_saved", lambda figure, form, metadata, **options: b"<svg/>")
 
 
 @pytest.fixture(scope="module")
-def only_svg():
-    """Save plots as SVG alone, for tests of what the page shows."""
+def only_panels():
+    """Draw the panels, which are what the page shows, and not the plots composed of them, which OUT keeps."""
 
     def saved(figure, form, metadata, **options):
         return SAVED(figure, form, metadata, **options) if form == "svg" else b""
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drawing, "compose", lambda plot: Figure())
         patch.setattr(drawing, "_saved", saved)
         yield

@@ -62,7 +62,7 @@ MADE = {
 
 
 @pytest.fixture(scope="module")
-def reports(only_svg):
+def reports(only_panels):
     return {name: build_report(*make().arguments) for name, make in MADE.items()}
 
 
@@ -286,7 +286,7 @@ def test_traces_of_runs_are_in_the_page_thinned_where_they_are_many(small):
     assert run_traces({**small.tables, **unfitted}, small.config)["runs"] == {}
 
 
-def test_paper_sized_campaign_gives_a_page_that_can_be_mailed(only_svg):
+def test_paper_sized_campaign_gives_a_page_that_can_be_mailed(only_panels):
     made = paper_sized()
     assert made.tables["steady"]["file"].nunique() == 1752
     assert made.tables["steady"]["condition"].nunique() == 73
