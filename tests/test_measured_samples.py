@@ -13,7 +13,6 @@ from page_helpers import DOCS, ROOT, as_in_a_clone, assert_as_shown, ran
 
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
-from sealfit.engine.run_map import cores
 from sealfit.ingest.campaign import ingest_campaign
 
 
@@ -28,7 +27,7 @@ def tutorial(tmp_path_factory):
 def pneuseal():
     config = load_config(ROOT / "configs" / "pneuseal.toml")
     tables = ingest_campaign(ROOT / "sample_data" / "measured" / "pneuseal-repeats", config).tables
-    return close_loop(tables["bins"], tables["traces"], config, workers=cores())
+    return close_loop(tables["bins"], tables["traces"], config)
 
 
 def test_the_tutorial_prints_what_it_says(tutorial):

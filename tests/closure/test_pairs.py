@@ -10,7 +10,6 @@ from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.closure.search import mixed_columns
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.engine.run_map import cores
 from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
@@ -23,7 +22,7 @@ COLUMNS = {
 
 def close(effect):
     bins = make_bins(5, setup=0.003, effect=effect, run_channels=COLUMNS, bins=8)
-    return bins, close_loop(bins, make_traces(bins), Config(), workers=cores())
+    return bins, close_loop(bins, make_traces(bins), Config())
 
 
 def test_product_of_two_columns_is_found_and_predicted():
