@@ -15,7 +15,7 @@ demo: .venv/.installed ## analyse the simulated campaign in sample_data, and say
 	@$(BIN)/sealfit run sample_data/simulated --out demo-out
 
 test: lint ## lint and run every test
-	$(BIN)/python -m pytest -rs -n auto --dist loadfile
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -rs -n auto --dist loadfile --no-loadscope-reorder
 
 golden: .venv/.installed-test ## compare ten campaigns with what is on record; after every step that is to move no number (three minutes)
 	$(BIN)/python -m pytest -rs -n auto -m golden tests/golden
