@@ -15,6 +15,12 @@ def computations_as_they_were(monkeypatch):
         monkeypatch.setattr(owner, name, getattr(owner, name))
 
 
+@pytest.fixture(autouse=True)
+def plots_are_not_saved(monkeypatch):
+    """No command reads a plot: saving them is half of the time that the results to damage take."""
+    monkeypatch.setattr("sealfit.report.drawing._saved", lambda *given, **options: b"<svg/>")
+
+
 def test_mutations_are_many_and_differ_from_the_file():
     found = list(drawn(b"time_s,force_N\n0,1\n1,2\n", [b"other"], 30, 1))
     assert len({raw for _, raw in found}) == len(found) == 30
