@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pandas as pd
 
+from sealfit.config import Config
+
 LOAD_N = 49.03
 TRUE = {
     "mu_s0": 0.93,
@@ -114,6 +116,9 @@ def _along_strokes(files: pd.DataFrame, bins: int) -> pd.DataFrame:
     )
     names = list(files)
     return table[[*names[:9], "bin", *names[9:12], "displacement_mm", "distance_mm", "time_s", *names[12:]]]
+
+
+TWO_FOLDS = Config(loop={"folds": 2})  # for tests of what is found: each fold is a search of its own
 
 
 def warm(table: pd.DataFrame, force: np.ndarray) -> np.ndarray:

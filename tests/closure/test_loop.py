@@ -6,7 +6,7 @@ import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
-from bins_helpers import LOAD_N, TRUE, make_bins, make_traces, warm
+from bins_helpers import LOAD_N, TRUE, TWO_FOLDS, make_bins, make_traces, warm
 
 from sealfit.closure.confirm import TOO_SMALL
 from sealfit.closure.loop import close_loop
@@ -25,8 +25,8 @@ CHANNELS = {
 SCATTER = {"setup": 0.005, "specimen": 0.01, "run_channels": CHANNELS}
 
 
-def close(bins):
-    return close_loop(bins, make_traces(bins), Config())
+def close(bins, config=None):
+    return close_loop(bins, make_traces(bins), config or Config())
 
 
 @pytest.fixture(scope="module")
@@ -261,7 +261,7 @@ def of_two_loads(**options):
 
 def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load():
     bins = of_two_loads(temperatures=(60.0,), days=(4.0,), bins=3, **SCATTER)
-    (found,) = close(bins).document["effects"]
+    (found,) = close(bins, TWO_FOLDS).document["effects"]
     assert (found["id"], found["channels"][-1]) == ("power_viscous", "speed_mm_s")
     values = {p["name"]: p["value"] for p in found["parameters"]}
     assert values["n"] == pytest.approx(2.0, abs=0.3)

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from bins_helpers import make_bins, make_traces
+from bins_helpers import TWO_FOLDS, make_bins, make_traces
 
 from sealfit.closure.channels import find_channels
 from sealfit.closure.loop import close_loop
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search, search_masked_pairs, search_pairs
-from sealfit.config import Config
 from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
@@ -50,7 +49,7 @@ def test_pairs_of_chance_are_not_found_too_often():
 
 def test_growth_in_one_direction_is_found_and_named():
     bins = make_bins(1, repeats=1, effect=one_way, **ONE)
-    effects = close_loop(bins, make_traces(bins), Config()).document["effects"]
+    effects = close_loop(bins, make_traces(bins), TWO_FOLDS).document["effects"]
     (effect,) = [
         e for e in effects if e["channels"] != ["direction"]
     ]  # from one direction to the other, mu may differ
@@ -66,7 +65,7 @@ def test_a_wrong_piston_area_is_an_offset_that_changes_with_pressure():
         run_channels=PRESSURE,
         effect=lambda table, force: force + 0.35 * (table["pressure_bar"].to_numpy() - 4),
     )  # fmt: skip
-    (effect,) = close_loop(bins, make_traces(bins), Config()).document["effects"]
+    (effect,) = close_loop(bins, make_traces(bins), TWO_FOLDS).document["effects"]
     assert effect["id"] in ("linear", "offset_slope")  # the offset is zero near the mean pressure
     assert (set(effect["channels"]), effect["acts_on"]) == ({"pressure_bar", "direction"}, "force")
     assert effect["parameters"][0]["value"] == pytest.approx(0.35, rel=0.1)
@@ -77,5 +76,5 @@ def test_an_offset_and_an_asymmetry_of_sigma_2_enter_together():
         return force - 1 + 0.015 * np.abs(table["speed_mm_s"].to_numpy())
 
     bins = make_bins(0, repeats=1, effect=askew, **ONE)
-    effects = close_loop(bins, make_traces(bins), Config()).document["effects"]
+    effects = close_loop(bins, make_traces(bins), TWO_FOLDS).document["effects"]
     assert {(e["id"], e["acts_on"]) for e in effects} == {("zero_offset", "force"), ("asymmetry", "sigma_2")}
