@@ -12,6 +12,8 @@ from user_effects import WORN_PATCH
 from sealfit import commands
 from sealfit.errors import ConfigError, RequestError, StaleError
 from sealfit.pipeline import run, single
+from sealfit.report.drawing import Drawn
+from sealfit.report.style import Plot
 from sealfit.simulation import load_spec, simulate
 from sealfit.store.manifest import ConfigCopy, fingerprint
 from sealfit.store.paths import own_effects_folder
@@ -32,6 +34,11 @@ sd_N = 0.2
 RAN = "from pathlib import Path\nPath({mark!r}).write_text('ran')\n"
 
 
+def undrawn(plot: Plot) -> Drawn:
+    """Stand for `draw` in reports that nobody looks at."""
+    return Drawn("<svg/>", b"", b"", ("<svg/>",) * len(plot.panels))
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A campaign, its results, and a folder of own effects that the config names."""
@@ -41,7 +48,9 @@ def made(tmp_path_factory):
     (home / "mine").mkdir()
     (home / "mine" / "patch.py").write_text(WORN_PATCH)
     (home / "rig.toml").write_text("[loop]\neffects_folder = 'mine'\nmax_rounds = 1\n")
-    run(home / "campaign", home / "out", home / "rig.toml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sealfit.report.page.draw", undrawn)
+        run(home / "campaign", home / "out", home / "rig.toml")
     points = pd.read_csv(home / "campaign" / "runs.csv").iloc[[0]].assign(displacement_mm=20.0)
     points[
         ["temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s", "displacement_mm"]
@@ -96,9 +105,7 @@ def predicted(home: Path, **options) -> pd.Series:
 
 # ---------------------------------------------------------------- what OUT brings along is not run
 def test_a_folder_named_in_the_model_or_the_state_of_out_is_never_run(home, monkeypatch):
-    monkeypatch.setattr(
-        "sealfit.report.drawing._saved", lambda *given, **options: b"<svg/>"
-    )  # four reports that nobody looks at
+    monkeypatch.setattr("sealfit.report.page.draw", undrawn)
     out = home / "out"
     marks = [evil(out / "evil"), evil(home / "elsewhere")]
     for folder in (out / "evil", home / "elsewhere"):
