@@ -30,13 +30,24 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 
 
-@pytest.fixture
-def dask(tmp_path):
-    made = DaskHere(tmp_path, workers=2, paths=(HERE, ROOT / "benchmarks"))
+def started(folder):
+    """A scheduler and two workers, stopped in the end."""
+    made = DaskHere(folder, workers=2, paths=(HERE, ROOT / "benchmarks"))
     try:
         yield made.wait()
     finally:
         made.stop()
+
+
+@pytest.fixture(scope="module")
+def left_whole(tmp_path_factory):
+    """A cluster for tests that kill nothing of it."""
+    yield from started(tmp_path_factory.mktemp("dask"))
+
+
+@pytest.fixture
+def dask(tmp_path):
+    yield from started(tmp_path)
 
 
 def square(number):
@@ -65,10 +76,11 @@ def fatal(number):
     os._exit(1)
 
 
-def test_a_map_runs_on_the_cluster_in_order(dask):
-    with on_cluster(str(dask.file)):
+def test_a_map_runs_on_the_cluster_in_order(left_whole):
+    with on_cluster(str(left_whole.file)):
         assert list(run_map(square, range(50))) == [n * n for n in range(50)]
-        assert set(run_map(process_id, range(20), together=1)) <= {worker.pid for worker in dask.workers}
+        pids = {worker.pid for worker in left_whole.workers}
+        assert set(run_map(process_id, range(20), together=1)) <= pids
         with pytest.raises(RequestError, match="0 is wrong"):
             list(run_map(wrong, range(3)))
     assert set(run_map(process_id, range(3))) == {os.getpid()}
@@ -78,9 +90,9 @@ def process_id(_):
     return os.getpid()
 
 
-def test_an_answer_that_comes_as_the_wait_ends_is_taken(dask, monkeypatch):
+def test_an_answer_that_comes_as_the_wait_ends_is_taken(left_whole, monkeypatch):
     monkeypatch.setattr("sealfit.engine.cluster.LOOK_S", 0.02)
-    with on_cluster(str(dask.file)):
+    with on_cluster(str(left_whole.file)):
         assert list(run_map(answer_late, range(120), together=1)) == list(range(120))
         with pytest.raises(TimeoutError, match="too slow"):
             list(run_map(timed_out, range(2)))
@@ -113,10 +125,10 @@ def test_work_that_kills_every_worker_is_a_clear_error(dask, monkeypatch):
         list(run_map(fatal, range(1)))
 
 
-def test_a_folder_that_workers_do_not_see_is_refused(dask, tmp_path):
+def test_a_folder_that_workers_do_not_see_is_refused(left_whole, tmp_path):
     with (
         pytest.raises(RequestError, match=r"does not see the folder.*all workers share"),
-        on_cluster(str(dask.file), tmp_path / "nowhere"),
+        on_cluster(str(left_whole.file), tmp_path / "nowhere"),
     ):
         pass
 
