@@ -121,8 +121,8 @@ class ParameterTable:
 
     @property
     def width(self) -> int:
-        """Number of columns of a parameter."""
-        return 1 if self.single else 4 if self.compared else 3
+        """Number of columns of a parameter: the value above that before, the interval above u_sys."""
+        return 1 if self.single else 2
 
 
 def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:

@@ -234,15 +234,21 @@ function quoted(cell) {
   return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
 
+// The lines of a cell that has several values, each a column of the saved table, or the cell.
+function parts(cell) {
+  const lines = cell.querySelectorAll(".part");
+  return lines.length ? [...lines] : [cell];
+}
+
 function csv(table) {
   const rows = [...table.rows].map(row => [...row.cells].flatMap(cell =>
-    [quoted(plain(cell.textContent)), ...Array(cell.colSpan - 1).fill("")]).join(","));
+    [...parts(cell).map(one => quoted(plain(one.textContent))), ...Array(cell.colSpan - 1).fill("")]).join(","));
   return rows.join("\r\n") + "\r\n";
 }
 
 function sorted(table, column, falling) {
   const body = table.tBodies[0], rows = [...body.rows], sign = falling ? -1 : 1;
-  const key = row => plain(row.cells[column]?.textContent ?? "");
+  const key = row => plain(row.cells[column] ? parts(row.cells[column])[0].textContent : "");
   const number = text => (/^[-+.\d]/.test(text) ? parseFloat(text) : NaN);
   rows.sort((one, other) => {
     const [a, b] = [key(one), key(other)], [x, y] = [number(a), number(b)];

@@ -1,5 +1,6 @@
 """The page in a browser: nothing is wider than the window, every image shows, and its script works."""
 
+import csv
 import html
 import json
 import re
@@ -8,7 +9,7 @@ import subprocess
 from functools import cache
 
 import pytest
-from report.made_campaigns import aging_campaign, not_run, torque_campaign
+from report.made_campaigns import HIGHER, after_campaign, aging_campaign, not_run, torque_campaign
 
 from sealfit.report.page import build_report
 
@@ -27,7 +28,8 @@ frame.onload = () => {
   const drawings = [...page.querySelectorAll(".panels svg")], all = images.length + drawings.length;
   const shown = images.filter(i => i.complete && i.naturalWidth > 0).length
     + drawings.filter(d => d.getBoundingClientRect().width > 100).length;
-  document.title = ["measured", root.clientWidth, root.scrollWidth, right, shown, all].join(" ");
+  const cut = [...page.querySelectorAll(".params")].filter(t => t.offsetWidth > t.parentElement.clientWidth);
+  document.title = ["measured", root.clientWidth, root.scrollWidth, right, shown, all, cut.length].join(" ");
 };
 frame.srcdoc = PAGE;
 document.body.append(frame);
@@ -83,7 +85,10 @@ frame.onload = () => {
   frame.contentWindow.Blob = function (parts) { found.csv = parts.join(""); };
   frame.contentWindow.URL.createObjectURL = () => "blob:none";
   frame.contentWindow.HTMLAnchorElement.prototype.click = function () { found.name = this.download; };
-  [...page.querySelectorAll("#errors .tools button")].find(b => b.textContent === "CSV").click();
+  const save = id => page.querySelector(id + " .tools button + button").click();
+  save("#parameters");
+  found.parameters = found.csv;
+  save("#errors");
   const ids = [...page.querySelectorAll("[id]")].map(e => e.id);
   found.single = new Set(ids).size === ids.length;
   document.title = "driven " + JSON.stringify(found);
@@ -96,15 +101,16 @@ pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium on PATH")
 
 
 @pytest.mark.parametrize("width", [1400, 800, 400])
-@pytest.mark.parametrize("make", [aging_campaign, torque_campaign, not_run])
+@pytest.mark.parametrize("make", [aging_campaign, after_campaign, torque_campaign, not_run])
 def test_nothing_overflows_and_every_image_shows(make, width, tmp_path):
     shown = loaded(FRAME.replace("WIDTH", str(width)), html_of(make), tmp_path)
-    found = re.search(r"<title>measured (\d+) (\d+) (\d+) (\d+) (\d+)</title>", shown)
-    client, scroll, right, shown, images = map(int, found.groups())
+    found = re.search(r"<title>measured (\d+) (\d+) (\d+) (\d+) (\d+) (\d+)</title>", shown)
+    client, scroll, right, shown, images, cut = map(int, found.groups())
     assert client == width
     assert scroll <= width
     assert right <= width
     assert shown == images > 0
+    assert cut == 0 or width < 1400
 
 
 @cache
@@ -113,7 +119,7 @@ def html_of(make):
 
 
 def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_path):
-    shown = loaded(DRIVE, html_of(aging_campaign), tmp_path)
+    shown = loaded(DRIVE, html_of(after_campaign), tmp_path)
     found = json.loads(html.unescape(re.search(r"<title>driven (.*?)</title>", shown, re.S)[1]))
     assert (found["hidden"], found["shown"]) == ("hidden", "visible")
     assert re.match(r"(before|after): .* N\n", found["tip"])
@@ -130,13 +136,17 @@ def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_p
     assert found["name"] == "Errors_before_and_after.csv"
     lines = found["csv"].removeprefix("\ufeff").splitlines()
     assert len({line.count(",") for line in lines if '"' not in line}) == 1
+    parameters = list(csv.reader(found["parameters"].removeprefix("\ufeff").splitlines()))
+    assert parameters[0][:6] == ["condition", "μs", "before", "95 %", "usys", "μc"]
+    assert len(parameters[0]) == len(parameters[1]) == 1 + 4 * 4
+    assert float(parameters[1][1]) == pytest.approx(HIGHER * float(parameters[1][2]), abs=2e-3)
     assert found["single"]
 
 
 def test_without_scripts_the_page_is_whole(tmp_path):
     inert = html_of(aging_campaign).replace("<script>", '<script type="text/plain">')
     shown = loaded(FRAME.replace("WIDTH", "1200"), inert, tmp_path)
-    images = re.search(r"<title>measured 1200 1200 \d+ (\d+) (\d+)</title>", shown)
+    images = re.search(r"<title>measured 1200 1200 \d+ (\d+) (\d+) \d+</title>", shown)
     assert images[1] == images[2] == str(html_of(aging_campaign).count("<img"))
 
 
