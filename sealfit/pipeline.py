@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
-CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
+CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "shape_points",
+          "curves")  # fmt: skip
 FITS = {
     "fit-steady": ("steady_fit", "steady_covariance", "steady_shift"),
     "fit-aging": ("aging_fit", "aging_covariance", "aging_curves", "aging_laws", "master_curve"),

@@ -309,6 +309,15 @@ SHAPES = table(
     Column("free", "the free smooth shape at x, null where none was fitted"),
     Column("unit", "unit of value, lo95, hi95 and free", TEXT),
 )
+SHAPE_POINTS = table(
+    "shape_points",
+    Column("effect", "row in closure.json's effects, from 0", INT),
+    Column("channel", "channel drawn along", TEXT),
+    Column("x", "middle of the group of channel values; null for a category"),
+    Column("label", "the category, or null", TEXT),
+    Column("value", "partial residual: shape plus mean residual, in the shape's unit; null without one"),
+    Column("se", "its standard error, from whole files, or from the strokes of a single one"),
+)
 CURVES = table(
     "curves",
     CONDITION,
@@ -393,7 +402,7 @@ AGING_CURVES = table(
 _INGESTED = (INPUTS, RUNS, QUALITY, TRACES, TRACES_MEAN, STEADY, BINS)
 _FITTED = (STEADY_FIT, AGING_FIT, AGING_CURVES, AGING_LAWS, MASTER_CURVE, DYNAMIC_FIT, DYNAMIC_CURVES)
 _BESIDE = (STEADY_COVARIANCE, STEADY_SHIFT, AGING_COVARIANCE)  # of the parameters of a fit
-_LOOP = (EFFECTS, RESIDUALS_BEFORE, RESIDUALS_AFTER, LEVELS, CHANNELS, SHAPES, CURVES)
+_LOOP = (EFFECTS, RESIDUALS_BEFORE, RESIDUALS_AFTER, LEVELS, CHANNELS, SHAPES, SHAPE_POINTS, CURVES)
 AFTER = (STEADY_AFTER, *(replace(fitted, name=f"{fitted.name}_after") for fitted in _FITTED))
 _BESIDE_AFTER = tuple(replace(beside, name=f"{beside.name}_after") for beside in _BESIDE)
 _ALL = (*_INGESTED, *_FITTED, PROPERTY_VALUES, *_BESIDE, *_LOOP, *AFTER, *_BESIDE_AFTER)

@@ -7,6 +7,7 @@ import pandas as pd
 from small_tables import small
 
 from sealfit.errors import Fault
+from sealfit.pipeline import CLOSED
 from sealfit.store.manifest import fingerprint
 from sealfit.tables import AFTER
 
@@ -132,11 +133,10 @@ class Parts:
         self._called("close-loop", config)
         self.workers = workers
         on_progress("trying ripple along displacement_mm")
-        names = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "curves")
         return SimpleNamespace(
             document=self.closure,
             model={"ready": True},
-            tables={name: small(name) for name in names},
+            tables={name: small(name) for name in CLOSED},
             after=None,
         )
 

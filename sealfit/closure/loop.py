@@ -16,7 +16,7 @@ from sealfit.closure.forms import describe
 from sealfit.closure.heldout import covered, folds, heldout_level
 from sealfit.closure.intervals import mean_se
 from sealfit.closure.outlier_files import outlier_files
-from sealfit.closure.output import channel_table, curve_table, shape_table, to_record
+from sealfit.closure.output import channel_table, curve_table, shape_points, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
 from sealfit.closure.ripple_selection import numbered, steady_samples
 from sealfit.closure.selection import Selection, Start, select_effects
@@ -132,10 +132,12 @@ def _drawn_tables(
         level_table("before", before, list(selection.first)),
         level_table("after", after, list(selection.last)),
     ]
+    shapes = shape_table(after, config)
     return {
         "levels": pd.concat(levels, ignore_index=True),
         "channels": channel_table(selection, before, after),
-        "shapes": shape_table(after, config),
+        "shapes": shapes,
+        "shape_points": shape_points(after, shapes),
         "curves": curve_table(before, after),
     }
 

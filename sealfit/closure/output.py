@@ -29,7 +29,7 @@ from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
 from sealfit.fit.joint.rows import Rows, open_columns, point_rows
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.store.paths import needed
-from sealfit.tables import CHANNELS, CURVES, SHAPES
+from sealfit.tables import CHANNELS, CURVES, SHAPE_POINTS, SHAPES
 
 # ---------------------------------------------------------------- model record
 # The fitted model as plain data for `predict`, written to OUT/model.json.
@@ -168,6 +168,7 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
 
 GROUPS = 12  # Groups of a numeric channel in the residual plot.
 POINTS = 60  # Points of a plotted curve.
+PERIODS = 4  # Periods of a periodic effect that are drawn.
 
 
 def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
@@ -177,18 +178,7 @@ def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.Dat
     records = []
     for name, known in selection.channels.items():
         values = rows.values(name) if name != "speed_mm_s" else np.abs(rows.speed)
-        if known.numeric:
-            edges = np.unique(np.quantile(values, np.linspace(0, 1, GROUPS + 1)))
-            distinct = np.unique(values)
-            if distinct.size <= GROUPS:
-                code, middle = np.searchsorted(distinct, values), distinct
-            else:
-                code = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
-                middle = np.bincount(code, values) / np.maximum(np.bincount(code), 1)
-            labels: list = [None] * middle.size
-        else:
-            labels, code = np.unique(values, return_inverse=True)
-            middle = [None] * len(labels)
+        code, middle, labels = _grouped(values, numeric=known.numeric)
         for group in np.unique(code):
             inside = code == group
             record = {"channel": name, "x": middle[group], "label": labels[group], "n": int(inside.sum())}
@@ -201,6 +191,19 @@ def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.Dat
                 record[f"{stage}_run"] = _farthest(runs[inside], weight, residual)
             records.append(record)
     return pd.DataFrame(records, columns=CHANNELS.names())
+
+
+def _grouped(values: np.ndarray, *, numeric: bool, groups: int = GROUPS) -> tuple[np.ndarray, list, list]:
+    """Return the group of each value, and the middle and label of each group, None where it has none."""
+    distinct, code = np.unique(values, return_inverse=True)
+    if not numeric:
+        return code, [None] * distinct.size, list(distinct)
+    if distinct.size <= groups:
+        return code, list(distinct), [None] * distinct.size
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, groups + 1)))
+    code = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
+    middle = np.bincount(code, values) / np.maximum(np.bincount(code), 1)
+    return code, list(middle), [None] * middle.size
 
 
 def _farthest(run: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> str:
@@ -244,6 +247,42 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
     return pd.DataFrame(records, columns=SHAPES.names())
 
 
+def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
+    """Return the partial residuals of each effect: its shape, of table `shapes`, plus the mean residual.
+
+    The residual is divided by the force's derivative with respect to the shape, by weighted least squares in
+    groups of the first channel's values (Larsen and McCleary 1972, Technometrics 14(3), 781-790). Standard
+    errors are from whole files, or from the strokes of a single one. Of a periodic effect all periods are
+    shifted onto those that are drawn.
+    """
+    rows, parts = after.rows, []
+    units = rows.codes("file" if rows.groups.starts["file"].size > 1 else "stroke")
+    for number, term in enumerate(after.model.terms):
+        own = shapes[shapes["effect"] == number]
+        values, numeric = term.inputs(rows)[term.effect.reads[0]], bool(own["label"].isna().all())
+        known = np.isfinite(values) if numeric else np.full(values.size, True)
+        if numeric:
+            low, high = own["x"].min(), own["x"].max()
+            values = np.where(values > high, low + (values - low) % ((high - low) or 1.0), values)
+        groups = PERIODS * GROUPS if term.effect.periodic else GROUPS
+        code, x, labels = _grouped(values[known], numeric=numeric, groups=groups)
+        slope, residual = after.slope(*term.target)[known], after.residual[known]
+        weighted, unit = rows.weight[known] * slope, units[known]
+        size = np.bincount(code, weighted * slope)
+        size[size <= 0] = np.nan
+        change = np.bincount(code, weighted * residual) / size
+        left = np.zeros((size.size, unit.max() + 1))
+        np.add.at(left, (code, unit), weighted * (residual - slope * change[code]))
+        shape = (
+            np.interp(x, own["x"], own["value"]) if numeric else own.set_index("label").loc[labels, "value"]
+        )
+        part = 1 + np.asarray(shape) if term.operation == "multiply" else 1.0  # which the slope has in it
+        se = np.abs(part) * np.sqrt((left**2).sum(axis=1)) / size
+        found = {"effect": number, "channel": term.channels[0], "x": x, "label": labels}
+        parts.append(pd.DataFrame({**found, "value": shape + part * change, "se": se}))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=SHAPE_POINTS.names())
+
+
 def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
     """Return inputs along a term's first channel, others at their means, and its values or categories."""
     rows = after.rows
@@ -255,7 +294,7 @@ def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
     values = np.abs(values) if first == "speed_mm_s" else values
     low, high = float(values.min()), float(values.max())
     if "lambda_" in after.model.values[after.model.terms.index(term)]:
-        high = min(high, low + 4 * after.model.values[after.model.terms.index(term)]["lambda_"])
+        high = min(high, low + PERIODS * after.model.values[after.model.terms.index(term)]["lambda_"])
     distinct = np.unique(values)
     x = (
         distinct

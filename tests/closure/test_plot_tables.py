@@ -3,10 +3,14 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.closure.channels import find_channels
-from sealfit.closure.output import POINTS, channel_table, curve_table
+from sealfit.closure.channels import Channel, find_channels
+from sealfit.closure.forms import free_term
+from sealfit.closure.output import GROUPS, POINTS, channel_table, curve_table, shape_points, shape_table
 from sealfit.closure.selection import Selection
+from sealfit.config import Config
+from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.start import start_model
 
@@ -43,3 +47,26 @@ def test_a_mean_residual_names_the_run_that_is_farthest_from_the_model():
     along = table[(table["channel"] == "displacement_mm")]
     assert set(along["before_run"]) == set(along["after_run"]) == {far}
     assert (table["before_run"].isin(set(bins["run_id"]))).all()
+
+
+def test_partial_residuals_follow_the_data_where_the_shape_does_not():
+    bins = bins_helpers.make_bins(repeats=2, temperatures=(60.0,), directions=(1, -1), noise_N=0.02, gain=0.0)
+    bins["batch"] = np.where(bins["repeat"] == 2, "B", "A")
+    bins["force_N"] *= 1 + 0.04 * (bins["distance_mm"] / 40) ** 2
+    bins["force_N"] += np.where(bins["batch"] == "B", 1.0, 0.0)
+    rows = make_rows(bins, has_aging=True)
+    batch = free_term(Channel("batch", rows.values("batch"), "file"), "force", "add")
+    line = Term(EFFECTS["linear"], ("distance_mm",), "mu", "multiply", {"x_ref": 20.0})
+    model = start_model(rows).with_term(line, {"A": 0.0})
+    fitted = fit(model.with_term(batch, {p.name: 0.0 for p in batch.effect.parameters}), rows)
+    shapes = shape_table(fitted, Config())
+    points = shape_points(fitted, shapes)
+    along, levels = (points[points["effect"] == number] for number in (0, 1))
+    assert len(along) == GROUPS
+    bent = 0.04 * (along["x"] / 40) ** 2
+    assert np.ptp(along["value"] - bent) < 0.002
+    straight = np.interp(along["x"], *shapes.loc[shapes["effect"] == 0, ["x", "value"]].to_numpy(float).T)
+    assert np.ptp(straight - bent) > 0.008
+    assert along["se"].between(0.0005, 0.002).all()
+    assert levels["label"].tolist() == ["A", "B"]
+    assert np.diff(levels["value"]) == pytest.approx(1.0, abs=0.02)

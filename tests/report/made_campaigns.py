@@ -21,6 +21,7 @@ from report.made_tables import (
     levels,
     quality,
     residuals,
+    shape_points,
     shapes,
     steady_rows,
     table,
@@ -52,6 +53,7 @@ NAMES = (
     "levels",
     "channels",
     "shapes",
+    "shape_points",
     "curves",
 )
 PROVENANCE = {
@@ -209,7 +211,7 @@ def aging_campaign(
         "curves": curves(fits, speeds, drop),
     }
     if verdict == "closed":
-        tables["shapes"] = shapes()
+        tables["shapes"], tables["shape_points"] = shapes(), shape_points()
         tables["effects"] = effects(closure)
     return Made(tables, closure, {**PROVENANCE, "inputs": inputs(steady["file"])}, config)
 
@@ -364,6 +366,7 @@ def not_run(**options):
         "levels",
         "channels",
         "shapes",
+        "shape_points",
         "curves",
         "aging_curves",
         "aging_fit",

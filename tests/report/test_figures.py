@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from report.made_campaigns import Made, aging_campaign, not_run, torque_campaign
-from report.made_tables import DROP, empty, shapes, table
+from report.made_tables import DROP, empty, shape_points, shapes, table
 
 from sealfit.config import Config
 from sealfit.report.drawing import draw
@@ -32,7 +32,7 @@ from sealfit.report.figures.residual import (
     run_means,
 )
 from sealfit.report.figures.speed import curve_lines, force_speed, run_points
-from sealfit.report.style import Key, Panel, Plot, compose, is_logarithmic, panel_figure, value_ticks
+from sealfit.report.style import AFTER, Key, Panel, Plot, compose, is_logarithmic, panel_figure, value_ticks
 from sealfit.units import Units
 
 TORQUE = Units(
@@ -250,6 +250,19 @@ def test_a_factor_is_drawn_in_percent(ax, made):
     draw_shape(ax, shapes(), made.closure["effects"][0], Units())
     assert ax.get_ylabel() == r"change of $\mu$ (%)"
     npt.assert_allclose(ax.lines[-1].get_ydata()[-1], -100 * DROP, rtol=1e-6)
+
+
+def test_partial_residuals_lie_behind_an_effect(ax, made):
+    points = shape_points()
+    draw_shape(ax, shapes(), made.closure["effects"][0], Units(), points)
+    drawn = ax.containers[0]
+    npt.assert_allclose(drawn.lines[0].get_xydata(), np.stack([points["x"], 100 * points["value"]], axis=1))
+    npt.assert_allclose(np.ptp(drawn.lines[2][0].get_segments()[0][:, 1]), 2 * 1.959964 * 0.05)
+    assert drawn.lines[0].get_zorder() < min(
+        line.get_zorder() for line in ax.lines if line.get_color() == AFTER
+    )
+    legend = draw_all(made.tables, made.closure, made.config)["effect_shapes"].legend
+    assert "partial residual" in legend[-1].label
 
 
 def test_an_added_force_has_its_unit(ax, made):

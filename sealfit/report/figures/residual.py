@@ -311,10 +311,13 @@ def _span(channels: pd.DataFrame) -> tuple[float, float]:
 
 
 # ---------------------------------------------------------------- shapes of effects
-def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> None:
+def draw_shape(
+    ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units, points: pd.DataFrame | None = None
+) -> None:
     """Draw an effect along one channel: its form with the 95 % band, and the free shape it was compared with.
 
-    `rows` are those of table `shapes` of this effect and channel, `effect` is its entry in closure.json.
+    `rows` are those of table `shapes` of this effect and channel, `effect` is its entry in closure.json. The
+    partial residuals are `points`, rows of table `shape_points`.
     """
     channel, scale = rows["channel"].iloc[0], shape_scale(effect)
     numeric = rows["x"].notna().all() and channel != "direction"
@@ -336,6 +339,12 @@ def draw_shape(ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units) -> N
         ax.errorbar(x, value, spread, color=AFTER, fmt="o", elinewidth=1.4, capsize=2.0)
         ax.plot(x, free, color=FLOOR, marker="_", linestyle="", markersize=12)
         category_ticks(ax, categories(rows, channel))
+    if points is not None and len(points):
+        places = points["x"] if numeric else np.arange(len(points)) + 0.15
+        ax.errorbar(
+            places, scale * points["value"], Z95 * scale * points["se"], color=FLOOR, fmt="o", markersize=2.6,
+            elinewidth=0.8, capsize=1.5, zorder=1.5,
+        )  # fmt: skip
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
     ax.set_ylabel(shape_label(rows, effect, units, symbol_math))
 
@@ -360,14 +369,15 @@ def shape_label(
 
 def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
     """Return the shape of every effect, a panel for each channel it is drawn along; None if there is none."""
-    shapes = tables["shapes"]
+    shapes, points = tables["shapes"], tables["shape_points"]
     if closure is None or shapes.empty:
         return None
     panels = []
     for (index, channel), rows in shapes.groupby(["effect", "channel"], sort=False):
         effect = closure["effects"][int(index)]
         rows = rows.sort_values("x") if rows["x"].notna().all() else rows
-        draw = partial(draw_shape, rows=rows, effect=effect, units=config.units)
+        own = points[(points["effect"] == index) & (points["channel"] == channel)]
+        draw = partial(draw_shape, rows=rows, effect=effect, units=config.units, points=own)
         scale = shape_scale(effect)
         words = effect_label(effect, config.units)
         alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
@@ -377,4 +387,6 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, c
     legend = [Key("effect, 95 % band", AFTER)]
     if shapes["free"].notna().any():
         legend.append(Key("free shape", FLOOR, "dashed"))
+    if len(points):
+        legend.append(Key("partial residual: effect plus mean residual, 95 %", FLOOR, "point"))
     return Plot("effect_shapes", "Shapes of the effects", tuple(panels), tuple(legend))
