@@ -31,7 +31,7 @@ from sealfit.report.figures.residual import (
     draw_shape,
     run_means,
 )
-from sealfit.report.figures.speed import curve_lines, force_speed, run_points
+from sealfit.report.figures.speed import curve_lines, draw_starts, force_speed, run_points
 from sealfit.report.style import AFTER, Key, Panel, Plot, compose, is_logarithmic, panel_figure, value_ticks
 from sealfit.units import Units
 
@@ -322,6 +322,20 @@ def test_letters_that_the_font_lacks_become_text():
 def test_the_same_tables_give_the_same_bytes(made):
     plot = draw_all(made.tables, made.closure, made.config)["variance_levels"]
     assert draw(plot) == draw(plot)
+
+
+def test_a_model_of_few_points_is_drawn_without_corners(ax):
+    x = np.linspace(0.1, 2.5, 13)
+    rise = 30 * (1 - np.exp(-4 * x))
+    rows = {"condition": "a", "speed_set_mm_s": 1.0, "direction": 1, "distance_mm": x, "model_N": rise}
+    draw_starts(ax, pd.DataFrame({**rows, "force_N": rise, "force_se_N": 0.1}), {1.0: "#0072B2"}, Units())
+    fine, drawn = ax.lines[-1].get_data()
+    assert len(fine) == 6 * 12 + 1
+    npt.assert_allclose(drawn[::6], rise)
+    off, straight = (
+        np.abs(y - 30 * (1 - np.exp(-4 * fine))).max() for y in (drawn, np.interp(fine, x, rise))
+    )
+    assert off < 0.25 * straight
 
 
 def test_a_panel_of_the_page_holds_all_that_it_uses_and_nothing_of_its_neighbours(made):

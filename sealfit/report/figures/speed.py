@@ -302,6 +302,8 @@ def _level_label(name: str, level: str, names: ConditionNames) -> str:
 
 MOST_START_PANELS = 6
 MOST_SPEEDS = 3
+COARSE = 60  # points with which a curve shows corners
+FINER = 6  # pieces that it is then drawn with between two points
 UP = 0.98  # share of the last force at which a start counts as over
 BEYOND = 1.5  # of that distance is shown
 
@@ -321,10 +323,21 @@ def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], un
             x, force, linestyle="", marker=marker, markersize=2.6, color=colour, markerfacecolor=face,
             markeredgewidth=0.7,
         )  # fmt: skip
-        ax.plot(x, curve["model_N"], color=colour, linestyle=line)
+        ax.plot(*_smooth(x, curve["model_N"]), color=colour, linestyle=line)
     ax.set_xlim(0.0, _reach(curves))
     ax.set_xlabel(plain(units.label("distance_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
+
+
+def _smooth(x: pd.Series, y: pd.Series) -> tuple[np.ndarray, np.ndarray]:
+    """Return finer points between the known ones of a curve, by monotone cubic interpolation."""
+    from scipy.interpolate import PchipInterpolator
+
+    x, y = x[y.notna()].to_numpy(float), y.dropna().to_numpy(float)
+    if not 2 < len(x) <= COARSE:
+        return x, y
+    fine = np.interp(np.linspace(0, len(x) - 1, FINER * (len(x) - 1) + 1), np.arange(len(x)), x)
+    return fine, PchipInterpolator(x, y)(fine)
 
 
 def _reach(curves: pd.DataFrame) -> float:
