@@ -34,7 +34,7 @@ MADE = {"ingest": INGESTED, **FITS, "close-loop": (*CLOSED, *AFTER)}  # tables b
 TABLES = tuple(name for names in MADE.values() for name in names)
 OF_PROPERTIES = ("property_values", "aging_fit", "aging_curves", "aging_laws", "master_curve")
 BESIDE = ("steady_covariance", "steady_shift", "aging_covariance")  # of the parameters of a fit
-UNREPORTED = (  # of many rows, and nothing in the report needs them
+UNREPORTED = (  # of many rows, and the report needs nothing of them but a few traces
     "traces", "bins", "steady_after", *BESIDE, *(f"{name}_after" for name in BESIDE),
 )  # fmt: skip
 TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
@@ -328,18 +328,22 @@ def report_tables(store: Store) -> dict[str, pd.DataFrame]:
         return {name: store.read(name) for name in OF_PROPERTIES}
     names = [name for name in TABLES if name not in (*UNREPORTED, "traces_mean")]
     tables = {name: store.read(name, REPORTED.get(name)) for name in names}
-    return {**tables, "traces_mean": _example_traces(store, tables["runs"])}
+    return {**tables, **_example_traces(store, tables["runs"])}
 
 
-def _example_traces(store: Store, runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the averaged traces that the report draws; the table has hundreds of rows for every run."""
-    from sealfit.report.figures.aging import example_runs
+def _example_traces(store: Store, runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the averaged traces that the report draws, and repeats of them, as both tables are large."""
+    from sealfit.report.figures.aging import MOST_REPEATS, example_runs
 
     names = ["run_id", "condition"]
     places = store.read("traces_mean", names, coded=names).drop_duplicates("run_id").astype(object)
     chosen = example_runs(places, runs)["run_id"].tolist()
-    traces = store.read("traces_mean", TRACE, where={"run_id": chosen})
-    return traces.sort_values("run_id", key=lambda names: names.map(chosen.index), kind="stable")
+    means = store.read("traces_mean", TRACE, where={"run_id": chosen})
+    means = means.sort_values("run_id", key=lambda names: names.map(chosen.index), kind="stable")
+    used = runs.loc[runs["used"].astype(bool) & runs["run_id"].isin(chosen)]
+    strokes = used.groupby("run_id").head(MOST_REPEATS)[["file", "stroke", "run_id", "direction"]]
+    names, files = ["file", "stroke", "displacement_mm", "force_N"], strokes["file"].unique().tolist()
+    return {"traces_mean": means, "traces": strokes.merge(store.read("traces", names, where={"file": files}))}
 
 
 _WORK: dict[str, Callable[[Store, Staged, Options, Silent], Counted]] = {

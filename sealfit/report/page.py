@@ -162,7 +162,7 @@ def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict
 # ---------------------------------------------------------------- page
 
 TABLES = (
-    "inputs", "runs", "quality", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves",
+    "inputs", "runs", "quality", "traces", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves",
     "aging_laws", "property_values", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
     "residuals_before", "residuals_after", "levels", "channels", "shapes", "shape_points",
     "curves",

@@ -195,6 +195,18 @@ def test_trace_shades_its_steady_window(ax):
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("angle (turn)", "torque (mN m)")
 
 
+def test_single_repeats_lie_behind_their_mean(made):
+    (panel, *_), runs = (plot := traces_mean(made.tables, made.config)).panels, made.tables["traces_mean"]
+    repeats = made.tables["traces"][made.tables["traces"]["run_id"] == runs["run_id"].iloc[0]]
+    lines = panel_figure(panel).axes[0].lines
+    single, mean = lines[:3], lines[-1]
+    for line, (_, own) in zip(single, repeats.groupby("file"), strict=True):
+        npt.assert_array_equal(line.get_ydata(), own["force_N"])
+        assert line.get_zorder() < mean.get_zorder()
+        assert line.get_linewidth() < mean.get_linewidth()
+    assert "single repeats, up to 6" in [key.label for key in plot.legend]
+
+
 def test_scaled_days_are_plain_numbers(ax):
     known = {"kind": "value", "quantity": "mu_s", "temperature_C": 60.0, "compression_ratio_pct": 80.0}
     rows = pd.DataFrame({**known, "scaled_days": [0.0, 1.0, 30.0], "value": [0.9, 0.8, 0.7], "lo95": np.nan})

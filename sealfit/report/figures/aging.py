@@ -51,6 +51,8 @@ from sealfit.units import Units
 
 TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
 MOST_TRACES = 6
+MOST_REPEATS = 6  # of a run that are drawn behind their mean, thinner than it
+REPEAT_BUCKETS = 120
 UNCORRECTED = Key("before, without the effects", FLOOR, "dotted")
 
 
@@ -183,11 +185,15 @@ def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: Con
 
 
 # ---------------------------------------------------------------- averaged traces
-def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units) -> None:
+def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units, repeats: pd.DataFrame | None = None) -> None:
     """Draw one run's mean force along its displacement with its standard error; the steady window is shaded.
 
-    `trace` are its rows of table `traces_mean`; the force is drawn in the direction of motion.
+    `trace` are its rows of table `traces_mean`, `repeats` those of its strokes in table `traces` with their
+    direction; the force is drawn in the direction of motion.
     """
+    for _, stroke in repeats.groupby(["file", "stroke"]) if repeats is not None and len(repeats) else ():
+        one = envelope(along_motion(stroke), REPEAT_BUCKETS)
+        ax.plot(one["displacement_mm"], one["force_N"], color=QUIET, linewidth=0.5, zorder=1)
     thin = envelope(along_motion(trace))
     x, force, error = thin["displacement_mm"], thin["force_N"], thin["force_se_N"].fillna(0)
     draw_band(ax, x, force - error, force + error, AFTER, alpha=0.25)
@@ -228,7 +234,9 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         return None
     names, units = ConditionNames.of(config), config.units
     traces = traces[traces["run_id"].isin(chosen["run_id"])]
-    shown = along_motion(traces)["force_N"].dropna()
+    single = tables["traces"]
+    ends = along_motion(single)["force_N"].quantile([0.002, 0.998]) if len(single) else None  # but spikes
+    shown = pd.concat([along_motion(traces)["force_N"], ends])
     span = padded(shown.min(), shown.max())
     panels = []
     for run in chosen.itertuples():
@@ -238,11 +246,13 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         title = f"{names(run.condition)}{speed}"
         alt = f"Mean trace of {title}, {count(repeats, 'stroke')} averaged: {units.quantity('force')} from "
         alt += f"{number(trace['force_N'].min())} to {number(trace['force_N'].max())} {units.unit('force')}."
-        draw = partial(draw_trace, trace=trace, units=units)
+        own = single[single["run_id"] == run.run_id] if len(single) else single
+        draw = partial(draw_trace, trace=trace, units=units, repeats=own)
         panels.append(Panel(short(title, 40), alt, draw, limits={"ylim": span}))
     legend = [Key("mean of all repeats", AFTER)]
     if (traces["n"] < traces.groupby("run_id")["n"].transform("max")).any():
         legend.append(Key("mean of fewer repeats", SKY))
+    legend += [Key(f"single repeats, up to {MOST_REPEATS}", QUIET)] if len(single) else []
     legend += [Key("± standard error", AFTER, "band"), Key("steady window", QUIET, "band")]
     return Plot("traces_mean", "Averaged traces", tuple(panels), tuple(legend))
 
