@@ -28,7 +28,7 @@ from sealfit.report.notation import (
     true_units,
 )
 from sealfit.report.summary import by_gain, level_words
-from sealfit.report.words import acts, meaning, target_html
+from sealfit.report.words import acts, meaning, target_html, with_symbols
 
 MOST_TESTS = 40
 CURVE_PLACES = 7  # of a free shape that a card lists
@@ -90,7 +90,7 @@ def refused_rows(closure: Mapping, config: Config) -> list[dict]:
         {
             "label": f"{entry['id']} along {_labels(entry['channels'], config)}",
             "p": p_value(entry["p_value"]),
-            "reason": entry["reason"],
+            "reason": with_symbols(entry["reason"]),
         }
         for entry in closure.get("refused") or ()
     ]
@@ -123,7 +123,7 @@ def effect_cards(closure: Mapping, shapes: pd.DataFrame, config: Config) -> list
                 "note": effect.get("note") or "",
                 "acts": acts(effect, config),
                 "given": _given(effect, config),
-                "form": effect["form"],
+                "form": with_symbols(effect["form"], formula=True),
                 "reference": effect.get("reference") or "",
                 "level": level_words(effect["level"]),
                 "channels": _labels(effect["channels"], config),
@@ -233,7 +233,7 @@ def next_runs(closure: Mapping, config: Config) -> list[dict]:
     """Return the recommended runs: the reason and the conditions."""
     return [
         {
-            "why": capital(true_units(entry["why"], config.units)),
+            "why": with_symbols(capital(true_units(entry["why"], config.units))),
             "conditions": _wanted(entry["conditions"], config),
         }
         for entry in closure["next_runs"]

@@ -22,6 +22,7 @@ from sealfit.report.notation import (
     true_units,
 )
 from sealfit.report.style import MOST_ROWS, spread
+from sealfit.report.words import with_symbols
 
 MOST_LAWS = 4  # listed per quantity
 
@@ -45,7 +46,7 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
                 {
                     "rubber": rubber if several else "",
                     "quantity": symbol_html(quantity),
-                    "form": first["form"],
+                    "form": with_symbols(first["form"], formula=True),
                     "changes": f"the {first['way']}" if first["way"] else NOTHING,
                     "criterion": number(first["criterion"]) if rank > 1 else "0",
                     "energy": _with_interval(by, "E"),
@@ -305,7 +306,9 @@ def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: boo
     for (identified, why), symbols in about.items():
         lead = Markup(", ").join(symbols if named else [])
         lead += "" if identified else " not identified"
-        said.append(Markup("{}{}{}").format(lead, ": " if lead else "", true_units(why, config.units)))
+        said.append(
+            Markup("{}{}{}").format(lead, ": " if lead else "", with_symbols(true_units(why, config.units)))
+        )
     return Markup("<br>").join(said)
 
 

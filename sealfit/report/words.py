@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from markupsafe import Markup, escape
 
 from sealfit.config import Config
 from sealfit.report.notation import (
+    GREEK,
     NOTHING,
     capital,
     channel_label,
@@ -173,6 +175,22 @@ def _change(effect: Mapping, shape: pd.DataFrame, config: Config) -> Markup:
 def target_html(target: str, config: Config) -> Markup:
     """Return the target of an effect: a symbol, or the name of the measured force."""
     return escape(f"the {config.units.quantity('force')}") if target == "force" else symbol_html(target)
+
+
+def with_symbols(text: object, *, formula: bool = False) -> Markup:
+    """Return text as HTML with its parameters as symbols; single letters are parameters in a formula only.
+
+    Examples
+    --------
+    >>> str(with_symbols("a mu_0 > 0"))
+    'a <i>μ</i><sub>0</sub> &gt; 0'
+    >>> str(with_symbols("A exp(-s / s_0)", formula=True))
+    '<i>A</i> exp(-<i>s</i> / <i>s</i><sub>0</sub>)'
+    """
+    words = re.split(r"(\w+)", str(text))
+    named = ("_" in word or word in GREEK or (formula and len(word) == 1) for word in words)
+    pairs = zip(words, named, strict=True)
+    return Markup("").join(symbol_html(word) if symbol else escape(word) for word, symbol in pairs)
 
 
 def acts(effect: Mapping, config: Config) -> Markup:

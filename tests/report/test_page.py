@@ -186,7 +186,7 @@ def test_a_loop_that_was_not_run_is_said_not_guessed(pages):
 
 def test_parameters_say_what_is_not_identified(pages):
     text = pages["closed"].text
-    assert "v s not identified: fewer than two speeds lie below 2 v_s" in text
+    assert "v s not identified: fewer than two speeds lie below 2 v s" in text
     assert "u sys" in text
 
 

@@ -32,7 +32,9 @@ def test_what_is_not_identified_says_why_and_gives_no_number():
     steady = parameter_tables(made.tables["steady_fit"], "condition", made.config)[0]
     cells, note = {keys[0]: (cells, note) for keys, cells, note in steady.rows}["60 °C · 80 % · 16 d"]
     assert (cells[2].words, cells[2].value) == ("not identified", "–")
-    assert note == "<i>v</i><sub>s</sub> not identified: fewer than two speeds lie below 2 v_s"
+    assert (
+        note == "<i>v</i><sub>s</sub> not identified: fewer than two speeds lie below 2 <i>v</i><sub>s</sub>"
+    )
 
 
 def test_coefficients_of_one_law_share_a_table():
@@ -94,7 +96,7 @@ def test_remarks_on_identified_parameters_stand_apart():
     first = fit.index[(fit["condition"] == "unaged") & (fit["parameter"] == "mu_s")]
     fit.loc[first, "reason"] = "mu_s < mu_c"
     rows = parameter_tables(fit, "condition", made.config)[0].rows
-    assert rows[0][2] == "<i>μ</i><sub>s</sub>: mu_s &lt; mu_c"
+    assert rows[0][2] == "<i>μ</i><sub>s</sub>: <i>μ</i><sub>s</sub> &lt; <i>μ</i><sub>c</sub>"
     assert not rows[1][2]
 
 
