@@ -29,6 +29,7 @@ from sealfit.report.figures.residual import (
     draw_errors,
     draw_levels,
     draw_shape,
+    finding,
     run_means,
 )
 from sealfit.report.figures.speed import curve_lines, draw_starts, force_speed, run_points
@@ -256,6 +257,25 @@ def test_channels_have_95_percent_bars(ax):
 
 def test_the_strongest_channel_comes_first(made):
     assert channel_order(made.tables["channels"])[0] == "time_s"
+
+
+def test_an_effect_of_the_direction_is_shown_over_the_signed_speed(made):
+    tables = dict(made.tables)
+    for stage, size in (("before", -0.1), ("after", 0.0)):  # viscous friction that is larger backward
+        rows = tables[f"residuals_{stage}"]
+        speed = rows["speed_mm_s"].astype(float) * np.where(rows["repeat"] == 1, -1, 1)
+        tables[f"residuals_{stage}"] = rows.assign(speed_mm_s=speed, residual_N=size * speed.abs())
+    known = {"channel": "direction", "before_N": 1.0, "before_se_N": 0.1, "after_N": 0.0, "after_se_N": 0.1}
+    tables["channels"] = table("channels", [{**known, "x": sign, "n": 9} for sign in (-1.0, 1.0)])
+    effect = {**made.closure["effects"][0], "channels": ["direction"]}
+    plot = finding(tables, {**made.closure, "effects": [effect]}, made.config)
+    drawn = panel_figure(plot.panels[0]).axes[0].containers
+    before, after = (np.array(one.lines[0].get_xydata(), float) for one in drawn)
+    speeds = np.unique(tables["residuals_before"]["speed_mm_s"])
+    npt.assert_allclose(before[:, 0], speeds, atol=0.01 * np.ptp(speeds))
+    npt.assert_allclose(before[:, 1], -0.1 * np.abs(speeds))
+    npt.assert_array_equal(after[:, 1], 0.0)
+    assert plot.panels[0].title == "Sliding speed, negative backward"
 
 
 def test_a_factor_is_drawn_in_percent(ax, made):

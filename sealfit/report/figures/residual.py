@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 
@@ -141,7 +142,8 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config:
     """Return the evidence for the verdict: the residual along one variable, and the errors.
 
     The variable is that of the effect that reduces the held-out error most, or, without an effect, the one
-    along which the residual is largest relative to its error. None if the loop was not run.
+    along which the residual is largest relative to its error. Of the direction it is the signed speed, over
+    which an offset, a factor and viscous friction of one direction differ. None if the loop was not run.
     """
     errors, channels = before_after(tables, closure, config), tables["channels"]
     if errors is None or channels.empty:
@@ -150,10 +152,32 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config:
     added = [effect for effect in by_gain(closure["effects"]) if not effect["candidate"]]
     own = chain.from_iterable(effect["channels"] for effect in added)
     name = next((name for name in own if name in order), order[0])
-    panel = _channel_panel(channels[channels["channel"] == name], name, tables, config)
+    rows = channels[channels["channel"] == name]
+    if name == "direction":
+        name, rows = "speed_mm_s", signed_speeds(tables["residuals_before"], tables["residuals_after"])
+    panel = _channel_panel(rows, name, tables, config)
+    if rows["x"].min() < 0 and name == "speed_mm_s":
+        panel = replace(panel, title=f"{panel.title}, negative backward")
     floor = (key for key in errors.legend if key.mark == "dashed")
     title = "Residual and errors before and after"
     return Plot("finding", title, (panel, errors.panels[0]), (*STAGES, *floor))
+
+
+def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean residuals at each signed speed, as rows of table `channels`.
+
+    Speeds that agree to two digits are one. Standard errors are from the strokes' means.
+    """
+    found = {}
+    for stage, residuals in (("before", before), ("after", after)):
+        strokes = residuals.groupby(["run_id", "file", "stroke"], sort=True)
+        means = strokes[["speed_mm_s", "residual_N"]].mean().reset_index()
+        speed = means["speed_mm_s"].map(lambda value: float(f"{value:.2g}"))
+        groups, farthest = means.groupby(speed), means["residual_N"].abs().groupby(speed).idxmax()
+        found["x"] = groups["speed_mm_s"].mean().map(lambda value: float(f"{value:.3g}"))
+        found[f"{stage}_N"], found[f"{stage}_se_N"] = groups["residual_N"].mean(), groups["residual_N"].sem()
+        found[f"{stage}_run"] = farthest.map(means["run_id"])
+    return pd.DataFrame(found)
 
 
 # ---------------------------------------------------------------- residual by level
