@@ -35,6 +35,18 @@ frame.srcdoc = PAGE;
 document.body.append(frame);
 </script>"""
 
+# Says the colours of the page, and how those of a plot are changed.
+COLOURS = """<!doctype html><title>not measured</title><body><script>
+const frame = document.createElement("iframe");
+frame.onload = () => {
+  const page = frame.contentDocument, style = e => frame.contentWindow.getComputedStyle(e);
+  const body = style(page.body), plot = style(page.querySelector(".panels svg"));
+  document.title = "measured " + JSON.stringify([body.backgroundColor, body.color, plot.filter]);
+};
+frame.srcdoc = PAGE;
+document.body.append(frame);
+</script>"""
+
 # Drives the page, whose own rules hold, from the page around it.
 DRIVE = """<!doctype html><title>not measured</title><body><script>
 const frame = document.createElement("iframe");
@@ -150,6 +162,15 @@ def test_without_scripts_the_page_is_whole(tmp_path):
     assert images[1] == images[2] == str(html_of(aging_campaign).count("<img"))
 
 
+@pytest.mark.parametrize("dark", [False, True])
+def test_page_and_plots_follow_the_colour_scheme(dark, tmp_path):
+    scheme = f"--blink-settings=preferredColorScheme={0 if dark else 1}"
+    shown = loaded(COLOURS, html_of(aging_campaign), tmp_path, scheme)
+    ground, text, turned = json.loads(html.unescape(re.search(r"<title>measured (.*?)</title>", shown)[1]))
+    light = [sum(map(int, re.findall(r"\d+", colour)[:3])) / 765 for colour in (ground, text)]
+    assert (light[0] < 0.2) == (light[1] > 0.7) == ("invert" in turned) == dark
+
+
 def test_the_page_prints_on_a4(tmp_path):
     page, printed = tmp_path / "page.html", tmp_path / "page.pdf"
     page.write_text(html_of(aging_campaign), "utf-8")
@@ -160,11 +181,11 @@ def test_the_page_prints_on_a4(tmp_path):
     assert sheets == {(b"594", b"841")}  # points
 
 
-def loaded(around, page, folder):
+def loaded(around, page, folder, *options):
     """Return what a browser made of a page in another one, where it stands for PAGE."""
     path = folder / "frame.html"
     path.write_text(around.replace("PAGE", json.dumps(page).replace("</", "<\\/")), "utf-8")
-    return browsed(path, folder)
+    return browsed(path, folder, *options)
 
 
 def browsed(page, folder, *options):
