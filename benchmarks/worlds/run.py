@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -60,12 +61,11 @@ class Ended:
 
     @property
     def traceback(self) -> str | None:
-        """Last line of a traceback, or None."""
-        return (
-            self.output.strip().splitlines()[-1][:300]
-            if "Traceback (most recent call last)" in self.output
-            else None
-        )
+        """Last line of a traceback, else a library's first warning, which no user should see, or None."""
+        lines = self.output.strip().splitlines()
+        if "Traceback (most recent call last)" in self.output:
+            return lines[-1][:300]
+        return next((line[-300:] for line in lines if re.search(r"\wWarning: ", line)), None)
 
 
 def command(words: list[str], limit_s: float) -> Ended:
