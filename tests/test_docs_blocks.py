@@ -1,4 +1,4 @@
-"""Every command and code block of the documents is parsed, whether or not another test runs it."""
+"""Every command and code block of the documents is parsed, and every link leads somewhere."""
 
 import ast
 import importlib
@@ -9,6 +9,7 @@ import tomllib
 from contextlib import nullcontext, suppress
 
 import pytest
+from markdown.extensions.toc import slugify
 from page_helpers import DOCS, ROOT
 from typer.main import get_command
 
@@ -109,3 +110,24 @@ def test_names_within_lines_exist(page):
     for table, key in re.findall(r"`(\w+)\.(\w+)(?: = [^`]*)?`", text):
         if hasattr(TABLES.get(table), "model_fields"):
             assert key in {*TABLES[table].model_fields, *SUFFIXES}, f"{table}.{key}"
+
+
+def anchors(page):
+    """Return the fragments that the site gives the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text("utf-8"), re.MULTILINE)
+    return {slugify(re.sub(r"[`*]", "", heading), "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES.get)
+def test_links_and_files_exist(page):
+    text = page.read_text("utf-8")
+    for link in re.findall(r"\]\(([^)\s]+)\)|(https?://[^\s)>`]*)", text):
+        file, _, fragment = "".join(link).partition("#")
+        if "://" in file:
+            assert re.match(r"https://[\w-]+(\.[\w-]+)+(/|$)", file), file
+            continue
+        target = page.parent / file if file else page
+        assert target.exists(), file
+        assert not fragment or fragment in anchors(target), "".join(link)
+    for name in re.findall(r"`((?:docs|tests|sealfit|configs|sample_data|benchmarks)/[\w./-]*)`", text):
+        assert (ROOT / name).exists(), name
