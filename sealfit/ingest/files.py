@@ -380,15 +380,15 @@ def without_strays(line: str, settings: TraceFormat) -> str:
     return line.rstrip(",; \t" + (settings.delimiter if len(settings.delimiter) == 1 else ""))
 
 
-def without_footer(text: bytes, footer: str | None) -> bytes:
-    """Return a text up to the first line that begins as the footer does; all of it without a footer.
+def without_footer(text: bytes, footer: str | None, start: int) -> bytes:
+    """Return a text up to the first line from `start` on that begins as the footer does; else all of it.
 
     Examples
     --------
-    >>> without_footer(b"0,1\\n1,2\\n*** END ***\\n", "*** END")
-    b'0,1\\n1,2\\n'
+    >>> without_footer(b"Test 1\\nt,x\\n0,1\\nTest ended\\n", "Test", start=11)
+    b'Test 1\\nt,x\\n0,1\\n'
     """
-    at = -1 if footer is None else text.find(b"\n" + footer.encode())
+    at = -1 if footer is None else text.find(b"\n" + footer.encode(), max(start - 1, 0))
     return text if at < 0 else text[: at + 1]
 
 

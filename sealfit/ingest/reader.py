@@ -141,6 +141,7 @@ def _open(raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Opened:
         layout, body, width = Layout(found.header, found.names, None, 0, 1), b"", len(arrays)
     else:
         text, layout, settings = _text(raw, file, settings)
+        text = without_footer(text, settings.footer, layout.start)
         if ref.cut:
             text, fault = whole_lines(text, file)
             faults = (fault,)
@@ -196,15 +197,14 @@ def _text(
 ) -> tuple[bytes, Layout, TraceFormat]:
     """Return a text file or workbook sheet as UTF-8, its layout, and the settings with its delimiter."""
     if kind_of(file, settings) == "csv":
-        text = without_footer(as_utf8(raw, settings.encoding, file, head=head), settings.footer)
+        text = as_utf8(raw, settings.encoding, file, head=head)
         refuse_marked_up(text, file)
         return text, find_layout(text, settings, file), settings
     sheet = read_sheet(raw, file, settings.sheet, decimal=settings.decimal, head=head)
     settings = settings.model_copy(update={"delimiter": "tab"})
-    text = without_footer(sheet.text, settings.footer)
-    layout = find_layout(text, settings, file)
+    layout = find_layout(sheet.text, settings, file)
     sheet.check(layout.first_line, file)
-    return text, layout, settings
+    return sheet.text, layout, settings
 
 
 def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | str]:

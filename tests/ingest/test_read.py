@@ -55,6 +55,12 @@ def test_a_bad_cell_costs_its_row_and_is_named_with_line_value_and_fix(
     npt.assert_array_equal(np.delete(np.arange(2, 102), 10), trace.line)
 
 
+def test_a_footer_is_looked_for_below_the_header(tmp_path):
+    content = csv_of([*ROWS, "Test ended", "mean,25,2.5"], header=f"Operator: Ada\nTest: friction\n{HEADER}")
+    trace = read(tmp_path, content, '[trace]\nheader_lines = 3\nfooter = "Test"')
+    assert (trace.line[0], trace.rows_read, trace.faults) == (4, 100, ())
+
+
 def test_five_percent_of_bad_rows_are_left_out_and_six_leave_the_file_out(tmp_path):
     bad = {i: f"{0.1 * i:.1f},x,1" for i in range(0, 60, 10)}
     five = [bad[i] if i in list(bad)[:5] else row for i, row in enumerate(ROWS)]
