@@ -55,12 +55,13 @@ def read_sheet(
     *,
     decimal: str = ".",
     first: bool = False,
+    longest: bool = False,
     head: bool = False,
 ) -> Sheet:
     """Return a sheet of a workbook as text: its name or number (from 1), or None for the only one with cells.
 
-    With `first`, None means the first sheet; with `head`, `HEAD_ROWS` rows are enough. Numbers are written
-    with the mark `decimal`.
+    With `first`, None means the first sheet, with `longest` the one with the most rows; with `head`,
+    `HEAD_ROWS` rows are enough. Numbers are written with the mark `decimal`.
 
     Raises
     ------
@@ -73,7 +74,7 @@ def read_sheet(
     openpyxl = library("openpyxl", file)
     with damage_named(file, "xlsx"):
         with _book(openpyxl, raw, formulas=True) as book:
-            title = _title(book, sheet, first, file)
+            title = _longest(book)[0] if longest else _title(book, sheet, first, file)
             lines, formulas = _lines(book[title], decimal, head)
         if formulas:
             with _book(openpyxl, raw, formulas=False) as book:
@@ -87,9 +88,11 @@ def longest_sheet(raw: bytes, file: str) -> tuple[str, int]:
     _refuse_others(raw, file)
     openpyxl = library("openpyxl", file)
     with damage_named(file, "xlsx"), _book(openpyxl, raw, formulas=True) as book:
-        rows = {
-            sheet.title: sum(map(_has_cell, sheet.iter_rows(values_only=True))) for sheet in book.worksheets
-        }
+        return _longest(book)
+
+
+def _longest(book) -> tuple[str, int]:
+    rows = {sheet.title: sum(map(_has_cell, sheet.iter_rows(values_only=True))) for sheet in book.worksheets}
     return max(rows, key=rows.get), sum(count > 0 for count in rows.values())
 
 

@@ -14,6 +14,7 @@ from sealfit import cli
 from sealfit.config import load_config, parse_config
 from sealfit.draft.draft import draft
 from sealfit.errors import RequestError
+from sealfit.ingest import workbooks
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.runs import list_traces
 
@@ -351,14 +352,17 @@ def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_k
     assert "what 'Gewicht [kg]' of log.csv holds is not known here" in doubts
 
 
-def test_the_sheet_with_the_most_rows_holds_the_trace(tmp_path):
+def test_the_sheet_with_the_most_rows_holds_the_trace(tmp_path, monkeypatch):
     for one in exports.records():
         about, data = pd.DataFrame({"Operator": ["Ada"]}), pd.DataFrame(exports.slots(one)).T
         data.columns = ["Time [s]", "Stroke [mm]", "Force [N]"]
         with pd.ExcelWriter(tmp_path / f"{one.days}d_{one.speed:g}mms_r{one.repeat}.xlsx") as book:
             about.to_excel(book, sheet_name="Info", index=False)
             data.to_excel(book, sheet_name="Data", index=False)
+    opened, book = [], workbooks._book
+    monkeypatch.setattr(workbooks, "_book", lambda *args, **how: opened.append(1) or book(*args, **how))
     made = draft(tmp_path)
+    assert len(opened) == 12 + 6 + 1  # looked at, columns read, sheets counted
     config = parse_config(made.text, "rig.toml")
     assert config.trace.sheet == "Data"
     assert made.files == 12
