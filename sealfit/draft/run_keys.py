@@ -23,6 +23,7 @@ from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import channels_of, name_parts
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import RUNS_CSV, natural
+from sealfit.ingest.start_times import excel_time
 from sealfit.units import Units, conversion
 
 NO_CONDITION = {
@@ -351,6 +352,8 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
         if value != ours:
             cell = next((cell for cell in table.cells[theirs] if cell), "")
             evidence = f"column '{theirs}' of {table.file}, such as '{cell}'"
+            if ours == "started_at" and (time := excel_time(cell.replace(",", "."))):
+                evidence += f": Excel's serial number of {time.isoformat(' ', 'minutes')}"
             notes.guess(f"files.runs_columns.{ours}", value, evidence)
     cells = {ours: table.cells[theirs] for theirs, ours in table.ours.items()}
     heights = cells.get("compression_ratio_pct", ())

@@ -14,6 +14,7 @@ from sealfit.errors import BadFile
 from sealfit.ingest.files import as_number, split_line
 from sealfit.ingest.formats import kind_of
 from sealfit.ingest.listing import RUNS_CSV
+from sealfit.ingest.start_times import excel_time
 
 NAMING = 0.5
 """Share of a column's cells that must be names of trace files: a log may list tests that were not kept."""
@@ -112,12 +113,12 @@ def _meanings(
 
 
 def _fits(meaning: str, column: Sequence[str]) -> bool:
-    """Whether the cells can be what the name says: numbers, or dates that are ISO 8601."""
+    """Whether the cells can be what the name says: numbers, or dates in ISO 8601 or as Excel counts days."""
     full = [cell for cell in column if cell]
     if not full:
         return False
     if meaning == "started_at":
-        return all(_is_iso(cell) for cell in full)
+        return all(_is_iso(cell) or excel_time(cell.replace(",", ".")) for cell in full)
     if meaning in ("specimen_id", "run_id", "rubber", "file"):
         return True
     if meaning in AGING_CONDITION:  # the words for unaged rubber

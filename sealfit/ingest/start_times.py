@@ -93,7 +93,7 @@ def _with_none(values: pd.Series) -> Column:
 def _time(text: str, formats: Sequence[str]) -> datetime | None:
     """Return the time by the first format that fits, else ISO 8601, else Excel's serial number, or None."""
     in_formats = (_read(datetime.strptime, text, one) for one in formats)
-    return next(filter(None, in_formats), None) or _read(datetime.fromisoformat, text) or _excel(text)
+    return next(filter(None, in_formats), None) or _read(datetime.fromisoformat, text) or excel_time(text)
 
 
 def _read(reader: Callable[..., datetime], *given: str) -> datetime | None:
@@ -103,8 +103,11 @@ def _read(reader: Callable[..., datetime], *given: str) -> datetime | None:
         return None
 
 
-def _excel(text: str) -> datetime | None:
-    """Return the time of a day's serial number, or of a day's and a share's: 45352.395833, 45352 0.395833."""
+def excel_time(text: str) -> datetime | None:
+    """Return the time of a day's serial number, or of a day's and a share's: 45352.395833, 45352 0.395833.
+
+    None for other texts.
+    """
     numbers = [as_number(part) for part in text.split()]
     if not numbers or None in numbers or not EXCEL_DAYS[0] <= sum(numbers) < EXCEL_DAYS[1]:
         return None

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -350,6 +351,23 @@ def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_k
     doubts = " ".join(f"{doubt.reason} {doubt.fix}" for doubt in made.doubts)
     assert "files.started_at = { date = 'Datum', time = 'Uhrzeit' }" in doubts
     assert "what 'Gewicht [kg]' of log.csv holds is not known here" in doubts
+
+
+@pytest.mark.parametrize(("mark", "sign"), [(",", "."), (";", ",")])
+def test_excel_serial_numbers_in_a_log_are_dates(mark, sign, tmp_path):
+    rows = ["Datei;Tage;Datum"]
+    for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
+        exports.write(tmp_path, f"M{number}.csv", plain(one))
+        rows.append(f"M{number}.csv;{one.days};{45987.53 + number:.2f}")
+    table = "\n".join(rows).replace(";", mark)
+    exports.write(tmp_path, "log.csv", re.sub(r"(\d)\.(\d)", rf"\1{sign}\2", table) + "\n")
+    made = draft(tmp_path)
+    config = parse_config(made.text, "rig.toml")
+    assert config.files.runs_columns["started_at"].name == "Datum"
+    example = f"such as '45987{sign}53': Excel's serial number of 2025-11-26 12:43"
+    assert f"column 'Datum' of log.csv, {example}" in [guess.evidence for guess in made.guesses]
+    runs = ingest_campaign(tmp_path, config).tables["runs"]
+    assert list(runs["started_at"])[:2] == ["2025-11-26T12:43:12", "2025-11-27T12:43:12"]
 
 
 def test_the_sheet_with_the_most_rows_holds_the_trace(tmp_path, monkeypatch):
