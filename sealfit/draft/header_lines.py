@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sealfit.draft.vocabulary import Unit, name_and_unit, setting, unit_of
+from sealfit.draft.vocabulary import Unit, name_and_unit, plain, setting, unit_of
 from sealfit.ingest.files import as_number
 
 SETTINGS = {
@@ -19,6 +19,7 @@ SETTINGS = {
 """What header lines may set, and what its unit measures."""
 
 _LINE = re.compile(r'^"?(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
+_SPECIMEN = re.compile(r"(specimen|probe|sample|pruefling|muster)( (id|nr|no|number|nummer|name))?")
 _NUMBER = re.compile(r"^[-+]?\d+(?:[.,]\d+)?(?=$|[\s;,\t\"°%A-Za-zµ])")
 _ISO = re.compile(r"20\d\d-[01]\d-[0-3]\d[T ][0-2]\d:[0-5]\d(?::[0-5]\d)?(?!\d)")
 _DAYS = (
@@ -34,13 +35,17 @@ CLOCK = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A setting in a header line: our name of it, the pattern that finds it, its unit and the line."""
+    """A setting in a header line: our name of it, the pattern that finds it, its unit and the line.
+
+    `counts` is whether no two files have the same.
+    """
 
     ours: str
     pattern: str
     unit: Unit | None
     line: int
     text: str
+    counts: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +67,15 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
     found: dict[str, Setting] = {}
     for number, line in enumerate(headers[0], start=1):
         match = _LINE.match(line)
+        if match and _SPECIMEN.fullmatch(plain(match["key"])):
+            pattern = _after(match["key"], r'([^\s;,"][^;,\t"]*)')
+            values = _found(pattern, headers)
+            if "" not in values and len(set(values)) > 1:
+                counts = len(set(values)) == len(values)
+                found.setdefault(
+                    "specimen_id", Setting("specimen_id", pattern, None, number, line.strip(), counts)
+                )
+            continue
         number_found = _NUMBER.match(match["value"].strip()) if match else None
         if number_found is None or as_number(number_found.group(), decimal or ".") is None:
             continue
@@ -71,7 +85,7 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
         ours = setting(name)
         if ours not in SETTINGS or ours in found or (unit is not None and unit.dimension != SETTINGS[ours]):
             continue
-        pattern = rf'^"?{re.escape(match["key"])}"?[\s:=;,"]*([-+]?[\d.,]*\d)'.replace(r"\ ", " ")
+        pattern = _after(match["key"], r"([-+]?[\d.,]*\d)")
         if _everywhere(pattern, headers):
             found[ours] = Setting(ours, pattern, unit, number, line.strip())
     return list(found.values())
@@ -124,5 +138,16 @@ def _leading(text: str) -> str:
     return "^" + re.sub(r"\d+(?:[.,]\d+)?", r"[\\d.,]+", words)
 
 
+def _after(key: str, value: str) -> str:
+    """Return the pattern of a value behind the key of its line."""
+    return rf'^"?{re.escape(key)}"?[\s:=;,"]*'.replace(r"\ ", " ") + value
+
+
 def _everywhere(pattern: str, headers: Sequence[Sequence[str]]) -> bool:
-    return all(any(re.search(pattern, line) for line in header) for header in headers)
+    return "" not in _found(pattern, headers)
+
+
+def _found(pattern: str, headers: Sequence[Sequence[str]]) -> list[str]:
+    """Return what a pattern finds in the header lines of each file, "" for nothing."""
+    searched = ((re.search(pattern, line) for line in header) for header in headers)
+    return [next((match[1].strip() for match in found if match), "") for found in searched]

@@ -355,6 +355,10 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
     for one in settings:
         evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
         notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
+        if one.counts:
+            reason = f"every file looked at has a specimen of its own: {_shown(one.text)}."
+            fix = "If that counts the tests, delete this line."
+            notes.doubt("trace.header_fields.specimen_id", reason, fix)
         if one.unit is not None and one.unit.name != Units().of(one.ours):
             notes.guess(f"files.units.{one.ours}", one.unit.name, f"the unit in header line {one.line}")
     return [one.ours for one in settings]

@@ -196,6 +196,20 @@ def test_settings_and_dates_in_the_header_are_enough(tmp_path):
     assert ingested.faults == []
 
 
+@pytest.mark.parametrize(
+    ("key", "pieces", "told"),
+    [("Probe", "AB", True), ("Sample ID", "ABCD", True), ("Probe", "A", False), ("Sample rate", "AB", False)],
+)
+def test_specimens_in_the_header(key, pieces, told, tmp_path):
+    for i, one in enumerate(exports.records(days=(1,), speeds=(1.0, 5.0))):
+        head = f"{key}: {pieces[i % len(pieces)]}\nt [s],x [mm],F [N]\n"
+        file = f"{one.days}d_{one.speed:g}mms_r{one.repeat}.csv"
+        exports.write(tmp_path, file, head + exports.table(exports.slots(one), ",", 4))
+    made, _, ingested = read(tmp_path)
+    assert set(ingested.tables["runs"]["specimen_id"]) == (set(pieces) if told else {"aging_days=1"})
+    assert any("a specimen of its own" in doubt.reason for doubt in made.doubts) == (pieces == "ABCD")
+
+
 def test_rubbers_directions_and_decimal_commas_in_names(tmp_path):
     written = {}
     for one in exports.records(speeds=(0.5, 5.0)):
