@@ -21,6 +21,10 @@ from sealfit.tables import CALENDAR, QUALITY, STEADY
 from sealfit.units import conversion
 
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
+# Of a load: standard deviation over mean, along a trace. Friction follows its load, so a force that varies by
+# less than the second times as much may be the load itself. In 25 files (exports of tests, microtribo) the
+# force varies 66 times as much as the load or more; swapped, 0.015 times or less.
+VARIES, STEADIER = 0.05, 0.2
 # Seals on a full film of oil slide at about 0.01, soft dry rubber at up to about 4. Dry rubber at 0.6 to 1 is
 # above with its load in kg, which makes mu 9.81 times too large, and below with its load in g: 102 times too
 # small.
@@ -218,6 +222,22 @@ def load_faults(measured: float, declared: float, unit: str) -> list[Fault]:
     reason = f"measured {measured:.4g} {unit}, declared {declared:.4g} {unit}."
     fix = "The measured load is used; check runs.csv."
     return [Fault("load", reason, column="load_N", value=float(measured), fix=fix, **KEPT)]
+
+
+def swapped_faults(force_N: np.ndarray, load_N: np.ndarray, config: Config) -> list[Fault]:
+    """Return that the load varies along a trace and the force does not, as if their columns were swapped.
+
+    The arrays have shape (n,).
+    """
+    with np.errstate(all="ignore"):  # no scatter of numbers beyond 1e154: inf or nan, and no finding
+        of_force, of_load = (np.std(values) / np.mean(np.abs(values)) for values in (force_N, load_N))
+    if not (VARIES < of_load < np.inf and of_force < STEADIER * of_load):
+        return []
+    force, load = (config.trace.their_columns.get(name, name) for name in ("force_N", "load_N"))
+    reason = f"'{load}' varies by {100 * of_load:.2g} % along the trace, the force, '{force}', by "
+    reason += f"{100 * of_force:.2g} % only."
+    fix = "Are the two swapped under [trace.columns]? The load hardly varies, the friction force does."
+    return [Fault("swapped_columns", reason, column="load_N", value=float(of_load), fix=fix, **KEPT)]
 
 
 def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:

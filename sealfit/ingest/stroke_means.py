@@ -20,6 +20,7 @@ from sealfit.ingest.quality import (
     rising_faults,
     speed_column_faults,
     stroke_faults,
+    swapped_faults,
 )
 from sealfit.ingest.reader import Trace, read_traces
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
@@ -171,12 +172,14 @@ def _stroke_rows(
 
 
 def _load_faults(trace: Trace, rows: Sequence[Mapping[str, object]], config: Config) -> list[Fault]:
-    """Return where the load measured in the strokes of use differs from the declared one."""
+    """Return where the load measured in the strokes of use differs from the declared one, or is no load."""
     declared = trace.ref.channels.get("load_N")
     loads = [row["load_N"] for row in rows if row["used"]] if "load_N" in trace.columns else []
-    if not loads or not isinstance(declared, int | float):
+    if not loads:
         return []
-    found = load_faults(float(np.mean(loads)), declared, config.units.unit("load"))
+    found = swapped_faults(trace.columns["force_N"], trace.columns["load_N"], config)
+    if isinstance(declared, int | float):
+        found += load_faults(float(np.mean(loads)), declared, config.units.unit("load"))
     return [replace(fault, file=trace.ref.file) for fault in found]
 
 

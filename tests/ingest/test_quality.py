@@ -12,6 +12,7 @@ from sealfit.ingest.quality import (
     speed_column_faults,
     stroke_faults,
     stuck_samples,
+    swapped_faults,
 )
 from sealfit.ingest.repeat_checks import constant_strokes, outlying_files, reversed_strokes
 from sealfit.ingest.strokes import Stroke, find_strokes
@@ -266,6 +267,20 @@ def test_speed_and_load_columns_are_compared_with_what_was_measured_and_declared
     assert load_faults(50.0, 49.0, "N") == []
     (fault,) = load_faults(60.0, 49.03, "N")
     assert fault.reason == "measured 60 N, declared 49.03 N."
+
+
+def test_a_load_that_varies_as_friction_does_beside_a_constant_force_is_a_warning():
+    _, _, friction = trace()
+    load = 50.0 + 0.01 * friction
+    config = parse_config('[trace.columns]\nforce_N = "Fz [N]"\nload_N = {name = "Fx"}\n', "rig.toml")
+    assert swapped_faults(friction, load, config) == []
+    assert swapped_faults(friction, friction + 50.0, config) == []
+    assert swapped_faults(load, np.zeros(len(load)), config) == []
+    for other in (friction, -friction, friction * np.sign(np.arange(1000) - 500.0)):  # one way; to and fro
+        (fault,) = swapped_faults(load, other, config)
+        assert (fault.check, fault.severity, fault.action) == ("swapped_columns", "warning", "kept")
+        assert fault.reason.startswith("'Fx' varies by ")
+        assert "the force, 'Fz [N]', by " in fault.reason
 
 
 def test_the_quality_table_has_a_row_per_finding_and_one_for_every_sound_file():
