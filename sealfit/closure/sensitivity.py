@@ -4,7 +4,7 @@ The effect is a factor on mu, linear in the variable at one of the levels at whi
 force for the direction. It is added to the residual, and the scatter is re-estimated, because part of the
 effect is taken for scatter. The smallest effect exceeds the critical value of the whole search with a power
 of 80 % (noncentral F). It must also have the least size that is reported and, with weak evidence, lower the
-held-out error. Naming is not considered.
+held-out error. The stated size is larger by `TO_BE_ADDED`.
 """
 
 from __future__ import annotations
@@ -53,6 +53,13 @@ from sealfit.fit.joint.whitening import Whitening
 
 TINY = 1e-6
 """Size of an effect, as a share of the force, that changes no estimate."""
+
+TO_BE_ADDED = 1.2
+"""Ratio of the stated size to that which is significant with a power of 80 %.
+
+Some significant effects are refused, or another variable is taken for them. Of 53 effects of the significant
+size in designs drawn at random 64 % were added, of 42 effects 1.2 times as large 79 %, 1.35 times 83 %.
+"""
 
 STEPS = 6
 """Most sizes that are tried to reach `TARGET_POWER`."""
@@ -109,7 +116,8 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
-                smallest = force * float(max(times, SIZE_MARGIN * LEAST_SIZE)) if times < 1 else None
+                times = max(TO_BE_ADDED * times, SIZE_MARGIN * LEAST_SIZE)
+                smallest = force * float(times) if times < TO_BE_ADDED else None
             if smallest is None:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
                 if channel.unit == "sample" and specimens > 1:
