@@ -317,6 +317,7 @@ SHAPE_POINTS = table(
     Column("label", "the category, or null", TEXT),
     Column("value", "partial residual: shape plus mean residual, in the shape's unit; null without one"),
     Column("se", "its standard error, from whole files, or from the strokes of a single one"),
+    Column("unit", "unit of value and se", TEXT),
 )
 CURVES = table(
     "curves",

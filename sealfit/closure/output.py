@@ -279,7 +279,8 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
         part = 1 + np.asarray(shape) if term.operation == "multiply" else 1.0  # which the slope has in it
         se = np.abs(part) * np.sqrt((left**2).sum(axis=1)) / size
         found = {"effect": number, "channel": term.channels[0], "x": x, "label": labels}
-        parts.append(pd.DataFrame({**found, "value": shape + part * change, "se": se}))
+        found |= {"value": shape + part * change, "se": se, "unit": own["unit"].iloc[0]}
+        parts.append(pd.DataFrame(found))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=SHAPE_POINTS.names())
 
 

@@ -69,4 +69,5 @@ def test_partial_residuals_follow_the_data_where_the_shape_does_not():
     assert np.ptp(straight - bent) > 0.008
     assert along["se"].between(0.0005, 0.002).all()
     assert levels["label"].tolist() == ["A", "B"]
+    assert set(levels["unit"]) == {"N"}
     assert np.diff(levels["value"]) == pytest.approx(1.0, abs=0.02)

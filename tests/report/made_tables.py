@@ -300,7 +300,8 @@ def shape_points():
     """The data of `shapes`, in twelve groups."""
     x = np.linspace(3, 73, 12)
     value = -DROP * (1 - np.exp(-x / TAU)) + 0.001 * np.cos(9 * x)
-    return table("shape_points", {"effect": 0, "channel": "time_s", "x": x, "value": value, "se": 0.0005})
+    found = {"effect": 0, "channel": "time_s", "x": x, "value": value, "se": 0.0005, "unit": ""}
+    return table("shape_points", found)
 
 
 def levels(found):
