@@ -310,7 +310,7 @@ def _inverse_of(size: np.ndarray, axes: np.ndarray) -> np.ndarray:
 def score_statistic(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """Return T for each row of `totals`, shape (m, k) -> (m,)."""
     inverse = np.linalg.pinv(scores.T @ scores, rcond=1e-10, hermitian=True)
-    return np.einsum("ij,jk,ik->i", totals, inverse, totals)
+    return ((totals @ inverse) * totals).sum(axis=1)
 
 
 def log_p_of(t: np.ndarray, df: int, units: int) -> np.ndarray:
