@@ -17,22 +17,27 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
 # A window has a least width of 500 px, a frame in it has none; the page's own rules hold in the frame too.
 FRAME = """<!doctype html><title>not measured</title><body><script>
-const frame = document.createElement("iframe");
-frame.style.width = "WIDTHpx";
-frame.style.height = "2000px";
-frame.style.border = "0";
-frame.onload = () => {
-  const page = frame.contentDocument, images = [...page.images], root = page.documentElement;
-  const boxes = [...page.querySelectorAll("body *")].filter(e => !e.closest(".box") && !e.closest("pre"));
-  const right = Math.ceil(Math.max(...boxes.map(e => e.getBoundingClientRect().right)));
-  const drawings = [...page.querySelectorAll(".panels svg")], all = images.length + drawings.length;
-  const shown = images.filter(i => i.complete && i.naturalWidth > 0).length
-    + drawings.filter(d => d.getBoundingClientRect().width > 100).length;
-  const cut = [...page.querySelectorAll(".params")].filter(t => t.offsetWidth > t.parentElement.clientWidth);
-  document.title = ["measured", root.clientWidth, root.scrollWidth, right, shown, all, cut.length].join(" ");
-};
-frame.srcdoc = PAGE;
-document.body.append(frame);
+const widths = WIDTHS, found = {};
+for (const width of widths) {
+  const frame = document.createElement("iframe");
+  frame.style.width = width + "px";
+  frame.style.height = "2000px";
+  frame.style.border = "0";
+  frame.onload = () => {
+    const page = frame.contentDocument, images = [...page.images], root = page.documentElement;
+    const boxes = [...page.querySelectorAll("body *")].filter(e => !e.closest(".box") && !e.closest("pre"));
+    const right = Math.ceil(Math.max(...boxes.map(e => e.getBoundingClientRect().right)));
+    const drawings = [...page.querySelectorAll(".panels svg")], all = images.length + drawings.length;
+    const shown = images.filter(i => i.complete && i.naturalWidth > 0).length
+      + drawings.filter(d => d.getBoundingClientRect().width > 100).length;
+    const tables = [...page.querySelectorAll(".params")];
+    const cut = tables.filter(t => t.offsetWidth > t.parentElement.clientWidth);
+    found[width] = [root.clientWidth, root.scrollWidth, right, shown, all, cut.length];
+    if (Object.keys(found).length === widths.length) document.title = "measured " + JSON.stringify(found);
+  };
+  frame.srcdoc = PAGE;
+  document.body.append(frame);
+}
 </script>"""
 
 # Says the colours of the page, and how those of a plot are changed.
@@ -112,17 +117,15 @@ document.body.append(frame);
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium on PATH")
 
 
-@pytest.mark.parametrize("width", [1400, 800, 400])
 @pytest.mark.parametrize("make", [aging_campaign, after_campaign, torque_campaign, not_run])
-def test_nothing_overflows_and_every_image_shows(make, width, tmp_path):
-    shown = loaded(FRAME.replace("WIDTH", str(width)), html_of(make), tmp_path)
-    found = re.search(r"<title>measured (\d+) (\d+) (\d+) (\d+) (\d+) (\d+)</title>", shown)
-    client, scroll, right, shown, images, cut = map(int, found.groups())
-    assert client == width
-    assert scroll <= width
-    assert right <= width
-    assert shown == images > 0
-    assert cut == 0 or width < 1400
+def test_nothing_overflows_and_every_image_shows(make, tmp_path):
+    found = measured(html_of(make), [1400, 800, 400], tmp_path)
+    for width, (client, scroll, right, shown, images, cut) in found.items():
+        assert client == width
+        assert scroll <= width
+        assert right <= width
+        assert shown == images > 0
+        assert cut == 0 or width < 1400
 
 
 @cache
@@ -157,9 +160,9 @@ def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_p
 
 def test_without_scripts_the_page_is_whole(tmp_path):
     inert = html_of(aging_campaign).replace("<script>", '<script type="text/plain">')
-    shown = loaded(FRAME.replace("WIDTH", "1200"), inert, tmp_path)
-    images = re.search(r"<title>measured 1200 1200 \d+ (\d+) (\d+) \d+</title>", shown)
-    assert images[1] == images[2] == str(html_of(aging_campaign).count("<img"))
+    ((client, scroll, _, shown, images, _),) = measured(inert, [1200], tmp_path).values()
+    assert client == scroll == 1200
+    assert shown == images == html_of(aging_campaign).count("<img")
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -179,6 +182,13 @@ def test_the_page_prints_on_a4(tmp_path):
     assert document.startswith(b"%PDF")
     sheets = set(re.findall(rb"/MediaBox ?\[0 0 (\d+)\S* (\d+)", document))
     assert sheets == {(b"594", b"841")}  # points
+
+
+def measured(page, widths, folder):
+    """Return by width what a browser measures of a page: see `FRAME`."""
+    shown = loaded(FRAME.replace("WIDTHS", json.dumps(widths)), page, folder)
+    found = json.loads(html.unescape(re.search(r"<title>measured (.*?)</title>", shown)[1]))
+    return {int(width): sizes for width, sizes in found.items()}
 
 
 def loaded(around, page, folder, *options):
