@@ -116,8 +116,8 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
-                times = max(TO_BE_ADDED * times, SIZE_MARGIN * LEAST_SIZE)
-                smallest = force * float(times) if times < TO_BE_ADDED else None
+                stated = float(max(TO_BE_ADDED * times, SIZE_MARGIN * LEAST_SIZE))
+                smallest = force * stated if times < 1 else None
             if smallest is None:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
                 if channel.unit == "sample" and specimens > 1:

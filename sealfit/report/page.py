@@ -164,8 +164,7 @@ def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict
 TABLES = (
     "inputs", "runs", "quality", "traces", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves",
     "aging_laws", "property_values", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
-    "residuals_before", "residuals_after", "levels", "channels", "shapes", "shape_points",
-    "curves",
+    "residuals_before", "residuals_after", "levels", "channels", "shapes", "shape_points", "curves",
 )  # fmt: skip
 FITS = (
     "steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves",

@@ -191,9 +191,10 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units, repeats: pd.DataFram
     `trace` are its rows of table `traces_mean`, `repeats` those of its strokes in table `traces` with their
     direction; the force is drawn in the direction of motion.
     """
-    for _, stroke in repeats.groupby(["file", "stroke"]) if repeats is not None and len(repeats) else ():
-        one = envelope(along_motion(stroke), REPEAT_BUCKETS)
-        ax.plot(one["displacement_mm"], one["force_N"], color=QUIET, linewidth=0.5, zorder=1)
+    if repeats is not None:
+        for _, stroke in repeats.groupby(["file", "stroke"]):
+            one = envelope(along_motion(stroke), REPEAT_BUCKETS)
+            ax.plot(one["displacement_mm"], one["force_N"], color=QUIET, linewidth=0.5, zorder=1)
     thin = envelope(along_motion(trace))
     x, force, error = thin["displacement_mm"], thin["force_N"], thin["force_se_N"].fillna(0)
     draw_band(ax, x, force - error, force + error, AFTER, alpha=0.25)
