@@ -142,9 +142,10 @@ def test_no_scheduler_is_a_clear_error(monkeypatch):
 def test_what_is_no_scheduler_is_said_at_once(tmp_path):
     with pytest.raises(RequestError, match=r"'foo' is not an address of a scheduler\. Write tcp://host:8786"):
         Cluster("foo")
-    (tmp_path / "scheduler.json").write_text("{}")
-    with pytest.raises(RequestError, match=r"scheduler\.json is not a scheduler file"):
-        Cluster(str(tmp_path / "scheduler.json"))
+    for text in ("{}", "[" * 4_000 + "]" * 4_000):
+        (tmp_path / "scheduler.json").write_text(text)
+        with pytest.raises(RequestError, match=r"scheduler\.json is not a scheduler file"):
+            Cluster(str(tmp_path / "scheduler.json"))
 
 
 def test_a_cluster_without_workers_is_a_clear_error(dask):

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from simulation_helpers import ONE_CONDITION, effect, tree
 
-from sealfit.errors import ConfigError, OutError
-from sealfit.simulation import Spec, load_spec, simulate, truth_path
+from sealfit.errors import ConfigError, OutError, RequestError
+from sealfit.simulation import Spec, load_spec, load_truth, simulate, truth_path
 
 SAMPLE = Path(__file__).parents[1] / "sample_data"
 SMALL = Spec(design={**ONE_CONDITION, "repeats": 2}, noise=[{"kind": "white", "sd_N": 0.1}])
@@ -56,6 +56,10 @@ def test_a_foreign_truth_file_and_a_plain_file_are_refused(tmp_path):
     (tmp_path / "b").write_text("")
     with pytest.raises(OutError, match="is a file"):
         simulate(SMALL, tmp_path / "b")
+    for text in ("{}", "[" * 4_000 + "]" * 4_000):
+        (tmp_path / "a.truth.json").write_text(text)
+        with pytest.raises(RequestError, match="is not the truth of a simulated campaign"):
+            load_truth(tmp_path / "a.truth.json")
 
 
 def test_a_failure_leaves_the_last_campaign_and_no_litter(tmp_path, monkeypatch):

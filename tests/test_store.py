@@ -412,11 +412,30 @@ def test_a_folder_that_sealfit_did_not_make_is_refused(out, campaign):
         do_all(campaign, campaign)
 
 
-def test_a_state_that_cannot_be_read_is_refused(out, campaign):
+DEEP = "[" * 4_000 + "]" * 4_000
+
+
+@pytest.mark.parametrize("state", ['{"program": "else"}', DEEP], ids=["foreign", "deep"])
+def test_a_state_that_cannot_be_read_is_refused(out, campaign, state):
     out.mkdir()
-    (out / "state.json").write_text('{"program": "else"}')
+    (out / "state.json").write_text(state)
     with pytest.raises(OutError, match="is not a state that this version"):
         do_all(out, campaign)
+
+
+@pytest.mark.parametrize("document", [DEEP, "{"], ids=["deep", "cut"])
+def test_a_result_that_is_no_json_is_one_line(out, campaign, document):
+    do_all(out, campaign)
+    (out / "closure.json").write_text(document)
+    with pytest.raises(OutError, match=r"closure\.json: is not what sealfit wrote"):
+        Store.open(out).read_json("closure")
+
+
+def test_a_lock_of_lists_in_lists_names_nobody(out, campaign):
+    out.mkdir()
+    (out / LOCK).write_text(DEEP)
+    do_all(out, campaign)
+    assert stale(out) == []
 
 
 def test_results_of_an_earlier_format_are_made_again(out, campaign):

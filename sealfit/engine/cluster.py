@@ -170,7 +170,7 @@ def _connected(scheduler: str) -> Client:
         address = scheduler
         if Path(scheduler).is_file():
             address = json.loads(Path(scheduler).read_text("utf-8"))["address"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         fix = f"Give one that Dask wrote, or {EXAMPLE}."
         raise RequestError(f"{scheduler} is not a scheduler file.", fix=fix) from error
     place = re.fullmatch(r"\w+://\[?(?P<host>[^]]+)\]?:(?P<port>\d+)", address)

@@ -70,7 +70,7 @@ def load_truth(path: Path) -> dict:
         raise RequestError(
             f"cannot be read ({error.strerror}).", file=path, fix="Simulate the campaign."
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         document = error
     if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
         raise RequestError(

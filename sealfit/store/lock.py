@@ -109,7 +109,7 @@ def _same_file(handle: int, path: Path) -> bool:
 def _owner(handle: int) -> dict:
     try:
         owner = json.loads(os.pread(handle, 10_000, 0))
-    except (ValueError, OSError):
+    except (ValueError, RecursionError, OSError):
         return {}
     return owner if isinstance(owner, dict) else {}
 

@@ -321,7 +321,7 @@ class State:
             return None
         except OSError as error:
             raise OutError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             what = "is not a state that this version of sealfit can read."
             raise OutError(what, file=path, fix="Choose another --out.") from error
 

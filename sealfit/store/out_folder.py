@@ -282,9 +282,13 @@ class Store:
         return by_conditions(conditions)
 
     def read_json(self, name: str) -> dict:
-        """Return `<name>.json`."""
+        """Return `<name>.json`; OutError if it is none."""
+        path = self.out / f"{name}.json"
         try:
-            return json.loads((self.out / f"{name}.json").read_text("utf-8"))
+            return json.loads(path.read_text("utf-8"))
+        except (ValueError, RecursionError) as error:
+            fix = f"Run: sealfit close-loop {quoted(self.out)} --force"
+            raise OutError("is not what sealfit wrote.", file=path, fix=fix) from error
         finally:
             self._require_unchanged()
 
