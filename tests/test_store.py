@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from small_tables import small
 
 from sealfit.config import parse_config
-from sealfit.errors import OutError, StaleError
+from sealfit.errors import ConfigError, OutError, StaleError
 from sealfit.store import parquet
 from sealfit.store.lock import LOCK
 from sealfit.store.manifest import STAGING, STATE, STEPS, ConfigCopy, State, fingerprint, seen_config, to_json
@@ -436,6 +436,30 @@ def test_a_lock_of_lists_in_lists_names_nobody(out, campaign):
     (out / LOCK).write_text(DEEP)
     do_all(out, campaign)
     assert stale(out) == []
+
+
+needs_bytes = pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux only")
+
+
+@needs_bytes
+def test_a_campaign_in_a_folder_that_is_not_utf_8_is_kept(tmp_path, out, campaign):
+    place = tmp_path / os.fsdecode(b"caf\xe9")
+    campaign.rename(place)
+    do_all(out, place)
+    assert stale(out, place) == []
+    assert Store.open(out).state.campaign == place
+
+
+@needs_bytes
+def test_an_out_that_is_not_utf_8_is_refused(tmp_path, campaign):
+    with pytest.raises(OutError, match=r"is a path that is not UTF-8\. Choose another --out"):
+        do_all(tmp_path / os.fsdecode(b"caf\xe9"), campaign)
+
+
+def test_a_config_that_is_a_link_to_itself_is_one_line(tmp_path):
+    (tmp_path / "rig.toml").symlink_to("rig.toml")
+    with pytest.raises(ConfigError, match=r"cannot be read"):
+        ConfigCopy.at(tmp_path / "rig.toml")
 
 
 def test_results_of_an_earlier_format_are_made_again(out, campaign):

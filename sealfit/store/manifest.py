@@ -194,7 +194,8 @@ class ConfigCopy:
     @classmethod
     def at(cls, path: Path | None) -> ConfigCopy:
         """Return the config file at `path`, or the default; ConfigError if it cannot be read."""
-        return cls(path.resolve() if path else None, read_config(path))
+        text = read_config(path)  # first, as a link that leads to itself has no path to resolve
+        return cls(path.resolve() if path else None, text)
 
     @property
     def name(self) -> str:
@@ -306,9 +307,11 @@ class State:
         Raises
         ------
         OutError
-            If state.json is not one that this version of sealfit wrote.
+            If state.json is not one that this version of sealfit wrote, or Arrow cannot open files in `out`.
         """
         path = out / STATE
+        if any("\ud800" <= character <= "\udfff" for character in str(out)):
+            raise OutError("is a path that is not UTF-8.", file=out, fix="Choose another --out.")
         try:
             kept = json.loads(path.read_text("utf-8"))
             if kept["program"] != "sealfit" or kept["format"] > FORMAT:

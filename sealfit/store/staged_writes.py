@@ -49,8 +49,8 @@ class Staged:
         self.text(f"{name}.json", to_json(document))
 
     def text(self, name: str, text: str) -> None:
-        """Write a text file."""
-        self._write(name, lambda path: path.write_bytes(text.encode("utf-8")))
+        """Write a text file; bytes of paths that are not UTF-8 become escapes, which JSON reads back."""
+        self._write(name, lambda path: path.write_bytes(text.encode("utf-8", "backslashreplace")))
 
     def figure(self, name: str, figure: Drawn) -> None:
         """Write a drawn figure as `plots/<name>.png`, `.pdf` and `.svg`."""
