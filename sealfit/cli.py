@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -20,7 +21,17 @@ from typer.core import TyperCommand
 
 from sealfit import __version__
 from sealfit.engine import one_thread
-from sealfit.errors import MEMORY, MORE_MEMORY, SealfitError, grouped, memory_ran_out, told
+from sealfit.errors import (
+    LONGEST_PATH,
+    MEMORY,
+    MORE_MEMORY,
+    SealfitError,
+    grouped,
+    memory_ran_out,
+    printable,
+    shortened,
+    told,
+)
 
 # ---------------------------------------------------------------- options
 # Arguments and options that several commands share.
@@ -47,6 +58,7 @@ Json = Annotated[bool, Option("--json", help="Print exactly one JSON object on s
 # ---------------------------------------------------------------- ending
 # How a command ends: what it prints, as text or as one JSON object, and its exit code.
 
+FORBIDDEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)  # what the system refuses to open
 BUG = 70  # EX_SOFTWARE of sysexits.h
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
@@ -56,7 +68,7 @@ def end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: b
     if as_json:
         print_json({"ok": True, "command": command, **made})
     else:
-        typer.echo("\n".join(_coloured(text) for text in lines(made)))
+        typer.echo("\n".join(_coloured(printable(text)) for text in lines(made)))
 
 
 VERDICT_COLOURS = {"closed": "green", "nothing_missing": "green", "cannot_tell": "yellow"}
@@ -72,10 +84,10 @@ def _coloured(text: str) -> str:
 
 
 def print_json(document: dict) -> None:
-    """Print exactly one JSON object."""
+    """Print exactly one JSON object, in ASCII: a terminal obeys control characters."""
     from sealfit.store.manifest import to_json
 
-    typer.echo(to_json(document), nl=False)
+    typer.echo(to_json(document, ensure_ascii=True), nl=False)
 
 
 def exit_code(app: typer.Typer) -> int:
@@ -94,7 +106,7 @@ def exit_code(app: typer.Typer) -> int:
     except Exception as error:
         if memory_ran_out(error):
             return _fail(f"sealfit: {MEMORY} {MORE_MEMORY}", [_error(MEMORY, fix=MORE_MEMORY)], 1)
-        if isinstance(error, PermissionError) and error.filename is not None:
+        if isinstance(error, OSError) and error.errno in FORBIDDEN and error.filename is not None:
             return _forbidden(error)
         # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they
         # can do.
@@ -111,15 +123,16 @@ def exit_code(app: typer.Typer) -> int:
 
 def _fail(message: str, errors: list[dict], code: int) -> int:
     if "--json" in sys.argv[1:]:
-        print(json.dumps({"ok": False, "errors": errors}, indent=1, ensure_ascii=False, allow_nan=False))
-    print(message, file=sys.stderr)
+        print(json.dumps({"ok": False, "errors": errors}, indent=1, allow_nan=False))
+    print(printable(message), file=sys.stderr)
     return code
 
 
-def _forbidden(error: PermissionError) -> int:
+def _forbidden(error: OSError) -> int:
     """Report a file or folder without access, such as one in a folder that cannot be searched."""
-    file, reason = os.fsdecode(error.filename), f"there is no access ({error.strerror})."
-    fix = "Fix its rights, or those of the folders above it."
+    file = shortened(os.fsdecode(error.filename), LONGEST_PATH)
+    reason = f"there is no access ({error.strerror})."
+    fix = "Fix its name or rights, or those of the folders above it."
     return _fail(f"sealfit: {file}: {reason} {fix}", [_error(reason, file=file, fix=fix)], 1)
 
 

@@ -260,6 +260,27 @@ def test_a_folder_that_may_not_be_searched_is_one_line_and_1(sealfit, monkeypatc
     assert told["reason"] == "there is no access (Permission denied)."
 
 
+@pytest.mark.parametrize("text", ["glob = '{}'", "runs_table = '{}.csv'"])
+def test_a_name_longer_than_names_can_be_is_one_line_and_1(sealfit, campaign, tmp_path, text):
+    (tmp_path / "rig.toml").write_text("[files]\n" + text.format("x" * 5000))
+    ended = sealfit("check", campaign, "--config", tmp_path / "rig.toml")
+    assert ended.code == 1
+    assert len(ended.stderr.splitlines()) == 1
+    assert len(ended.stderr) < 1000
+    assert "there is no access (File name too long)" in ended.stderr
+
+
+@pytest.mark.parametrize("name", ["\x1b[2J", "\x9b2J", "\u202e"])
+def test_the_terminal_gets_no_control_characters_from_names(sealfit, campaign, out, tmp_path, name):
+    out.mkdir()
+    (out / name).write_text("")
+    for words in (("ingest", campaign, "--out", out), ("report", tmp_path / name)):
+        for option in ((), ("--json",)):
+            ended = sealfit(*words, *option)
+            assert ended.code == 1
+            assert {c for c in ended.stdout + ended.stderr if not c.isprintable()} <= {"\n"}
+
+
 def test_a_reader_that_leaves_early_is_no_fault():
     program = "import sys; sys.argv = ['sealfit', '--help']; from sealfit.cli import main; main()"
     read = subprocess.run(

@@ -332,9 +332,9 @@ class State:
 _STATE = TypeAdapter(State)
 
 
-def to_json(document: object, *, indent: int | None = 1) -> str:
+def to_json(document: object, *, indent: int | None = 1, ensure_ascii: bool = False) -> str:
     """Return `document` as JSON text: numbers that are not finite become null, numpy's become Python's."""
-    style = {"indent": indent, "ensure_ascii": False, "allow_nan": False}
+    style = {"indent": indent, "ensure_ascii": ensure_ascii, "allow_nan": False}
     try:
         return json.dumps(document, **style) + "\n"
     except (TypeError, ValueError):  # a type that JSON lacks, or a number that is not finite
