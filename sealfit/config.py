@@ -264,13 +264,13 @@ class Strokes(Strict):
     """Shorter strokes are not strokes."""
     min_samples: int = Field(20, ge=4, le=MOST)
     """A steady window with fewer samples is too short."""
-    speed_tolerance: float = Field(0.1, gt=0)
+    speed_tolerance: float = Field(0.1, gt=0, le=1)
     """Steady: smoothed speed within this share of its plateau."""
     min_steady_share: float = Field(0.2, gt=0, lt=1)
     """A steady window that is a smaller share of its stroke is too short."""
     whole_file: bool = False
     """Every file is one steady stroke, without ramps."""
-    turn: float | None = Field(None, gt=0)
+    turn: float | None = Field(None, ge=1e-9)
     """One turn of a rotation, in the unit of the displacement: `360`. Each turn is a stroke of its own, and
     its displacement counts from the turn's start.
     """
@@ -279,7 +279,7 @@ class Strokes(Strict):
 class Rig(Strict):
     """What the rig adds to the measured force."""
 
-    moving_mass_kg: float = Field(0.0, ge=0)
+    moving_mass_kg: float = Field(0.0, ge=0, le=1e6)
     """Mass that the measured force accelerates; mass times acceleration is subtracted from the force."""
 
 

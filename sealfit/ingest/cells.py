@@ -103,7 +103,7 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 # Both give the same columns and the line number of every row; the patient one also names what stands in the
 # way: text where a number belongs, remarks typed beside a number, lines with too few or too many cells.
 
-OVERLOAD = 1e30  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
+OVERLOAD = 1e24  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
 _CLOCK = re.compile(r"(?:.*[\sT])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:\s*([ap])\.?m\.?)?Z?", re.IGNORECASE)
 _DAY_S = 86400.0

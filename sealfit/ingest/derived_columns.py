@@ -213,7 +213,7 @@ ABSOLUTE_ZERO_C = -273.15
 
 
 def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
-    """Return faults of impossible values: negative days, no load, no speed, below absolute zero."""
+    """Return faults of impossible values: negative days, no load, no speed, too cold, or too large."""
     found: list[tuple[int, Fault]] = []
 
     def add(name: str, wrong: Callable[[float], bool], reason: str, fix: str) -> None:
@@ -229,11 +229,17 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
     fix = "Temperatures are in °C; give another unit in the rig config."
     for name in (name for name in columns if name.endswith("_C")):
         add(name, _is_below_absolute_zero, "is not above absolute zero.", fix)
+    for name in columns:
+        add(name, _is_overload, "is larger than any quantity of a rig.", "Correct what gives it.")
     return [fault for _, fault in sorted(found, key=lambda one: one[0])]
 
 
 def _is_below_absolute_zero(value: float | str) -> bool:
     return not isinstance(value, str) and value <= ABSOLUTE_ZERO_C
+
+
+def _is_overload(value: float | str) -> bool:
+    return not isinstance(value, str) and abs(value) >= OVERLOAD
 
 
 # ---------------------------------------------------------------- derive

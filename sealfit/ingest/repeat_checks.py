@@ -190,6 +190,8 @@ def _outliers(
 
 # Share of its peers' force by which a force against its motion is of the wrong sign, not an offset.
 AGAINST = -0.5
+# A smaller force was not measured; the square of its square would be 0.
+NOTHING = 1e-24
 
 
 def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
@@ -257,12 +259,13 @@ def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
         (whether the window's largest force is the stroke's), force_N, used.
     """
     used = strokes["used"].to_numpy(bool)
-    constant = used & (strokes["equal"].to_numpy(float) >= 1.0)
+    nothing = np.abs(strokes["force_N"].to_numpy(float)) < NOTHING
+    constant = used & (nothing | (strokes["equal"].to_numpy(float) >= 1.0))
     if not constant.any():
         return np.ones(len(strokes), bool), []
     others = strokes["equal"].to_numpy(float)[used & ~constant]
     noisy = bool(len(others) and np.median(others) < FINE)
-    dead = constant & (noisy | (strokes["force_N"].to_numpy(float) == 0.0))
+    dead = constant & (noisy | nothing)
     return ~dead, [_constant(row, bool(dead[i])) for i, row in strokes[constant].iterrows()]
 
 
@@ -272,7 +275,7 @@ def _constant(row: pd.Series, dead: bool) -> Fault:
     if dead:
         check, reason = "stuck", "unlike in other strokes."
         fix = MEASURE_AGAIN
-    if row["force_N"] == 0.0:
+    if abs(row["force_N"]) < NOTHING:
         reason = "so it was not measured."
     if dead and row["extreme"]:
         check = "saturated"

@@ -175,7 +175,7 @@ def _config_faults(config: Config) -> list[Fault]:
 def _is_encoding(name: str) -> bool:
     try:
         return name == "auto" or bool("a".encode(name))
-    except (LookupError, UnicodeError):  # rot13 and hex are codecs, but of no text
+    except (LookupError, ValueError):  # rot13 and hex are codecs, but of no text
         return False
 
 

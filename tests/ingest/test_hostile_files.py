@@ -194,6 +194,9 @@ def test_no_temperature_is_below_absolute_zero(tmp_path, value):
     [
         "[strokes]\nmin_travel_mm = -1\n",
         "[strokes]\nsmooth_samples = 1000000\n",
+        "[strokes]\nspeed_tolerance = 1e308\n",
+        "[strokes]\nturn = 1e-320\n",
+        "[rig]\nmoving_mass_kg = 1e308\n",
         "[loop]\nseed = -1\n",
         "[trace.columns]\ntime_s = 0\n",
         "[trace.columns]\ntime_s = true\n",
@@ -212,7 +215,7 @@ def test_a_pipe_is_no_config(tmp_path):
         load_config(tmp_path / "rig.toml")
 
 
-@pytest.mark.parametrize("encoding", ["rot13", "hex", "no-such"])
+@pytest.mark.parametrize("encoding", ["rot13", "hex", "no-such", "latin-1\\u0000"])
 def test_codecs_that_are_no_text_are_no_encodings(tmp_path, encoding):
     campaign(tmp_path, RUNS)
     with pytest.raises(CampaignError, match="is not an encoding"):
@@ -226,6 +229,24 @@ def test_forces_that_are_zero_everywhere_were_not_measured(tmp_path):
         (tmp_path / f"{name}.csv").write_text("\n".join([HEADER, *rows]))
     with pytest.raises(CampaignError, match="so it was not measured"):
         ingest_campaign(tmp_path, config('condition = ["aging_days"]'))
+
+
+@pytest.mark.parametrize(("factor", "said"), [("1e-100", "so it was not measured"), ("1e28", "rows are bad")])
+def test_forces_that_no_rig_measures_are_left_out(tmp_path, factor, said):
+    campaign(tmp_path, RUNS)
+    rows = [row.rpartition(",")[0] + f",{2 + 0.1 * (i % 7)}" for i, row in enumerate(ROWS)]
+    for name in "abc":
+        (tmp_path / f"{name}.csv").write_text(csv_of(rows))
+    text = f'condition = ["aging_days"]\n[trace.compute]\nforce_N = "force_N * {factor}"\n'
+    with pytest.raises(CampaignError, match=said):
+        ingest_campaign(tmp_path, config(text))
+
+
+@pytest.mark.parametrize("value", ["[runs.constants]\nload_N = 1e150", "[runs.compute]\nload_N = '1e150'"])
+def test_values_that_no_rig_has_are_refused(tmp_path, value):
+    campaign(tmp_path, RUNS)
+    with pytest.raises(CampaignError, match="is larger than any quantity of a rig"):
+        channels(tmp_path, f'condition = ["aging_days"]\n{value}\n')
 
 
 def test_a_friction_that_pushes_along_stops_with_the_line_for_the_config(tmp_path):

@@ -228,6 +228,12 @@ def test_errors_stand_beside_the_noise_floor(ax, made):
     assert ax.get_xlabel() == "rms error (mN m)"
 
 
+def test_errors_that_are_all_zero_are_drawn(ax):
+    none = dict.fromkeys(("rmse_N", "rmse_runs_N", "heldout_rmse_N", "max_abs_N"), 0.0)
+    draw_errors(ax, {"before": none, "after": none, "noise_floor_N": 0.0}, TORQUE)
+    assert ax.get_xlim() == (0.0, 1.0)
+
+
 def test_run_means_weigh_files_alike():
     rows = pd.DataFrame({"run_id": "r", "file": ["a", "a", "a", "b"], "residual_N": [1.0, 1.0, 1.0, 3.0]})
     assert run_means(rows, "residual_N").tolist() == [2.0]

@@ -80,7 +80,7 @@ def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
         largest = max(largest, floor)
     ax.set_yticks(range(len(rows)), [label for _, label in reversed(rows)])
     ax.set_ylim(-0.6, len(rows) - 0.35)
-    ax.set_xlim(0.0, 1.13 * largest)
+    ax.set_xlim(0.0, 1.13 * largest or 1.0)
     ax.grid(axis="y", visible=False)
     ax.set_xlabel(f"rms error ({plain(units.unit('force'))})")
 
