@@ -48,8 +48,9 @@ class Fault:
         return printable(f"{text} {self.fix}".strip())
 
     def as_dict(self) -> dict:
-        """Return the fault as plain values, as `--json` prints it."""
-        return {name: getattr(self, name) for name in self.__slots__}
+        """Return the fault as plain values, as `--json` prints it; a long cell is cut."""
+        value = shortened(self.value, LONGEST_PATH) if isinstance(self.value, str) else self.value
+        return {name: getattr(self, name) for name in self.__slots__} | {"value": value}
 
 
 # Severity and action of findings that leave nothing out, and of a stroke that is left out: fields of `Fault`.

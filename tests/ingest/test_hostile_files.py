@@ -64,8 +64,10 @@ def test_a_remark_beside_a_number_is_quoted(tmp_path):
 
 
 def test_long_cells_and_control_characters_are_shortened_and_escaped_in_messages():
-    said = str(Fault("odd", "\x1b[2J is odd.", file=os.fsdecode(b"caf\xe9.csv"), value="x" * 1_000_000))
+    fault = Fault("odd", "\x1b[2J is odd.", file=os.fsdecode(b"caf\xe9.csv"), value="x" * 1_000_000)
+    said = str(fault)
     assert len(said) < 200
+    assert len(fault.as_dict()["value"]) < 500
     assert said.startswith("caf\\xe9.csv: 'xxx")
     assert "\\x1b[2J" in said
 
