@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config, TraceFormat
-from sealfit.errors import BadFile, ConfigError, Fault
+from sealfit.errors import KEPT, BadFile, ConfigError, Fault
 from sealfit.ingest.cells import Cells, Rows, array_cells, body_of, clean, read_cells, width_of
 from sealfit.ingest.columns import (
     RESERVED,
@@ -247,6 +247,7 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
     if settings.keep is not None:
         keep = _evaluate(parse(settings.keep, condition=True), {**known, **rows.columns}, file)
         rows = rows.where(np.broadcast_to(keep, rows.line.shape))
+    faults += _not_computed(rows, settings, file)
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
         fix = "Check drop_first_rows, keep and the export."
@@ -309,6 +310,17 @@ def _computed(rows: Rows, compute: Mapping[str, Expression], known: Mapping[str,
         value = _evaluate(expression, {**known, **columns}, file)
         columns[name] = np.broadcast_to(value, rows.line.shape).astype(float)
     return Rows(columns, rows.line)
+
+
+def _not_computed(rows: Rows, settings: TraceFormat, file: str) -> list[Fault]:
+    """Return a warning for each computed channel that is no number in some rows."""
+    faults = []
+    for name in settings.compute.keys() - {*SLOTS, *settings.drop_columns}:
+        if lacking := np.count_nonzero(~np.isfinite(rows.columns[name])):
+            reason = f"is computed in the rig config, and is no number in {lacking} of {len(rows.line)} rows."
+            fix = "Correct the expression, or the cells that it reads."
+            faults.append(Fault("not_finite", reason, file=file, column=name, fix=fix, **KEPT))
+    return faults
 
 
 def _evaluate(expression: Expression, values: Mapping[str, object], file: str) -> np.ndarray:

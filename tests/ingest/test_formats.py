@@ -122,6 +122,14 @@ def test_what_cannot_be_computed_is_a_fault_that_json_can_hold(tmp_path):
     assert (fault.check, fault.line, fault.value) == ("not_finite", 2, "inf")
 
 
+def test_a_computed_channel_that_is_no_number_is_said(tmp_path):
+    text = 'trace.compute.root = "sqrt(force_N - 2.1)"\ntrace.compute._helper = "1 / displacement_mm"\n'
+    trace = read(tmp_path, csv_of(ROWS), f'{text}trace.drop_columns = ["_helper"]\n')
+    (fault,) = trace.faults
+    assert (fault.check, fault.column, fault.severity) == ("not_finite", "root", "warning")
+    assert "no number in 10 of 100 rows" in fault.reason
+
+
 def test_an_instrument_s_mark_for_overload_is_no_force(tmp_path):
     rows = [f"{row},20" for row in ROWS]
     rows[10], rows[20] = "1.0,5.0,9.9E+37,20", "2.0,10.0,2.2,9.91e37"
