@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import io
 import re
+import struct
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -291,6 +292,8 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     else:
         from scipy.io import loadmat
 
+        if raw[124:128] in _BYTE_ORDER:
+            _refuse_damage(raw, 128, len(raw), _BYTE_ORDER[raw[124:128]])
         loaded = loadmat(io.BytesIO(raw), simplify_cells=True)
         variables = {name: value for name, value in loaded.items() if not name.startswith("__")}
     header = [_header_line(name, value) for name, value in _scalars(variables)]
@@ -313,6 +316,39 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
         )
         raise bad_file(file, "column_shape", reason, "Save its transpose.")
     return Arrays(tuple(header), (), tuple(table.T.astype(float)))
+
+
+# Version 5 has no checksum, and a wrong tag in it makes `loadmat` crash: the tags are checked before.
+_BYTE_ORDER = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}
+_TAGS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 14, 15, 16, 17, 18}
+_MATRIX, _COMPRESSED = 14, 15
+# Elements of an array by class: flags, sizes, name, what follows; one more for an imaginary part.
+_PARTS = {**dict.fromkeys(range(4, 16), 4), 5: 6}
+_SPARSE, _OPAQUE = 5, 16  # _OPAQUE: the first class without sizes
+
+
+def _refuse_damage(raw: bytes, at: int, end: int, order: str) -> list[tuple[int, int]]:
+    """Return begin and size of the data elements from `at` to `end`; ValueError if they are not whole."""
+    found = []
+    while at < end:
+        tag, size = struct.unpack_from(f"{order}II", raw, at)
+        begin = at + 8
+        at = begin + (size if tag == _COMPRESSED else size + -size % 8)
+        if small := tag >> 16:  # up to four bytes stand in the tag itself
+            tag, size, begin, at = tag & 0xFFFF, small, begin - 4, begin
+        if tag not in _TAGS or small > 4 or begin + size > end:
+            raise ValueError("its tags are damaged")
+        found.append((begin, size))
+        if tag == _MATRIX and size:
+            parts = _refuse_damage(raw, begin, begin + size, order)
+            (flags,) = struct.unpack_from(f"{order}I", raw, parts[0][0])
+            kind, imaginary = flags & 0xFF, flags >> 11 & 1
+            if kind < _OPAQUE:
+                shape = np.frombuffer(raw, f"{order}u4", parts[1][1] // 4, parts[1][0])
+                fits = kind == _SPARSE or np.prod(shape, dtype=float) <= size
+                if len(shape) < 2 or not fits or len(parts) - imaginary != _PARTS.get(kind, len(parts)):
+                    raise ValueError("an array is damaged")
+    return found
 
 
 def _tables(

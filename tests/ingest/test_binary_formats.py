@@ -22,6 +22,7 @@ from format_helpers import (
 )
 from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
+from scipy.sparse import csc_array
 from trace_helpers import config
 
 from sealfit.commands import check
@@ -333,6 +334,36 @@ def test_a_damaged_file_is_a_fault_with_a_fix(tmp_path, capfd, ending, damage):
     assert refused(tmp_path, file).check in ("empty_file", "damaged_file", "binary_file", "no_rows")
     assert read_or_nothing(tmp_path, file) == {}
     assert capfd.readouterr() == ("", "")  # the libraries' own warnings
+
+
+MIXED = {
+    **dict.fromkeys(("time_s", "displacement_mm", "force_N"), np.arange(60.0)),
+    "S": {"rate": 1.0, "none": [], "cells": np.array([1, "a"], object)},
+    "z": np.arange(3) * 1j,
+    "sparse": csc_array(np.eye(3)),
+}
+
+
+def test_mat_files_of_every_kind_of_variable_are_not_refused(tmp_path):
+    savemat(tmp_path / "t.mat", MIXED)
+    assert len(read(tmp_path, "t.mat", 'trace.variable = "(vectors)"').line) == 60
+
+
+@pytest.mark.parametrize(
+    ("tag", "byte", "bit"),
+    [
+        (b"\x06\0\0\0\x08\0\0\0\x06", 9, 8),  # an array is complex, and has no imaginary part
+        (b"\x09\0\0\0\xe0\1", 0, 1),  # of a type that there is not
+        (b"\x05\0\0\0\x08", 2, 2),  # sizes of two bytes
+        (b"\x05\0\0\0\x08\0\0\0\1\0\0\0\x02\0\0\0", 15, 64),  # more cells than bytes
+    ],
+)
+def test_a_bit_of_a_mat_file_that_crashes_its_library_is_a_fault(tmp_path, tag, byte, bit):
+    savemat(tmp_path / "t.mat", MIXED)
+    raw = bytearray((tmp_path / "t.mat").read_bytes())
+    raw[raw.index(tag, 128) + byte] ^= bit
+    (tmp_path / "t.mat").write_bytes(raw)
+    assert refused(tmp_path, "t.mat").check == "damaged_file"
 
 
 def read_or_nothing(folder, file):
