@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 
 from sealfit.draft.vocabulary import Unit, name_and_unit, plain, setting, unit_of
 from sealfit.ingest.files import as_number
@@ -26,7 +27,8 @@ _DAYS = (
     (re.compile(r"[0-3]?\d\.[01]?\d\.20\d\d"), "%d.%m.%Y"),
     (re.compile(r"20\d\d-[01]\d-[0-3]\d"), "%Y-%m-%d"),
     (re.compile(r"20\d\d/[01]\d/[0-3]\d"), "%Y/%m/%d"),
-    (re.compile(r"[0-3]?\d/[0-3]?\d/20\d\d"), "%m/%d/%Y"),
+    (re.compile(r"(?<!\d)[01]?\d/[0-3]?\d/20\d\d"), "%m/%d/%Y"),
+    (re.compile(r"[0-3]?\d/[01]?\d/20\d\d"), "%d/%m/%Y"),
 )
 CLOCK = re.compile(
     r"(?P<clock>[0-2]?\d:[0-5]\d(?P<second>:[0-5]\d)?)(?:[.,]\d+)?(?P<half>\s*[AP]M)?", re.IGNORECASE
@@ -101,9 +103,17 @@ def started_in(headers: Sequence[Sequence[str]]) -> When | None:
     for number, line in enumerate(headers[0], start=1):
         for days, spelled in _DAYS:
             match = days.search(line)
-            if match and (when := _with_clock(headers, number, line, match, spelled)):
+            when = match and _with_clock(headers, number, line, match, spelled)
+            if when and all(_is_day(text, days, spelled) for text in _found(when.pattern, headers)):
                 return when
     return None
+
+
+def _is_day(text: str, days: re.Pattern, spelled: str) -> bool:
+    try:
+        return bool(datetime.strptime(days.search(text)[0], spelled))
+    except (TypeError, ValueError):  # 14/03/2024 is no date where the month stands first
+        return False
 
 
 def _with_clock(headers, number: int, line: str, match: re.Match, spelled: str) -> When | None:
@@ -113,7 +123,8 @@ def _with_clock(headers, number: int, line: str, match: re.Match, spelled: str) 
     if clock is not None:
         between = line[match.end() : clock.start()]
         full = f"{spelled}{between.replace('%', '%%')}{_clock_format(clock)}"
-        pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(line[match.start() : clock.end()])) + ")"
+        end = clock.end() if clock["half"] else clock.end("clock")  # strptime reads no fraction of a second
+        pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(line[match.start() : end])) + ")"
         pattern = re.sub(r"[AP]M\)$", "[AP]M)", pattern).replace(r"\ ", " ")
         return When(pattern, full, number, line.strip()) if _everywhere(pattern, headers) else None
     pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(match.group())) + ")"

@@ -1,5 +1,6 @@
 """The draft of a config reads what others' programs export, without an edit."""
 
+import re
 from datetime import timedelta
 from itertools import product
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from sealfit.config import parse_config
 from sealfit.draft.draft import draft
+from sealfit.draft.header_lines import started_in
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_trace
@@ -112,6 +114,17 @@ def test_a_german_date_in_the_header_is_a_doubt_with_the_lines_that_would_read_i
     assert "header line 2" in doubt.reason
     assert "14.03.2024" in doubt.reason
     assert any("%d.%m.%Y %H:%M:%S" in line for line in doubt.lines)
+
+
+@pytest.mark.parametrize(
+    ("dates", "order"),
+    [(("03/14/2024", "03/02/2024"), "%m/%d/%Y"), (("03/02/2024", "14/03/2024"), "%d/%m/%Y")],
+)
+def test_the_order_of_day_and_month_is_the_one_that_fits_all_files(dates, order):
+    lines = [f"Date\t{date} 09:19:33.25" for date in dates]
+    when = started_in([(line,) for line in lines])
+    assert when.format == f"{order} %H:%M:%S"
+    assert [re.search(when.pattern, line)[1] for line in lines] == [f"{date} 09:19:33" for date in dates]
 
 
 @pytest.mark.parametrize(
