@@ -23,7 +23,7 @@ from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import channels_of, name_parts
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import RUNS_CSV, natural
-from sealfit.ingest.start_times import excel_time
+from sealfit.ingest.start_times import excel_time, usual_formats
 from sealfit.units import Units, conversion
 
 NO_CONDITION = {
@@ -33,6 +33,7 @@ NO_CONDITION = {
 AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
 SPEED_UNITS = ("mm/min", "m/s", "cm/s", "um/s", "in/min", "in/s")
+_WHOLE_DAY = re.compile(r"\d{4}-\d\d-\d\d(?:[ T]00:00(?::00)?)?")  # a workbook's date is a midnight
 MOST_LISTED = 20  # files that are excluded by name; more are said in a sentence
 
 
@@ -347,7 +348,12 @@ def _values(part: Part) -> str:
 
 
 def _table_keys(table: RunsTable, notes: Notes) -> None:
+    clock = next((name for name, cells in table.cells.items() if all(map(CLOCK.fullmatch, cells))), None)
     for theirs, ours in table.ours.items():
+        if ours == "started_at" and clock and all(map(_WHOLE_DAY.fullmatch, table.cells[theirs])):
+            evidence = f"columns '{theirs}' and '{clock}' of {table.file}"
+            notes.guess("files.started_at", {"date": theirs, "time": clock}, evidence)
+            continue
         value = file_column(theirs, table.units.get(theirs), ours)
         if value != ours:
             cell = next((cell for cell in table.cells[theirs] if cell), "")
@@ -363,7 +369,7 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
         fix = "Write the height in percent of the original into the table."
         notes.doubt("files.runs_columns", f"compressions up to {max(numbers):g} % {like}.", fix)
     if "started_at" not in cells:
-        _dates_doubt(table, notes)
+        _dates_doubt(table, clock, notes)
     if unknown := [f"'{name}'" for name in table.cells if name not in table.ours and not name.isidentifier()]:
         reason = (
             f"what {', '.join(unknown)} of {table.file} hold{'s' * (len(unknown) == 1)} is not known here."
@@ -373,15 +379,18 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
         )
 
 
-def _dates_doubt(table: RunsTable, notes: Notes) -> None:
-    clock = next((name for name, cells in table.cells.items() if all(map(CLOCK.fullmatch, cells))), None)
+def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> None:
     dates = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}")
     for name, cells in table.cells.items():
         full = [cell for cell in cells if cell]
         if name not in table.ours and full and all(dates.search(cell) for cell in full):
             what = f"holds dates that are not ISO 8601, such as '{full[0]}'"
-            started = f"'{name}'" if clock is None else f"{{ date = '{name}', time = '{clock}' }}"
-            fix = f"Set files.started_at = {started}, and files.date_format, such as '%d.%m.%Y %H:%M'."
+            started = f"files.runs_columns.started_at = '{name}'"
+            if clock is not None:
+                started = f"files.started_at = {{ date = '{name}', time = '{clock}' }}"
+                full = [f"{day} {time}" for day, time in zip(cells, table.cells[clock], strict=True) if day]
+            form = " or ".join(usual_formats(full)) or "a list of formats, such as ['%d.%m.%Y %H:%M']"
+            fix = f"Set {started} and files.date_format = {form}."
             notes.doubt("files.runs_columns", f"column '{name}' of {table.file} {what}.", fix)
             return
 

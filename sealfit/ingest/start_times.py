@@ -114,6 +114,19 @@ def excel_time(text: str) -> datetime | None:
     return EXCEL_DAY_0 + timedelta(milliseconds=round(sum(numbers) * 86_400_000))
 
 
+def usual_formats(texts: Sequence[str]) -> list[str]:
+    """Return the first two of the usual formats in which all of these dates are, as a config writes them.
+
+    Examples
+    --------
+    >>> usual_formats(["14/03/2024 09:30"]), usual_formats(["03/02/2024", "14/02/2024"])
+    (["'%d/%m/%Y %H:%M'"], ["'%d/%m/%Y'"])
+    """
+    usual = (date + clock for clock in _CLOCKS for date in _USUAL)
+    fits = (repr(one) for one in usual if all(_read(datetime.strptime, text, one) for text in texts))
+    return list(islice(fits, 2))
+
+
 def _reason(formats: Sequence[str]) -> str:
     tried = ", ".join(repr(one) for one in formats)
     return f"fits none of the formats tried: {tried}, ISO 8601." if formats else "is not an ISO 8601 time."
@@ -121,8 +134,7 @@ def _reason(formats: Sequence[str]) -> str:
 
 def _fix(text: str) -> str:
     """Return a fix: the formats that a date is in, by the usual ones, or how it should be written."""
-    usual = (date + clock for clock in _CLOCKS for date in _USUAL)
-    likely = list(islice((repr(one) for one in usual if _read(datetime.strptime, text, one)), 2))
+    likely = usual_formats([text])
     if likely:
         return f"Set date_format = {' or '.join(likely)} under [files] in the rig config."
     fix = "Write it as 2024-03-01T09:30:00, or give its format: "

@@ -349,8 +349,31 @@ def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_k
     columns = parse_config(made.text, "rig.toml").files.runs_columns
     assert (columns["temperature_C"].name, columns["speed_mm_s"].unit) == ("Ofen", "mm/min")
     doubts = " ".join(f"{doubt.reason} {doubt.fix}" for doubt in made.doubts)
-    assert "files.started_at = { date = 'Datum', time = 'Uhrzeit' }" in doubts
+    started = "files.started_at = { date = 'Datum', time = 'Uhrzeit' }"
+    assert f"Set {started} and files.date_format = '%d.%m.%Y %H:%M'." in doubts
     assert "what 'Gewicht [kg]' of log.csv holds is not known here" in doubts
+
+
+def test_a_log_with_whole_dates_and_a_clock_is_read(tmp_path):
+    rows = ["File,Days,Date,Time"]
+    for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
+        exports.write(tmp_path, f"M{number}.csv", plain(one))
+        rows.append(f"M{number}.csv,{one.days},2024-03-14T00:00:00,{one.started:%H:%M:%S}")
+    exports.write(tmp_path, "log.csv", "\n".join(rows) + "\n")
+    made = draft(tmp_path)
+    assert "columns 'Date' and 'Time' of log.csv" in [guess.evidence for guess in made.guesses]
+    runs = ingest_campaign(tmp_path, parse_config(made.text, "rig.toml")).tables["runs"]
+    assert list(runs["started_at"])[:2] == ["2024-03-14T09:19:33", "2024-03-14T09:26:33"]
+
+
+def test_a_log_with_dates_of_another_form_is_said_with_the_key_that_reads_them(tmp_path):
+    rows = ["File,Days,Date"]
+    for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
+        exports.write(tmp_path, f"M{number}.csv", plain(one))
+        rows.append(f"M{number}.csv,{one.days},14/03/2024")
+    exports.write(tmp_path, "log.csv", "\n".join(rows) + "\n")
+    (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "ISO 8601" in doubt.reason]
+    assert doubt.fix == "Set files.runs_columns.started_at = 'Date' and files.date_format = '%d/%m/%Y'."
 
 
 @pytest.mark.parametrize(("mark", "sign"), [(",", "."), (";", ",")])
