@@ -1,6 +1,6 @@
 """What columns, parts of file names and header lines are called, and their units.
 
-The words are English and German; of columns the usual French, Italian and Spanish ones too.
+The words are English and German, and the usual French, Italian and Spanish ones.
 """
 
 from __future__ import annotations
@@ -211,19 +211,19 @@ BEFORE = {
     **dict.fromkeys(
         ("C", "K", "comp", "compr", "compression", "verpressung", "H", "height"), "compression_ratio_pct"
     ),
-    **dict.fromkeys(("d", "D", "t", "day", "days", "tag", "tage", "age", "aged", "alter"), "aging_days"),
+    **dict.fromkeys(("d", "D", "t", "day", "days", "tag", "tage", "age", "aged", "alter", "j"), "aging_days"),
     **dict.fromkeys(("v", "V", "speed", "vel", "velocity", "geschw"), "speed_mm_s"),
-    **dict.fromkeys(
-        ("r", "R", "rep", "repeat", "run", "w", "W", "wdh", "wiederholung", "test", "trial"), "repeat"
-    ),
+    **dict.fromkeys(("r", "R", "rep", "repeat", "run", "w", "W", "wdh", "wiederholung"), "repeat"),
+    **dict.fromkeys(("test", "trial", "essai", "prova", "ensayo", "rip"), "repeat"),
     **dict.fromkeys(("F", "FN", "Fn", "L", "N", "load", "last"), "load_N"),
     **dict.fromkeys(("S", "s", "P", "sp", "spec", "specimen", "sample", "probe", "rawdata"), "specimen_id"),
 }
 AFTER = {
-    **dict.fromkeys(("C", "degC", "°C", "grad", "deg"), ("temperature_C", "")),
+    **dict.fromkeys(("C", "degC", "°C", "grad", "deg", "gradi", "grados"), ("temperature_C", "")),
     **dict.fromkeys(("F", "degF", "°F"), ("temperature_C", "degF")),
     **dict.fromkeys(("pct", "%", "percent", "prozent"), ("compression_ratio_pct", "")),
     **dict.fromkeys(("d", "day", "days", "tag", "tage", "j", "jours"), ("aging_days", "")),
+    **dict.fromkeys(("giorni", "dias", "días"), ("aging_days", "")),
     **dict.fromkeys(("h", "hr", "hrs", "hours", "std"), ("aging_days", "h")),
     **dict.fromkeys(("w", "wk", "weeks", "wochen"), ("aging_days", "week")),
     **dict.fromkeys(("mms", "mm s", "mmps", "mm/s", "mmpers"), ("speed_mm_s", "")),

@@ -34,6 +34,9 @@ AGED = {"temperature_C": 60.0, "aging_days": 4.0, "speed_mm_s": 5.0, "repeat": 1
         ("temp_{T}_days_{d}_speed_{v}_rep_{r}.csv", AGED),
         ("{T}degC/{d}days/{v}mmps_{r}.csv", AGED),
         ("T{T}/{d}d/T{T}_{d}d_{v}mms_{r}.csv", AGED),
+        ("T{T}_j{d}_V{v}_essai{r}.csv", AGED),
+        ("{T}gradi_{d}giorni_{v}mm-s_rip{r}.csv", AGED),
+        ("{T}grados_{d}días_{v}mmps_ensayo{r}.csv", AGED),
     ],
 )
 def test_a_way_of_naming_files_is_read(template, expected):
