@@ -413,11 +413,13 @@ def _remark(cell: str) -> str:
 
 
 def decimal_fix(cell: str, decimal: str) -> str:
-    """Return the fix for a number written with the other decimal mark; "" if that is not what is wrong."""
+    """Return the fix for a number with the other decimal mark or one of thousands; "" if it has neither."""
     if decimal == "." and as_number(cell, ",") is not None:
         return 'Use a decimal point, or set decimal = "," in the rig config.'
     if decimal == "," and as_number(cell, ".") is not None:
         return 'Use a decimal comma, or set decimal = "." in the rig config.'
+    if as_number(cell.replace("," if decimal == "." else ".", ""), decimal) is not None:
+        return "Export it again without marks between thousands."
     return ""
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from trace_helpers import HEADER, ROWS, changed, config, csv_of, read, refused
 
 from sealfit.errors import BadFile
+from sealfit.ingest.cells import decimal_fix
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_trace
 
@@ -135,6 +136,12 @@ def test_decimal_commas_everywhere_name_the_config_key(tmp_path):
         tmp_path, csv_of(rows, HEADER.replace(",", ";")), 'trace.delimiter = ";"\ntrace.decimal = ","'
     )
     npt.assert_allclose(trace.table["displacement_mm"], 0.5 * np.arange(100))
+
+
+@pytest.mark.parametrize(("cell", "decimal"), [("1,200.5", "."), ("1.200,5", ",")])
+def test_marks_between_thousands_are_named(cell, decimal):
+    assert decimal_fix(cell, decimal) == "Export it again without marks between thousands."
+    assert decimal_fix("1 or 2", decimal) == ""
 
 
 def test_missing_folders_links_and_paths_outside_are_refused(tmp_path):
