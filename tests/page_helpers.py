@@ -42,6 +42,18 @@ def console(page):
             yield command, re.sub(r"^    ", "", output, flags=re.MULTILINE)
 
 
+def plain(page):
+    """Return the commands of a page that stand without a prompt and an output."""
+    return re.findall(r"^    (sealfit .*)$", page.read_text("utf-8"), re.MULTILINE)
+
+
+def examples(of_results):
+    """Return the examples of the reference of commands: those that ask results, or the others."""
+    page = (DOCS / "reference" / "commands.md").read_text("utf-8")
+    lines = re.findall(r"^Example: (.*)$", page, re.MULTILINE)
+    return [line for line in lines if (line.split()[2] == "results") == of_results]
+
+
 def has(expected, printed):
     """Whether an output is what a page shows; `...` stands for anything."""
     return doctest.OutputChecker().check_output(expected, printed, FLAGS)
@@ -56,15 +68,15 @@ def as_in_a_clone(folder):
     return folder
 
 
-def run(command, folder):
+def run(command, folder, codes=(0,)):
     """Run a command of a page with this Python's sealfit, and return what it prints on stdout."""
     words = shlex.split(command)
     programs = {"sealfit": ["-m", "sealfit"], "python": []}
     if words[0] in programs:
         words = [sys.executable, *programs[words[0]], *words[1:]]
-    path = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(words, cwd=folder, env=path, capture_output=True, text=True)
-    assert done.returncode in (0, 1), done.stderr
+    settings = {**os.environ, "PYTHONPATH": str(ROOT), "BROWSER": "true"}  # a program that opens nothing
+    done = subprocess.run(words, cwd=folder, env=settings, capture_output=True, text=True)
+    assert done.returncode in codes, f"{command}\n{done.stderr}"
     return done.stdout
 
 
@@ -72,7 +84,7 @@ def ran(page, folder):
     """Run every command of a page in a folder; return each with what the page shows and what it printed."""
     commands = list(console(page))
     assert commands
-    return [(command, shown, run(command, folder)) for command, shown in commands]
+    return [(command, shown, run(command, folder, codes=(0, 1))) for command, shown in commands]
 
 
 def assert_as_shown(commands):
