@@ -7,10 +7,12 @@ import re
 import shutil
 import subprocess
 from functools import cache
+from pathlib import Path
 
 import pytest
 from report.made_campaigns import HIGHER, after_campaign, aging_campaign, not_run, torque_campaign
 
+from sealfit.report import page as report_page
 from sealfit.report.page import build_report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -182,6 +184,19 @@ def test_the_page_prints_on_a4(tmp_path):
     assert document.startswith(b"%PDF")
     sheets = set(re.findall(rb"/MediaBox ?\[0 0 (\d+)\S* (\d+)", document))
     assert sheets == {(b"594", b"841")}  # points
+
+
+def test_a_table_of_one_row_stays_on_its_sheet(tmp_path):
+    sections = """<div style="height: 200mm"></div>
+    <section><h3>Table</h3><div class="box">
+    <table><thead><tr><th>a</th></tr></thead><tbody><tr><td>1</td></tr></tbody></table></div></section>
+    <section><h2>Figure</h2><figure><ul class="legend"><li>b</li></ul>
+    <div class="panels"><div class="panel" style="height: 228mm"></div></div></figure></section>"""
+    style = Path(report_page.__file__).with_name("style.css").read_text("utf-8")
+    path, printed = tmp_path / "page.html", tmp_path / "page.pdf"
+    path.write_text(f"<style>{style}</style><div class='page'><main>{sections}</main></div>", "utf-8")
+    browsed(path, tmp_path, f"--print-to-pdf={printed}", "--no-pdf-header-footer")
+    assert len(re.findall(rb"/Type ?/Page\b", printed.read_bytes())) == 2
 
 
 def measured(page, widths, folder):
