@@ -11,6 +11,7 @@ from markupsafe import Markup, escape
 
 from sealfit.config import Config
 from sealfit.ingest.categorical import UNAGED
+from sealfit.tables import CALENDAR
 from sealfit.units import Units
 
 NOTHING = "–"
@@ -205,7 +206,7 @@ GREEK = {
 }  # fmt: skip
 _SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])(?:_?([0-9]+)|_([A-Za-z0-9]{{1,4}}))?")
 _SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displacement_mm", "distance_mm",
-          "speed_mm_s", "force_N", "load_N")  # fmt: skip
+          "speed_mm_s", "force_N", "load_N", *CALENDAR)  # fmt: skip
 _SLOT = re.compile(rf"\b(?:{'|'.join(_SLOTS)})\b")
 
 
@@ -330,7 +331,7 @@ def split_channels(text: str | None, known: Collection[str]) -> list[str]:
 
 
 def effect_label(effect: Mapping, units: Units) -> str:
-    """Return an effect's label in words, slots by their quantity, without the target.
+    """Return an effect's label in words, slots and the force by their quantity, without the target.
 
     Examples
     --------
@@ -338,9 +339,9 @@ def effect_label(effect: Mapping, units: Units) -> str:
     >>> effect_label(effect, Units())
     'ripple along displacement'
     """
-    label = re.sub(
-        rf", (?:added to|factor on) {re.escape(str(effect.get('acts_on')))}$", "", str(effect["label"])
-    )
+    target = rf", (?:added to|factor on) {re.escape(str(effect.get('acts_on')))}(?=,|$)"
+    force = units.quantity("force").removeprefix("friction ")
+    label = re.sub(r"\bforce\b", force, re.sub(target, "", str(effect["label"])))
     return _SLOT.sub(lambda found: channel_words(found[0], units), label)
 
 

@@ -4,6 +4,7 @@ from sealfit.config import Config
 from sealfit.report.notation import (
     ConditionNames,
     channel_label,
+    effect_label,
     plain,
     short,
     symbol_html,
@@ -62,6 +63,18 @@ def test_channels_carry_their_true_unit(column, label):
 def test_sentences_of_others_lose_slot_names():
     text = true_units("force_N jumps at displacement_mm = 3; my_force_N stays", TORQUE)
     assert text == "torque (mN m) jumps at angle (turn) = 3; my_force_N stays"
+
+
+@pytest.mark.parametrize(
+    ("label", "words"),
+    [
+        ("zero offset of the force, added to force", "zero offset of the torque"),
+        ("ripple, added to force, separate phase per stroke", "ripple, separate phase per stroke"),
+        ("smooth in elapsed_h, added to force", "smooth in time since first run"),
+    ],
+)
+def test_labels_of_effects_are_in_words_of_the_rig(label, words):
+    assert effect_label({"label": label, "acts_on": "force"}, TORQUE) == words
 
 
 def test_conditions_are_values_with_units():
