@@ -265,19 +265,24 @@ def test_the_strongest_channel_comes_first(made):
     assert channel_order(made.tables["channels"])[0] == "time_s"
 
 
-def test_an_effect_of_the_direction_is_shown_over_the_signed_speed(made):
+@pytest.mark.parametrize("commanded", [True, False])
+def test_an_effect_of_the_direction_is_shown_over_the_signed_speed(made, commanded):
     tables = dict(made.tables)
     for stage, size in (("before", -0.1), ("after", 0.0)):  # viscous friction that is larger backward
         rows = tables[f"residuals_{stage}"]
         speed = rows["speed_mm_s"].astype(float) * np.where(rows["repeat"] == 1, -1, 1)
-        tables[f"residuals_{stage}"] = rows.assign(speed_mm_s=speed, residual_N=size * speed.abs())
+        measured = speed * np.where(rows["repeat"] == 2, 1.04 if commanded else 1.0, 1.0)
+        made_N = {"speed_mm_s": measured, "residual_N": size * speed.abs()}
+        given = rows["speed_set_mm_s"] if commanded else np.nan
+        tables[f"residuals_{stage}"] = rows.assign(**made_N, speed_set_mm_s=given)
     known = {"channel": "direction", "before_N": 1.0, "before_se_N": 0.1, "after_N": 0.0, "after_se_N": 0.1}
     tables["channels"] = table("channels", [{**known, "x": sign, "n": 9} for sign in (-1.0, 1.0)])
     effect = {**made.closure["effects"][0], "channels": ["direction"]}
     plot = finding(tables, {**made.closure, "effects": [effect]}, made.config)
     drawn = panel_figure(plot.panels[0]).axes[0].containers
     before, after = (np.array(one.lines[0].get_xydata(), float) for one in drawn)
-    speeds = np.unique(tables["residuals_before"]["speed_mm_s"])
+    magnitudes = np.unique(made.tables["residuals_before"]["speed_mm_s"])
+    speeds = np.sort([*magnitudes, *-magnitudes])
     npt.assert_allclose(before[:, 0], speeds, atol=0.01 * np.ptp(speeds))
     npt.assert_allclose(before[:, 1], -0.1 * np.abs(speeds))
     npt.assert_array_equal(after[:, 1], 0.0)

@@ -164,17 +164,19 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config:
 
 
 def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean residuals at each signed speed, as rows of table `channels`.
+    """Return the mean residuals at each commanded speed and direction, as rows of table `channels`.
 
-    Speeds that agree to two digits are one. Standard errors are from the strokes' means.
+    Where no speed was commanded, measured ones that agree to two digits are one. Standard errors are from the
+    strokes' means.
     """
     found = {}
     for stage, residuals in (("before", before), ("after", after)):
         strokes = residuals.groupby(["run_id", "file", "stroke"], sort=True)
-        means = strokes[["speed_mm_s", "residual_N"]].mean().reset_index()
-        speed = means["speed_mm_s"].map(lambda value: float(f"{value:.2g}"))
+        means = strokes[["speed_mm_s", "speed_set_mm_s", "residual_N"]].mean().reset_index()
+        measured = means["speed_mm_s"].map(lambda value: float(f"{value:.2g}"))
+        speed = (np.sign(measured) * means["speed_set_mm_s"]).fillna(measured)
         groups, farthest = means.groupby(speed), means["residual_N"].abs().groupby(speed).idxmax()
-        found["x"] = groups["speed_mm_s"].mean().map(lambda value: float(f"{value:.3g}"))
+        found["x"] = groups["residual_N"].mean().index.to_series()
         found[f"{stage}_N"], found[f"{stage}_se_N"] = groups["residual_N"].mean(), groups["residual_N"].sem()
         found[f"{stage}_run"] = farthest.map(means["run_id"])
     return pd.DataFrame(found)
