@@ -17,6 +17,7 @@ from sealfit.errors import Fault, grouped, told
 # What a command says while it works: plain lines, or one that moves where somebody watches a terminal.
 
 OnFile = Callable[[int, int], None]
+BAR = 20  # characters of the bar's width
 LINE_EVERY_S = 2.0  # plain progress ends up in log files: a line now and then
 BEAT_EVERY_S = 30.0  # without any line for so long, plain progress says that the step is still at work
 FAULTS_SHOWN = 20  # the rest are in the quality table, and `check` lists them all
@@ -125,9 +126,12 @@ class Terminal(Lines):
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
         from rich.table import Column
 
-        text = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True))
-        columns = (text, BarColumn(bar_width=20), TimeElapsedColumn())
-        with Progress(*columns, console=Console(file=self._stream), transient=True) as bar:
+        console = Console(file=self._stream)
+        room = max(console.width - len(" 0:00:00 ") - BAR, BAR)  # for the text: the time is never cut off
+        column = Column(no_wrap=True, max_width=room)
+        text = TextColumn("{task.description}", markup=False, table_column=column)
+        columns = (text, BarColumn(bar_width=BAR), TimeElapsedColumn())
+        with Progress(*columns, console=console, transient=True) as bar:
             self._bar, self._task = bar, bar.add_task(what, total=None)
             try:
                 yield

@@ -1,9 +1,11 @@
 import io
+import re
 import sys
 import time
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
 from sealfit.errors import Fault
 from sealfit.progress import LINE_EVERY_S, Lines, Silent, Terminal, for_notebook
@@ -91,3 +93,12 @@ def test_a_terminal_shows_what_is_done_and_for_how_long():
     assert stream.getvalue().splitlines()[:2] == ["folds: 1", "[round] 1"]
     progress.say("done")
     assert stream.getvalue().endswith("done\n")
+
+
+def test_a_long_text_leaves_room_for_the_time(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    progress = Terminal(io.StringIO())
+    with progress.working(100 * "x"):
+        shown = io.StringIO()
+        Console(file=shown, width=80).print(progress._bar.get_renderable())
+    assert re.fullmatch(r"x{20,}… \S+ 0:00:00\n", shown.getvalue())
