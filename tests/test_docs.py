@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from page_helpers import DOCS, ROOT, as_in_a_clone, assert_as_shown, console, examples, plain, ran, run
+from page_helpers import DOCS, ROOT, as_in_a_clone, assert_as_shown, console, examples, has, plain, ran, run
 
 from sealfit.effects.user import load_user_effects
+from sealfit.report.summary import verdict_sentence
+from sealfit.units import Units
 
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.parent.name != "paper")
 WITH_RESULTS = ("notebook.md",)  # run where there are results of the sample campaign: tests/notebook
@@ -109,6 +111,20 @@ def test_the_effect_of_ones_own_is_searched_and_predicted_with(desk, tmp_path):
     for command in plain(page):
         assert run(command, tmp_path)
     assert pd.read_csv(tmp_path / "answers.csv")["force_after_N"].notna().all()
+
+
+def test_the_verdicts_that_a_page_quotes_are_said_so():
+    limit = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.1, "smallest_pct": 0.2}
+    above = {"state": "above_scatter", "ratio": 1.6, "p_value": 1e-21}
+    found = {
+        "nothing_missing": {"effects": [], "sensitivity": [{**limit, "cannot_tell": False}]},
+        "closed": {"effects": [{"candidate": False}], "fit_quality": above},
+    }
+    text = (DOCS / "how-to" / "verdict.md").read_text("utf-8")
+    shown = dict(re.findall(r"^    verdict     (\w+): (.*)$", text, re.MULTILINE))
+    for verdict, closure in found.items():
+        assert has(shown[verdict], verdict_sentence({"verdict": verdict, **closure}, Units()))
+    assert set(shown) == set(found)
 
 
 def test_generated_pages_are_up_to_date():
