@@ -192,7 +192,11 @@ def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
         there = sorted(child.name for child in shown if missing or fits(child))
     except OSError:
         return ""
-    likely = nearest((missing or path.absolute()).name, there)
+    wanted = missing or path.absolute()
+    # Without endings, which make any names near where they are alike; of equal names the same ending counts.
+    there.sort(key=lambda name: Path(name).suffix == wanted.suffix)
+    names = {Path(name).stem: name for name in there}
+    likely = names.get(nearest(wanted.stem, names), "")
     meant = parent / likely if missing else path.parent / likely
     return f"Did you mean {quoted(meant)}?" if likely else ""
 

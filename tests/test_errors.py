@@ -109,6 +109,7 @@ def test_the_nearest_name_beside_a_path_that_is_not_there_or_nothing(tmp_path, m
     assert did_you_mean(Path("campain/a.csv"), Path.is_file).endswith("/campaign?")
     assert did_you_mean(Path("rig.tml"), Path.is_file) == "Did you mean rig.toml?"
     assert did_you_mean(Path("rig.tml")) == did_you_mean(Path("results")) == ""
+    assert did_you_mean(Path("x.toml"), Path.is_file) == ""  # only the ending is alike
     assert nearest("Force", ["time", "force"]) == "force"
     assert nearest("Force", ["time"]) == ""
 
