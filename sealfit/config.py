@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
@@ -504,8 +505,9 @@ def parse_config(text: str, name: str) -> Config:
     try:
         return Config.model_validate(tomllib.loads(text))
     except ValidationError as error:
-        fix = "docs/reference/config.md has every key."
-        raise ConfigError(explain(error, Config), file=name, fix=fix) from error
+        fix, found = "docs/reference/config.md has every key.", error.errors()
+        line = _line_of(found[0], text) if len(found) == 1 else None
+        raise ConfigError(explain(error, Config), file=name, line=line, fix=fix) from error
     except (ValueError, RecursionError) as error:  # a number of thousands of digits, or lists in lists
         raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
 
@@ -522,6 +524,17 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str
         end = "" if text.endswith(("?", ".")) else "."
         lines.append(f"key '{key}': {text}{end}" if key else f"{text}{end}")
     return " ".join(lines)
+
+
+def _line_of(fault: Mapping, text: str) -> int | None:
+    """Return the line of the last key of a fault that a config has; None where it has it in several."""
+    said = fault["msg"].removeprefix("Value error, ").partition(":")[0]  # of a fault of the whole config
+    for part in reversed(fault["loc"] or said.split(".")):
+        key = re.compile(rf"(?<![\w-]){re.escape(str(part))}['\"]?\s*[]=.]")
+        lines = [number for number, line in enumerate(text.split("\n"), start=1) if key.search(line)]
+        if lines:
+            return lines[0] if len(lines) == 1 else None
+    return None
 
 
 def _nearest_key(place: tuple[int | str, ...], model: type[BaseModel]) -> str:

@@ -150,6 +150,21 @@ def test_a_mistyped_key_is_answered_with_the_nearest(text, said):
     assert said in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("name = 'a'\n[trace]\n# delimeter\ndelimeter = ';'", 4),
+        ("[trace.columns]\ntime_s = 't'\nforce_N = { name = 'F', unit = 'kfg' }", 3),
+        ("[trace]\nzzz = 1\n[files]\nzzz = 1", None),  # two faults
+        ("[trace]\nzzz = 1\n[files]\nvalues = { zzz = { a = 1 } }", None),  # one of two lines
+    ],
+)
+def test_a_fault_of_a_config_has_the_line_of_its_key(text, line):
+    with pytest.raises(ConfigError) as caught:
+        config(text)
+    assert caught.value.line == line
+
+
 def test_a_mistyped_config_is_answered_with_the_nearest_file_beside_it(tmp_path):
     (tmp_path / "rig.toml").write_text("")
     with pytest.raises(ConfigError, match=r"Did you mean .*rig\.toml\?"):
