@@ -33,6 +33,7 @@ from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint.estimate import Fitted, fit, reestimated
+from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening
 from sealfit.tables import CALENDAR
@@ -268,9 +269,23 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
 
 def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
     """Return a proposal fitted jointly with the model, under the current scatter."""
-    model = fitted.model.with_term(proposal.term, proposal.values)
-    model = solve_linear(model, fitted.rows, fitted.scatter, fitted.friction)
-    return replace(proposal, fitted=fitted.refitted(model))
+    models = [fitted.model.with_term(proposal.term, values) for values in _starts(fitted.model, proposal)]
+    models = [solve_linear(model, fitted.rows, fitted.scatter, fitted.friction) for model in models]
+    return replace(proposal, fitted=min(map(fitted.refitted, models), key=lambda f: f.deviance))
+
+
+def _starts(model: Model, proposal: Proposal) -> Iterator[Mapping[str, float]]:
+    """Yield start values of a proposal: its own, and both sides of a value at which its shape vanishes.
+
+    There, parameters that the declared model has too, such as v_s, start from its value.
+    """
+    yield proposal.values
+    for p in (p for p in proposal.term.effect.nonlinear if p.vanishes_at is not None):
+        shared = {name: mean for name, mean in model.geometric_means().items() if name in proposal.values}
+        below = [value for value in p.search if value < p.vanishes_at]
+        above = [value for value in p.search if value > p.vanishes_at]
+        for side in (below, above):
+            yield {**proposal.values, **shared, p.name: float(np.median(side))}
 
 
 def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
@@ -278,10 +293,11 @@ def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
 
 
 def _refitted_under(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
-    """Yield proposals fitted under another scatter, with a new search for v_s and b.
+    """Yield proposals fitted under another scatter, the better of two starts each.
 
-    They may have been biased. The search is made with the likeliest effect on each quantity; further effects
-    on it start from its result.
+    One is the joint fit under the current scatter. The other has v_s and b searched anew, as they may have
+    been biased. That search is made with the likeliest effect on each quantity; further effects on it start
+    from its result.
     """
     rows, friction = fitted.rows, fitted.friction
     begun: dict[tuple[str, str], np.ndarray] = {}
@@ -292,7 +308,9 @@ def _refitted_under(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter)
             model = solve_linear(replace(model, theta=begun[target]), rows, scatter, friction)
         else:
             model = search_nonlinear(model, rows, scatter)
-        anew = fit(model, rows, scatter, turns=0, friction=friction)
+        starts = [model, _joint(fitted, proposal).fitted.model]
+        fits = [fit(start, rows, scatter, turns=0, friction=friction) for start in starts]
+        anew = min(fits, key=lambda f: f.deviance)
         begun.setdefault(target, anew.model.theta)
         yield replace(proposal, fitted=anew)
 

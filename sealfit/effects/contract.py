@@ -57,7 +57,8 @@ class Parameter:
     `linear` marks an amplitude: the shape is linear in the vector of amplitudes. `search` gives the grid of a
     nonlinear parameter: numbers, or "inside" (quantiles of the channel), "between" (midpoints of its
     neighbouring values, for a jump), "span" (logarithmic, from a fraction of the channel's range to a few
-    ranges), "ratio" (logarithmic, over the magnitudes of the channel).
+    ranges), "ratio" (logarithmic, over the magnitudes of the channel). `vanishes_at` is a value at which the
+    shape is zero for every amplitude; no descent crosses it, so that a fit starts on both sides.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Parameter:
     meaning: str
     linear: bool = False
     search: tuple[float, ...] | Literal["inside", "between", "span", "ratio"] = ()
+    vanishes_at: float | None = None
 
     def __post_init__(self) -> None:
         low, high = self.bounds

@@ -77,7 +77,13 @@ STRIBECK_EXPONENT = Effect(
         Parameter("A", "{y}", 0.3, (-10.0, 10.0), "drop of friction across the Stribeck curve", linear=True),
         Parameter("v_s", "{x}", 5.0, (1e-6, 1e6), "Stribeck speed", search="ratio"),
         Parameter(
-            "n", "", 1.0, (0.2, 10.0), "Stribeck exponent", search=(0.4, 0.6, 0.8, 1.0, 1.4, 3.0, 4.0, 6.0)
+            "n",
+            "",
+            1.0,
+            (0.2, 10.0),
+            "Stribeck exponent",
+            search=(0.4, 0.6, 0.8, 1.0, 1.4, 3.0, 4.0, 6.0),
+            vanishes_at=2.0,
         ),
     ),
     shape=stribeck_exponent_shape,

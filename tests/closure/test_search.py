@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from bins_helpers import make_bins
+from bins_helpers import LOAD_N, TRUE, make_bins
 
 from sealfit.closure.channels import (
     ALONG_STROKES,
@@ -297,3 +297,20 @@ def test_a_speed_effect_shows_where_sigma_2_could_take_it_up_only_below_zero():
     assert best.p_value < 0.001
     terms = terms_of(best, {c.name: c for c in channels}, fitted, EFFECTS)
     assert any(term.effect.id == "log_rate" for term, _ in terms)
+
+
+@pytest.mark.parametrize(("exponent", "drop"), [(3.0, 0.8), (0.7, 0.3)])
+def test_a_stribeck_exponent_is_found_above_and_below_2(exponent, drop):
+    """The shape vanishes at 2, so that a fit that starts below it does not reach an exponent above it."""
+
+    def abrupt(table, force):
+        ratio = np.abs(table["speed_mm_s"].to_numpy()) / TRUE["v_s"]
+        return force + LOAD_N * drop * (np.exp(-(ratio**exponent)) - np.exp(-(ratio**2)))
+
+    bins = make_bins(bins=2, speeds=tuple(np.geomspace(0.5, 200, 11)), effect=abrupt)
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    channels = {c.name: c for c in find_channels(fitted.rows)}
+    found = search(ScoreTests(fitted), list(channels.values()), np.random.default_rng(0))
+    named = propose(fitted, [c for c in found if c.p_value < 0.005], channels, EFFECTS)[0]
+    assert named.term.effect.id == "stribeck_exponent"
+    assert named.fitted.model.values[-1]["n"] == pytest.approx(exponent, rel=0.15)

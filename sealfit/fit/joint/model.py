@@ -232,6 +232,14 @@ class Model:
             values.append({p.name: x for p, x in own})
         return replace(self, theta=vector[: self.theta.size], values=tuple(values))
 
+    def geometric_means(self) -> dict[str, float]:
+        """Return the mean over series of each declared quantity whose logarithm is fitted."""
+        logs: dict[str, list[float]] = {}
+        for log, p in zip(self.theta.tolist(), self.declared.parameters, strict=True):
+            if p.quantity in LOGARITHMIC:
+                logs.setdefault(p.quantity, []).append(log)
+        return {quantity: float(np.exp(np.mean(own))) for quantity, own in logs.items()}
+
     def with_term(self, term: Term, values: Mapping[str, float]) -> Model:
         """Return the model with one more term."""
         return replace(self, terms=(*self.terms, term), values=(*self.values, dict(values)))
