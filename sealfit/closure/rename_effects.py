@@ -36,13 +36,13 @@ class Renaming:
     ) -> tuple[Fitted, list[AcceptedEffect]]:
         """Return a fit and its effects, each but the last renamed given all others.
 
-        An effect that keeps its name was confirmed while others were missing. It is removed if it has no gain
-        on held-out data given the others.
+        An effect that keeps its name was confirmed while others were missing. If it has no gain on held-out
+        data given the others, it or a later one is removed: the one that explains least.
         """
         for item in added[:-1]:
-            number = next(k for k, a in enumerate(added) if a is item)
+            number = next((k for k, a in enumerate(added) if a is item), None)
             name = self._channel(item)
-            if name is None:
+            if name is None or number is None:
                 continue
             without = fitted.refitted(fitted.model.without_term(number))
             proposals = self._proposals_on(fitted, number, without, [name], item.proposal.p_value)
@@ -53,7 +53,10 @@ class Renaming:
             better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
             others = [*added[:number], *added[number + 1 :]]
             if better is None and self._unchanged(without, fitted, number, item) is None:
-                fitted, added = fit(without.model, fitted.rows, fitted.scatter, turns=2), others
+                left = [fitted.refitted(fitted.model.without_term(k)) for k in range(number, len(added))]
+                least = min(range(len(left)), key=lambda k: left[k].deviance)
+                fitted = fit(left[least].model, fitted.rows, fitted.scatter, turns=2)
+                added = [a for k, a in enumerate(added) if k != number + least]
             elif better is not None and better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
                 added = [*others, better]

@@ -190,7 +190,8 @@ def test_a_product_told_as_a_sum_of_two_is_one_effect():
     )  # a third is to come, beside which alone one shows
 
 
-def test_an_effect_that_gains_nothing_beside_the_others_goes():
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_of_an_unconfirmed_effect_and_a_later_one_the_one_that_explains_least_goes(order, monkeypatch):
     def oil_only(table, force):
         return force * (1 + 1e-3 * (table["oil_ppm"].to_numpy() - 50))
 
@@ -199,7 +200,9 @@ def test_an_effect_that_gains_nothing_beside_the_others_goes():
     )
     slow = Term(EFFECTS["linear"], ("time_s",), "mu", "multiply", {"x_ref": 10.0})
     oil = Term(EFFECTS["linear"], ("oil_ppm",), "mu", "multiply", {"x_ref": 50.0})
-    model = fit_declared(rows).model.with_term(slow, {"A": 1e-3}).with_term(oil, {"A": 1e-3})
+    model = fit_declared(rows).model
+    for k in order:
+        model = model.with_term((slow, oil)[k], {"A": 1e-3})
     fitted = fit(model, rows, turns=2)
     added = [
         AcceptedEffect(
@@ -213,6 +216,7 @@ def test_an_effect_that_gains_nothing_beside_the_others_goes():
         for k, (t, v) in enumerate(zip(fitted.model.terms, fitted.model.values, strict=True))
     ]
     channels = {c.name: c for c in find_channels(rows)}
+    monkeypatch.setattr(rename_effects, "confirmed", lambda *given: None)
     again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
     after, kept = again.earlier_renamed(fitted, added)
     assert [a.proposal.term.channels for a in kept] == [("oil_ppm",)]
