@@ -273,8 +273,8 @@ def test_an_effect_of_the_direction_is_shown_over_the_signed_speed(made, command
         speed = rows["speed_mm_s"].astype(float) * np.where(rows["repeat"] == 1, -1, 1)
         measured = speed * np.where(rows["repeat"] == 2, 1.04 if commanded else 1.0, 1.0)
         made_N = {"speed_mm_s": measured, "residual_N": size * speed.abs()}
-        given = rows["speed_set_mm_s"] if commanded else np.nan
-        tables[f"residuals_{stage}"] = rows.assign(**made_N, speed_set_mm_s=given)
+        rows = rows if commanded else rows.drop(columns="speed_set_mm_s")
+        tables[f"residuals_{stage}"] = rows.assign(**made_N)
     known = {"channel": "direction", "before_N": 1.0, "before_se_N": 0.1, "after_N": 0.0, "after_se_N": 0.1}
     tables["channels"] = table("channels", [{**known, "x": sign, "n": 9} for sign in (-1.0, 1.0)])
     effect = {**made.closure["effects"][0], "channels": ["direction"]}

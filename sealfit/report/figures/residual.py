@@ -163,6 +163,9 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config:
     return Plot("finding", title, (panel, errors.panels[0]), (*STAGES, *floor))
 
 
+BY_STROKE = ["run_id", "file", "stroke"]
+
+
 def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     """Return the mean residuals at each commanded speed and direction, as rows of table `channels`.
 
@@ -171,8 +174,8 @@ def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     """
     found = {}
     for stage, residuals in (("before", before), ("after", after)):
-        strokes = residuals.groupby(["run_id", "file", "stroke"], sort=True)
-        means = strokes[["speed_mm_s", "speed_set_mm_s", "residual_N"]].mean().reset_index()
+        values = residuals.reindex(columns=[*BY_STROKE, "speed_mm_s", "speed_set_mm_s", "residual_N"])
+        means = values.groupby(BY_STROKE, sort=True).mean().reset_index()
         measured = means["speed_mm_s"].map(lambda value: float(f"{value:.2g}"))
         speed = (np.sign(measured) * means["speed_set_mm_s"]).fillna(measured)
         groups, farthest = means.groupby(speed), means["residual_N"].abs().groupby(speed).idxmax()
