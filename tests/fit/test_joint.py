@@ -137,6 +137,14 @@ def test_a_steep_fall_at_three_speeds_with_two_files_each_has_the_curve():
     assert set(declare(rows).stribeck.values()) == {"interpolated"}
 
 
+def test_a_curve_is_seen_though_friction_falls_from_repeat_to_repeat():
+    rows = rows_of(speeds=(0.02, 0.5, 12.0), temperatures=(60.0,), days=(4.0,), repeats=2, bins=4)
+    mu = 0.2 + 0.05 * np.exp(-((np.abs(rows.speed) / 3.0) ** 2))
+    run_in = np.where(rows.values("repeat") == 1, 1.0, 0.75)
+    rows = replace(rows, force=rows.load * mu * run_in * np.sign(rows.speed))
+    assert set(declare(rows).stribeck.values()) == {"interpolated"}
+
+
 def test_a_rising_curve_through_three_speeds_does_not_start_with_friction_below_zero():
     rows = rows_of(speeds=(0.502, 9.81, 192.0), days=(), repeats=2, bins=4)
     mu = np.interp(np.abs(rows.speed), [0.502, 9.81, 192.0], [0.5695, 0.609, 0.654])

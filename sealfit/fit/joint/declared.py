@@ -154,8 +154,8 @@ def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
     A curve through three speeds leaves few degrees of freedom for other effects, so a line is kept if it is
     not rejected. As in the declared model its slope is not negative and shared by all conditions, each of
     which has its own level. The curve adds curvature that all share, and may add a slope of each condition
-    (mu_s less mu_c). The two directions count as repeats. Without a degree of freedom there is no test; it is
-    0 then, and the curve is taken.
+    (mu_s less mu_c). Repeats may differ, each by the same in all runs: seals run in. The two directions count
+    as repeats. Without a degree of freedom there is no test; it is 0 then, and the curve is taken.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     nearest = np.abs(speed[:, None] - tested_speeds(rows, chosen)).argmin(axis=1)
@@ -164,6 +164,7 @@ def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
             "file": rows.codes("file")[chosen],
             "direction": np.sign(rows.speed[chosen]),
             "condition": rows.condition[chosen],
+            "repeat": rows.table["repeat"].to_numpy()[chosen],
             "slow": nearest == 0,
             "middle": nearest == 1,
             "slope": speed / load,
@@ -171,12 +172,13 @@ def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
         }
     )
     files = table.groupby(["file", "direction", "condition"], as_index=False).mean()
-    levels = pd.get_dummies(files["condition"], dtype=float).to_numpy()
+    levels = np.hstack([pd.get_dummies(files[name], dtype=float) for name in ("condition", "repeat")])
     slope = files["slope"].to_numpy()[:, None]
     line = np.column_stack([levels, slope])
     falls = np.linalg.lstsq(line, files["mu"], rcond=1e-9)[0][-1] < 0
     bends = files[["slow", "middle"]]  # with one load, one of them is a slope
-    curves = [np.column_stack([levels, slopes, bends]) for slopes in (slope, levels * slope)]
+    conditions = levels[:, : files["condition"].nunique()]
+    curves = [np.column_stack([levels, slopes, bends]) for slopes in (slope, conditions * slope)]
     tests = [_p_of_line(levels if falls else line, curve, files["mu"].to_numpy()) for curve in curves]
     p_values = [p for p in tests if p is not None]
     return len(p_values) * min(p_values, default=0.0)
