@@ -589,6 +589,10 @@ def test_predict_never_overwrites_the_points(sealfit, done, tmp_path):
         in sealfit("predict", done, "--points", points, "--output", tmp_path / "pipe").stderr
     )
     assert stat.S_ISFIFO(os.stat(tmp_path / "pipe").st_mode)  # and so for a device: it is not replaced
+    kept = (done / "model.json").read_bytes()
+    ended = sealfit("predict", done, "--points", points, "--output", done / "model.json")
+    assert "Give a name that ends in .csv." in ended.stderr
+    assert (done / "model.json").read_bytes() == kept
 
 
 # ---------------------------------------------------------------- simulate

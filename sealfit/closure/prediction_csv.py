@@ -173,6 +173,11 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
     if output.exists() and not output.is_file():  # a device would be replaced by a file
         what = "a folder" if output.is_dir() else "no file"
         raise RequestError(f"--output {output} is {what}.", fix="Give a file name.")
+    if output.exists() and output.suffix.lower() != ".csv":  # such as a config, or a file of OUT
+        raise RequestError(
+            f"--output {output} is there, and its name is not that of a CSV.",
+            fix="Give a name that ends in .csv.",
+        )
     # `answers` has the same rows in the same order.
     table = pd.concat([points.text.map(_no_formula), answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     table.columns = [_no_formula(name) for name in table.columns]
