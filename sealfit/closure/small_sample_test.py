@@ -56,6 +56,9 @@ MOST_DF = 1e4
 N_VARIANCES = 2
 """Number of variances a contrast is tested against: moderated, and its own. Each has half the error rate."""
 
+LEAST_VARIANCE = 1e-300
+"""Smallest variance of a contrast, so that one of noise-free data, 0 of 0, has the p-value 1."""
+
 
 class ContrastTest(NamedTuple):
     """Contrasts of one candidate: estimates, their variances from the units, and data for the prior."""
@@ -103,7 +106,8 @@ def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest 
     known = df >= LEAST_DF
     if not known.any():
         return None
-    parts = (slope, (deviations**2).sum(axis=0), df, along_strokes(fitted, left))
+    variance = np.maximum((deviations**2).sum(axis=0), LEAST_VARIANCE)
+    parts = (slope, variance, df, along_strokes(fitted, left))
     agree = specimens_agree(fitted, left)[known]
     return ContrastTest(level, *(p[known] for p in parts), deviations[:, known], agree)
 

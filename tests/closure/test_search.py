@@ -314,3 +314,10 @@ def test_a_stribeck_exponent_is_found_above_and_below_2(exponent, drop):
     named = propose(fitted, [c for c in found if c.p_value < 0.005], channels, EFFECTS)[0]
     assert named.term.effect.id == "stribeck_exponent"
     assert named.fitted.model.values[-1]["n"] == pytest.approx(exponent, rel=0.15)
+
+
+def test_a_constant_force_without_noise_gives_no_alarm():
+    bins = make_bins(days=(), temperatures=(), bins=4, speeds=(0.5, 2.0, 8.0, 30.0), gain=0.0, noise_N=0.0)
+    fitted = fit_declared(make_rows(bins.assign(force_N=40.0), has_aging=True))
+    found = search(ScoreTests(fitted), find_channels(fitted.rows), np.random.default_rng(0))
+    assert min(c.p_value for c in found) == 1.0
