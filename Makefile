@@ -20,12 +20,13 @@ test: lint ## lint and run every test
 golden: .venv/.installed-test ## compare ten campaigns with what is on record; after every step that is to move no number (three minutes)
 	$(BIN)/python -m pytest -rs -n auto -m golden tests/golden
 
-torture: .venv/.installed-test ## hostile input, faults of the system and long load; figures in benchmarks/RELIABILITY.md
+torture: .venv/.installed-test ## hostile input, faults of the system and long load; figures in benchmarks/RELIABILITY.md (half an hour)
 	$(BIN)/python benchmarks/torture/pollution.py
 	$(BIN)/python benchmarks/torture/fuzzing.py
 	$(BIN)/python benchmarks/torture/faults.py
 	$(BIN)/python benchmarks/torture/concurrency.py
-	$(BIN)/python benchmarks/torture/digits.py
+	$(BIN)/python benchmarks/torture/digits.py --campaigns short no_load
+	$(BIN)/python benchmarks/torture/digits.py --campaigns aged --changes force_1e+06 slots_mN_m_ms
 	$(BIN)/python benchmarks/torture/load.py
 
 torture-rivals: .venv/.installed-bench

@@ -529,8 +529,8 @@ def table_of(found: list[Found]) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description="fuzzing; see the top of the file")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--inputs", type=int, default=300, help="mutations of each input")
-    parser.add_argument("--results", type=int, default=12, help="mutations of each file of OUT")
+    parser.add_argument("--inputs", type=int, default=100, help="mutations of each input")
+    parser.add_argument("--results", type=int, default=4, help="mutations of each file of OUT")
     parser.add_argument(
         "--heal", type=int, default=4, help="`report` and `run` are asked after every so many"
     )
