@@ -315,7 +315,7 @@ def _paths(campaign: Path, entries: list[Entry], outside: set[str]) -> list[Faul
             reason, fix = f"the trace file is listed already on line {lines[entry.file]}.", "Delete one line."
             faults.append(entry.fault("duplicate_file", reason, "file", value=entry.file, fix=fix))
         lines.setdefault(entry.file, entry.line)
-    if entries and not faults and not any((campaign / entry.file).is_file() for entry in entries):
+    if entries and not faults and not any(os.path.isfile(campaign / entry.file) for entry in entries):
         reason = f"none of the {len(entries)} trace files listed exists."
         fix = "Paths are relative to the folder of runs.csv."
         faults.append(entries[0].fault("missing_file", reason, "file", value=entries[0].file, fix=fix))
