@@ -246,9 +246,9 @@ def test_a_missing_condition_column_is_one_fault_with_the_nearest_name(tmp_path)
 
 
 def test_one_trace_file_whose_name_is_longer_than_a_file_system_takes_is_missing(tmp_path):
-    line = FULL.splitlines()[1].replace("a.csv", 5000 * "a")
-    (fault,) = faults(campaign(tmp_path, f"{FULL.splitlines()[0]}\n{line}\n"))
-    assert "none of the 1 trace files" in fault.reason
+    table = FULL.replace("a.csv", 5000 * "a").replace("b.csv", "y.csv").replace("c.csv", "z.csv")
+    (fault,) = faults(campaign(tmp_path, table))
+    assert "none of the 3 trace files" in fault.reason
 
 
 def test_missing_folder_table_traces_and_links_out(tmp_path):
