@@ -20,6 +20,7 @@ from sealfit.closure.criteria import (
     MOST_WITHIN,
     RIPPLE_CONFIRMED_P,
     SAMPLES_PER_VALUE,
+    SMALL_SIZE,
     VAGUER,
     WEAK_P,
     WITHIN_P,
@@ -333,7 +334,8 @@ def _reason_refused(
     if size <= LEAST_SIZE * force:
         return TOO_SMALL
     if not gain.real:
-        return "it does not lower the error on held-out data"
+        small = size <= SMALL_SIZE * force and not proposal.term.effect.periodic
+        return NO_GAIN if small else "it does not lower the error on held-out data"
     if gain.rmse_N < LEAST_GAIN * force and not proposal.term.effect.periodic:
         return NO_GAIN
     halved = gain.share > 1 - HALVED

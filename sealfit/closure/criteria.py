@@ -288,6 +288,12 @@ A ripple needs none: a wave of the same length in every file is no error of the 
 worlds drawn at random 9 of 38 false claims and 7 of 120 true ones gained less.
 """
 
+SMALL_SIZE = 1e-3
+"""Size, as a share of the RMS force, up to which an effect without any gain on held-out data is negligible.
+
+Hundreds of files that repeat to 0.04 % show remainders of the pre-sliding rise of this size.
+"""
+
 
 # ---------------------------------------------------------------- the verdict, and what could have been seen
 NOT_ADJUSTED = 0.05

@@ -214,6 +214,10 @@ STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id":
     ("given", "reason"),
     [
         ({"gains": [Gain(0.5, 0.5, 1.0, 2.0)]}, "does not lower the error on held-out data"),
+        (
+            {"gains": [Gain(-0.5, 0.5, 1.0)], "added": 0.009},
+            "lowers the error on held-out data by less than 0.01% of the force",
+        ),
         ({"gains": [Gain(0.01, 0.99, 9.0)], "p_value": 1e-4}, "lowers the held-out error by less than 5%"),
         ({"added": 0.0019}, "less than 0.02% of the force"),  # 10 N
         (
