@@ -22,7 +22,7 @@ from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import SECOND, Effect
-from sealfit.effects.free import FREE, LEVELS, SMOOTH, free_effect
+from sealfit.effects.free import FREE, LEVELS, SMOOTH, WIDE, free_effect
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
 from sealfit.fit.joint.estimate import Fitted, fit
 from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
@@ -296,12 +296,10 @@ def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
     low, high = float(values.min()), float(values.max())
     if "lambda_" in after.model.values[after.model.terms.index(term)]:
         high = min(high, low + PERIODS * after.model.values[after.model.terms.index(term)]["lambda_"])
-    distinct = np.unique(values)
-    x = (
-        distinct
-        if distinct.size <= 12
-        else np.linspace(low, high, 4 * POINTS if high < values.max() else POINTS)
-    )
+    x = np.unique(values)
+    if x.size > 12:
+        spaced = np.geomspace if first == "speed_mm_s" and low > 0 and high >= WIDE * low else np.linspace
+        x = spaced(low, high, 4 * POINTS if high < values.max() else POINTS)
     inputs = {}
     for name, channel in zip(term.effect.reads, term.channels, strict=True):
         inputs[name] = (

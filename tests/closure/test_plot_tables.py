@@ -71,3 +71,12 @@ def test_partial_residuals_follow_the_data_where_the_shape_does_not():
     assert levels["label"].tolist() == ["A", "B"]
     assert set(levels["unit"]) == {"N"}
     assert np.diff(levels["value"]) == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_shape_along_the_speed_is_even_on_a_logarithmic_axis():
+    speeds = tuple(np.geomspace(0.5, 200, 13))
+    rows = make_rows(bins_helpers.make_bins(bins=2, temperatures=(60.0,), speeds=speeds), has_aging=True)
+    rate = Term(EFFECTS["log_rate"], ("speed_mm_s",), "mu", "multiply", {"speed_mm_s_ref": 10.0})
+    shapes = shape_table(fit(start_model(rows).with_term(rate, {"A": 0.0}), rows), Config())
+    assert len(shapes) == POINTS
+    assert np.ptp(np.diff(np.log(shapes["x"].astype(float)))) < 1e-6
