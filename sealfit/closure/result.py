@@ -131,7 +131,10 @@ def closure_document(
     seen = sensitivity(selection, config.loop.family_error)
     undetectable = set(undetectable_variables(selection, seen, scatter))
     only_inconclusive = selection.inconclusive is not None and not selection.added
-    if selection.worse or (selection.left is not None and not only_inconclusive):
+    significant = bool(selection.worse) or (selection.left is not None and not only_inconclusive)
+    # What remains beside effects that were found may be less than repeats scatter by.
+    small = bool(selection.added) and not selection.worse and (quality["ratio"] or np.inf) <= 1.0
+    if significant and not small:
         verdict = "unexplained"
     elif selection.added:
         verdict = "closed"
@@ -153,7 +156,7 @@ def closure_document(
         "heldout_unit": heldout_unit,
         "effects": effect_entries(after, selection, config),
         "scatter": scatter,
-        "left": left_entry(selection, numbers["after"]["rmse_N"], floor),
+        "left": {**left_entry(selection, numbers["after"]["rmse_N"], floor), "significant": significant},
         "outlier_files": [
             {"file": one.file, "deviation_pct": 100 * one.deviation, "p_value": one.p_value}
             for one in outliers

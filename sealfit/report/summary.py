@@ -196,7 +196,10 @@ def _verdict_clause(closure: Mapping, units: Units) -> str:
         return f"{quality}; these files do not decide whether an effect is missing: {untold}"
     if closure["verdict"] == "closed":
         beside = f"; not decided by these files: {untold}" if untold else ""
-        return f"{added}; no significant residual remains; {quality}{beside}"
+        remains = "no significant residual remains"
+        if closure["left"].get("significant"):
+            remains = f"what remains{_where(closure['left'], units)} is less than repeats scatter by"
+        return f"{added}; {remains}; {quality}{beside}"
     return f"{added}; a significant residual remains{_where(closure['left'], units)}; {quality}"
 
 

@@ -173,7 +173,7 @@ def closure_lines(part: Mapping) -> list[str]:
     if part["noise_floor_N"] is not None:
         found.append(line("noise floor", f"{_number(part['noise_floor_N'])} {unit}"))
     if part["left"]["channel"] is not None:
-        found.append(line("residual", _left(part["left"], part["verdict"], unit)))
+        found.append(line("residual", _left(part["left"], unit)))
     for run in part["next_runs"][:3]:
         settings = ", ".join(_setting(*own, part["units"]) for own in run["conditions"].items())
         found.append(line("next runs", f"{run['why']}: {settings}" if settings else run["why"]))
@@ -187,10 +187,10 @@ def _setting(name: str, value: object, units: Mapping[str, str]) -> str:
     return f"{name} {text}" if name.endswith(unit.replace("/", "_")) else f"{name} {text} {unit}"
 
 
-def _left(left: Mapping, verdict: str, unit: str) -> str:
+def _left(left: Mapping, unit: str) -> str:
     """Return the remaining residual: its size above the floor, the variable, and the p-value."""
     above = f"rms {_number(left['rmse_N'])} {unit} above the noise floor, " if left["rmse_N"] else ""
-    significant = "" if verdict == "unexplained" else ", not significant"
+    significant = "" if left.get("significant") else ", not significant"
     return f"{above}along {left['channel']} (p = {left['p_value']:.2g}{significant})"
 
 

@@ -228,7 +228,7 @@ def left_over(closure: Mapping, config: Config) -> Markup:
             said.append(
                 f"the excess over the noise floor is {excess} (root of the difference of the squares)"
             )
-    if closure["verdict"] == "unexplained":
+    if left.get("significant"):
         said.append(f"a significant residual remains: {_where(left, config)}")
     elif left.get("channels") and any(effect["candidate"] for effect in closure["effects"]):
         said.append(f"the evidence rests on too few specimens: {_where(left, config)}")

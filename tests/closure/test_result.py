@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
+from sealfit.closure import result
 from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import NO_GAIN, AcceptedEffect, RefusedEffect
 from sealfit.closure.linearised import Proposal
@@ -106,7 +107,7 @@ def document(selection, after=None):
     return closure_document(replace(selection, after=after), models, "run", Config(), EFFECTS)
 
 
-def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted):
+def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted, monkeypatch):
     item, after = accepted(fitted)
     weak, strong = (RefusedEffect(WARMING, p, "it does not lower the error") for p in (1e-4, 1e-7))
     small = RefusedEffect(WARMING, 1e-7, NO_GAIN)
@@ -119,6 +120,10 @@ def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted):
     }
     assert {name: found["verdict"] for name, found in verdicts.items()} == {name: name for name in verdicts}
     assert document(replace(selection, added=(item,), left=left), after)["verdict"] == "unexplained"
+    monkeypatch.setattr(result, "noise_floor", lambda fitted: 100.0)  # the error is far below it
+    within = document(replace(selection, added=(item,), left=left), after)
+    assert (within["verdict"], within["left"]["significant"]) == ("closed", True)
+    monkeypatch.undo()
     assert (
         document(replace(selection, left=left, inconclusive=item))["verdict"] == "cannot_tell"
     )  # too few specimens show it

@@ -214,7 +214,7 @@ def test_how_an_effect_acts(change, words):
 
 def test_what_is_left_is_called_scatter_only_if_it_is():
     assert "consistent with scatter" in left_over(document(), Config())
-    left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005}
+    left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005, "significant": True}
     text = left_over(document("unexplained", **left), Config())
     assert (
         "A significant residual remains: the residual varies with displacement (mm) along strokes "
