@@ -21,7 +21,7 @@ from small_tables import small
 
 from sealfit.config import parse_config
 from sealfit.errors import ConfigError, OutError, StaleError
-from sealfit.store import parquet
+from sealfit.store import parquet, staged_writes
 from sealfit.store.lock import LOCK
 from sealfit.store.manifest import STAGING, STATE, STEPS, ConfigCopy, State, fingerprint, seen_config, to_json
 from sealfit.store.out_folder import Store
@@ -496,6 +496,25 @@ def test_what_a_step_no_longer_writes_is_removed(out, campaign):
             staged.text("plots/both.svg", "two")
     assert sorted(p.name for p in (out / "plots").iterdir()) == ["both.svg"]
     assert (out / "plots/both.svg").read_text() == "two"
+
+
+def test_a_new_folder_is_on_the_disk_before_files_are_moved_into_it(out, campaign, monkeypatch):
+    """A power loss may keep what a synced folder holds and lose the folder itself."""
+    done, sync, replace = [], staged_writes.sync, os.replace
+
+    def noting(what, act):
+        def noted(*paths):
+            done.append((what, Path(paths[-1]), (out / "plots").is_dir()))
+            act(*paths)
+
+        return noted
+
+    monkeypatch.setattr(staged_writes, "sync", noting("sync", sync))
+    monkeypatch.setattr(os, "replace", noting("move", replace))
+    with Store.writing(out, campaign, ConfigCopy.at(None)) as store, store.step("ingest") as staged:
+        staged.inputs = {}
+        staged.text("plots/new.svg", "new")
+    assert ("sync", out, True) in done[: done.index(("move", out / "plots/new.svg", True))]
 
 
 def test_provenance_names_config_inputs_and_steps(out, campaign):

@@ -109,17 +109,18 @@ def finish(out: Path, state: State) -> None:
         what = f"lacks {folder.name}, with files of a step that was interrupted."
         raise OutError(what, file=out, fix="Delete the folder, or choose another --out.")
     refuse_links(folder)
+    folders = sorted({(out / file).parent for file in done.files} - {out})
+    for place in folders:
+        if place.is_file():  # a table that was one file
+            place.unlink()
+        place.mkdir(exist_ok=True)
+    sync(out)  # a power loss may not take a folder to which files were moved
     for file in (*done.files, PROVENANCE):
-        source, target = folder / file, out / file
-        if not source.exists():  # it is in OUT already
-            continue
-        if target.parent.is_file():  # a table that was one file
-            target.parent.unlink()
-        target.parent.mkdir(exist_ok=True)
-        os.replace(source, target)
+        if (folder / file).exists():  # else it is in OUT already
+            os.replace(folder / file, out / file)
     for file in state.moving.left_over:
         (out / file).unlink(missing_ok=True)
-    for place in {out, *((out / file).parent for file in done.files)}:
+    for place in (*folders, out):
         sync(place)
     os.replace(folder / ENDED, out / STATE)
     sync(out)
