@@ -137,7 +137,11 @@ def provenance_facts(provenance: Mapping, config: Config) -> dict:
         "inputs": found["inputs"][:MOST_INPUTS],
         "inputs_in_all": len(found["inputs"]),
         "bytes": sum(entry["size"] for entry in found["inputs"]),
-        "steps": [{**step, "finished_at": _instant(step["finished_at"])} for step in found["steps"]],
+        "steps": [
+            {**step, "finished_at": _instant(step["finished_at"])}
+            for step in found["steps"]
+            if step["step"] != "report"  # an earlier report is no part of this one
+        ],
     }
 
 

@@ -12,7 +12,7 @@ from report.made_tables import empty
 
 from sealfit.config import Config
 from sealfit.report.drawing import LARGEST_STEP, MOST_BINS, run_traces
-from sealfit.report.page import build_report
+from sealfit.report.page import build_report, provenance_facts
 
 VOID = {"meta", "img", "br", "link", "path", "rect", "circle"}
 
@@ -323,3 +323,10 @@ def test_the_page_states_the_sensitivity_and_the_effects_not_accepted():
     refused = {"id": "ripple", "channels": ["displacement_mm"], "p_value": 1e-6, "reason": "it is too small"}
     (row,) = refused_rows({"refused": [refused]}, Config())
     assert row["label"] == "ripple along displacement (mm)"
+
+
+def test_an_earlier_report_is_no_step_of_this_one(made):
+    again = {"step": "report", "version": "0.1.0", "finished_at": "2024-05-02T09:35:00+00:00", "seconds": 3.0}
+    first = provenance_facts(made.provenance, made.config)
+    provenance = {**made.provenance, "steps": [*made.provenance["steps"], again]}
+    assert provenance_facts(provenance, made.config) == first
