@@ -325,7 +325,8 @@ def test_the_page_states_the_sensitivity_and_the_effects_not_accepted():
     assert row["label"] == "ripple along displacement (mm)"
 
 
-def test_an_earlier_report_is_no_step_of_this_one(made):
+def test_an_earlier_report_is_no_step_of_this_one():
+    made = aging_campaign()
     again = {"step": "report", "version": "0.1.0", "finished_at": "2024-05-02T09:35:00+00:00", "seconds": 3.0}
     first = provenance_facts(made.provenance, made.config)
     provenance = {**made.provenance, "steps": [*made.provenance["steps"], again]}
