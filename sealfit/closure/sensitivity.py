@@ -367,7 +367,7 @@ def _by_numbers(
         return 0.0
     k, df = test.basis.shape[1], test.known + test.error_df
     quiet, differs = (
-        (float(np.sum(units.numbers(target).values ** 2)) - own.chi2) / df
+        max(float(np.sum(units.numbers(target).values ** 2)) - own.chi2, 0.0) / df
         for units, own in ((noise, test), (effect, added))
     )
     return float(_margin(np.sqrt(added.chi2), quiet + test.known / df, differs, k, df, tail))

@@ -12,7 +12,7 @@ from sealfit.closure.loop import close_loop
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
-from sealfit.closure.sensitivity import sensitivity, undetectable_variables
+from sealfit.closure.sensitivity import _by_numbers, sensitivity, undetectable_variables
 from sealfit.config import Config
 from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.rows import make_rows
@@ -102,3 +102,13 @@ def test_a_variable_of_an_effect_in_the_model_is_not_said_to_be_undecided():
     with_it = undetectable_variables(replace(selection, added=(effect,)), found, [])
     assert {*with_it, "displacement_mm"} == set(undetectable_variables(selection, found, []))
     assert "displacement_mm" not in with_it
+
+
+def test_a_test_that_leaves_nothing_but_rounding_has_a_margin():
+    """The sum of squares of the numbers is that of the test, or a rounding error below it."""
+    test = SimpleNamespace(share=1.0, basis=np.ones((4, 1)), known=1e-5, error_df=1.0, chi2=1.0 + 1e-14)
+    units = SimpleNamespace(
+        test=lambda left, target: test, numbers=lambda target: SimpleNamespace(values=np.array([1.0]))
+    )
+    margin = _by_numbers(units, units, np.ones((4, 1)), ("mu", "multiply"), 1e-8)
+    assert 0.0 <= margin < np.inf
