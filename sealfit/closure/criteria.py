@@ -77,6 +77,9 @@ PAIR_FACTOR = 2.0
 MOST_CATEGORIES = 12
 """Largest number of levels of a category for which a slope per level is tested."""
 
+MOST_PAIRED = 40
+"""Most columns of a campaign that are tested in pairs: 500 make 125,000 pairs, 14 minutes and 3 GB."""
+
 PAIRS_FROM_P = 1e-4
 """Pairs are searched too if the least p-value of single channels is above this: theirs may be far smaller."""
 

@@ -32,6 +32,7 @@ from sealfit.closure.criteria import (
     LEAST_UNITS_OF_SLOPES,
     LOGARITHMIC_SPAN,
     MOST_CATEGORIES,
+    MOST_PAIRED,
     PAIR_FACTOR,
     SEARCHES,
 )
@@ -41,7 +42,7 @@ from sealfit.closure.small_sample_test import log_p_of
 from sealfit.effects.free import BENDS, evenly
 from sealfit.effects.sensors import DAY_AND_NIGHT, DAY_H
 from sealfit.fit.joint.estimate import Fitted
-from sealfit.fit.joint.rows import POWER, Rows
+from sealfit.fit.joint.rows import POWER, Rows, open_columns
 from sealfit.fit.joint.variance_components import orthonormal
 
 # ---------------------------------------------------------------- search
@@ -171,9 +172,15 @@ NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
 def search_pairs(
     tests: ScoreTests, channels: Sequence[Channel], singles: Sequence[Candidate], rng: np.random.Generator
 ) -> list[Candidate]:
-    """Return candidates of pairs, with p-values adjusted over single channels and pairs, strongest first."""
-    combined = itertools.combinations(_usable(channels), 2)
-    found = [c for pair in combined for c in _pair_candidates(tests, *pair)]
+    """Return candidates of pairs, with p-values adjusted over single channels and pairs, strongest first.
+
+    Of the campaign's own columns those are paired that explain most alone (`singles` are sorted), at most
+    `MOST_PAIRED`.
+    """
+    own = set(open_columns(tests.fitted.rows.table))
+    paired = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in own))[:MOST_PAIRED]
+    usable = [c for c in _usable(channels) if c.name not in own or not singles or c.name in paired]
+    found = [c for pair in itertools.combinations(usable, 2) for c in _pair_candidates(tests, *pair)]
     if not found:
         return []
     pairs = [c for c in adjust_all(tests, [*found, *singles], rng) if c.pair]

@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins, make_traces
 
+from sealfit.closure import search as search_module
 from sealfit.closure.channels import Channel, find_channels
 from sealfit.closure.forms import terms_of
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
-from sealfit.closure.score_test import Candidate, ScoreTestResult
-from sealfit.closure.search import mixed_columns
+from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
+from sealfit.closure.search import mixed_columns, search, search_pairs
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit_declared
@@ -89,3 +90,16 @@ def test_a_product_holds_the_speed_alone_only_where_the_curve_leaves_room(speeds
         any(len(term.effect.linear) > 1 and not term.effect.id.startswith("surface") for term in terms)
         == alone
     )
+
+
+def test_of_many_columns_those_that_explain_most_are_paired(monkeypatch):
+    columns = {f"column_{k}": lambda rng: rng.normal() for k in range(5)}
+    bins = make_bins(temperatures=(60.0,), days=(4.0,), bins=2, run_channels=columns)
+    tests = ScoreTests(fit_declared(make_rows(bins, has_aging=True)))
+    channels, rng = find_channels(tests.fitted.rows), np.random.default_rng(0)
+    singles = search(tests, channels, rng)
+    monkeypatch.setattr(search_module, "MOST_PAIRED", 3)
+    paired = {name for c in search_pairs(tests, channels, singles, rng) for name in c.channels}
+    own = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in columns))
+    assert {name for name in paired if name in columns} == set(own[:3])
+    assert "speed_mm_s" in paired
