@@ -118,7 +118,7 @@ def test_the_verdicts_that_a_page_quotes_are_said_so():
     above = {"state": "above_scatter", "ratio": 1.6, "p_value": 1e-21}
     found = {
         "nothing_missing": {"effects": [], "sensitivity": [{**limit, "cannot_tell": False}]},
-        "closed": {"effects": [{"candidate": False}], "fit_quality": above},
+        "closed": {"effects": [{"candidate": False}], "fit_quality": above, "left": {}},
     }
     text = (DOCS / "how-to" / "verdict.md").read_text("utf-8")
     shown = dict(re.findall(r"^    verdict     (\w+): (.*)$", text, re.MULTILINE))
