@@ -102,7 +102,7 @@ def test_closure_json_has_every_key_and_no_nan(first):
     closure = json.loads((out / "closure.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert set(closure) == KEYS
     assert set(closure["before"]) == set(closure["after"]) == ERROR_KEYS
-    assert set(closure["left"]) == {"rmse_N", "level", "channel", "p_value"}
+    assert set(closure["left"]) == {"rmse_N", "level", "channel", "p_value", "significant"}
     assert closure["verdict"] == "nothing_missing"
     assert closure["before"] == closure["after"]
     assert closure["noise_floor_N"] > 0
