@@ -119,8 +119,8 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
     """Return the few best proposals to refit, the best free shape among them.
 
     Each effect is kept at most once per target and on at most two. A grid is coarse, so physical effects get
-    a margin. Every further quantity that explains nearly as much is kept: the missing effect biases the model
-    it is tested on.
+    a margin. Every further quantity that explains nearly as much has a named form among them: the missing
+    effect biases the model it is tested on.
     """
     kept: list[Proposal] = []
     ranked = sorted(found, key=lambda p: p.bic - EQUAL_BIC * p.term.effect.physical)
@@ -131,7 +131,7 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
             continue
         if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
-    known, most = {p.term.target for p in kept}, max((p.chi2 for p in found), default=0.0)
+    known, most = {p.term.target for p in kept if p.named}, max((p.chi2 for p in found), default=0.0)
     for target in dict.fromkeys(p.term.target for p in ranked if p.chi2 >= CONTENDER_SHARE * most):
         if target not in known:
             kept += [p for p in ranked if p.term.target == target][:FORMS_EACH]

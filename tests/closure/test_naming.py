@@ -1,5 +1,6 @@
 """Which of several proposals is reported: equals by rank, and only equals; which are said to be rivals."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ from sealfit.closure.naming import correlation, determined, named_among, rivals
 from sealfit.closure.ripple_selection import numbered
 from sealfit.closure.ripples import Peak
 from sealfit.effects import EFFECTS
-from sealfit.effects.free import free_effect
+from sealfit.effects.free import SURFACE, free_effect
 from sealfit.fit.joint.estimate import fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import Groups, make_rows
@@ -226,3 +227,13 @@ def test_proposals_of_one_term_are_compared_by_identity():
     one, other = (proposal("linear", column=np.array([1.0, 2.0])) for _ in range(2))
     assert one in [one]
     assert one not in [other]
+
+
+def test_a_free_shape_of_a_quantity_leaves_its_named_forms_among_those_refitted():
+    names = ("linear", "log", "quadratic", "power", "saturation", "hyperbolic", "bump", "step")
+    first = [proposal(name, "force", behind=k) for k, name in enumerate(names)]
+    surface = proposal(replace(EFFECTS["linear"], id=SURFACE), "mu", behind=20.0)
+    named = proposal("exponential_approach", "mu", behind=30.0)
+    kept = naming._best_few([named, surface, *first])
+    assert surface in kept
+    assert named in kept
