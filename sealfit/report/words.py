@@ -75,6 +75,8 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
         errors[0] = Markup("with {}, {}").format("them" if len(added) > 1 else "it", errors[0])
     if closure["verdict"] != "closed":
         left = f"a significant residual remains that no effect explains: {_where(closure['left'], config)}"
+    elif closure["left"].get("significant"):
+        left = f"{_where(closure['left'], config)}, by less than repeats scatter"
     return _sentences(lacked, left, *errors)
 
 
