@@ -354,12 +354,17 @@ def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_k
     assert "what 'Gewicht [kg]' of log.csv holds is not known here" in doubts
 
 
-def test_a_log_with_whole_dates_and_a_clock_is_read(tmp_path):
-    rows = ["File,Days,Date,Time"]
+def write_with_log(folder, columns, started):
+    """Write four traces, and a log with the time that `started(trace)` gives in the further `columns`."""
+    rows = [f"File,Days,{columns}"]
     for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
-        exports.write(tmp_path, f"M{number}.csv", plain(one))
-        rows.append(f"M{number}.csv,{one.days},2024-03-14T00:00:00,{one.started:%H:%M:%S}")
-    exports.write(tmp_path, "log.csv", "\n".join(rows) + "\n")
+        exports.write(folder, f"M{number}.csv", plain(one))
+        rows.append(f"M{number}.csv,{one.days},{started(one)}")
+    exports.write(folder, "log.csv", "\n".join(rows) + "\n")
+
+
+def test_a_log_with_whole_dates_and_a_clock_is_read(tmp_path):
+    write_with_log(tmp_path, "Date,Time", lambda one: f"2024-03-14T00:00:00,{one.started:%H:%M:%S}")
     made = draft(tmp_path)
     assert "columns 'Date' and 'Time' of log.csv" in [guess.evidence for guess in made.guesses]
     runs = ingest_campaign(tmp_path, parse_config(made.text, "rig.toml")).tables["runs"]
@@ -367,11 +372,7 @@ def test_a_log_with_whole_dates_and_a_clock_is_read(tmp_path):
 
 
 def test_a_log_with_dates_of_another_form_is_said_with_the_key_that_reads_them(tmp_path):
-    rows = ["File,Days,Date"]
-    for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
-        exports.write(tmp_path, f"M{number}.csv", plain(one))
-        rows.append(f"M{number}.csv,{one.days},14/03/2024")
-    exports.write(tmp_path, "log.csv", "\n".join(rows) + "\n")
+    write_with_log(tmp_path, "Date", lambda one: "14/03/2024")
     (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "ISO 8601" in doubt.reason]
     assert doubt.fix == "Set files.runs_columns.started_at = 'Date' and files.date_format = '%d/%m/%Y'."
 
