@@ -249,16 +249,15 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
     if not found:
         return []
     likeliest = sorted(found, key=lambda p: p.bic)
-    refitted = sorted((_joint(fitted, p) for p in likeliest[:LIKELIEST]), key=lambda p: p.bic)
-    best, alone = _reestimated(refitted[0]), _reestimated(refitted[0], noise=True)
-    if refitted[0].fitted.deviance - alone.fitted.deviance > SCATTER_FALL:
-        refitted = sorted(_refitted_under(fitted, likeliest, alone.fitted.scatter), key=lambda p: p.bic)
+    joint = [_joint(fitted, p) for p in likeliest[:LIKELIEST]]
+    first = min(joint, key=lambda p: p.bic)
+    best, alone = _reestimated(first), _reestimated(first, noise=True)
+    joint += [_joint(fitted, p) for p in likeliest[LIKELIEST:]]
+    if first.fitted.deviance - alone.fitted.deviance > SCATTER_FALL:
+        joint = list(_refitted_under(fitted, joint, alone.fitted.scatter))
+    refitted = sorted(joint, key=lambda p: p.bic)
+    if refitted[0] is not first:
         best = _reestimated(refitted[0])
-    elif len(found) > LIKELIEST:
-        refitted = sorted(
-            [*refitted, *(_joint(fitted, p) for p in likeliest[LIKELIEST:])], key=lambda p: p.bic
-        )
-        best = best if refitted[0].term is best.term else _reestimated(refitted[0])
     least = min(best.bic, refitted[0].bic)
     scatter = best.fitted.scatter
     near = [_deviance_under(p.fitted, scatter) + p.bic_penalty < least + REFIT_MARGIN for p in refitted[1:]]
@@ -292,23 +291,22 @@ def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
     return replace(proposal, fitted=reestimated(proposal.fitted, noise=noise))
 
 
-def _refitted_under(fitted: Fitted, found: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
-    """Yield proposals fitted under another scatter, the better of two starts each.
+def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
+    """Yield the fitted proposals, likeliest first, fitted under another scatter: the better of two starts.
 
-    One is the joint fit under the current scatter. The other has v_s and b searched anew, as they may have
-    been biased. That search is made with the likeliest effect on each quantity; further effects on it start
-    from its result.
+    One is their own fit. The other has v_s and b searched anew, as they may have been biased. That search is
+    made with the likeliest effect on each quantity; further effects on it start from its result.
     """
     rows, friction = fitted.rows, fitted.friction
     begun: dict[tuple[str, str], np.ndarray] = {}
-    for proposal in found:
+    for proposal in joint:
         model = fitted.model.with_term(proposal.term, proposal.values)
         target = proposal.term.target
         if target in begun:
             model = solve_linear(replace(model, theta=begun[target]), rows, scatter, friction)
         else:
             model = search_nonlinear(model, rows, scatter)
-        starts = [model, _joint(fitted, proposal).fitted.model]
+        starts = [model, proposal.fitted.model]
         fits = [fit(start, rows, scatter, turns=0, friction=friction) for start in starts]
         anew = min(fits, key=lambda f: f.deviance)
         begun.setdefault(target, anew.model.theta)

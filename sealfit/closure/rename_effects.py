@@ -51,15 +51,15 @@ class Renaming:
                 continue
             same = proposals[0].term.key() == item.proposal.term.key()
             better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
-            others = [*added[:number], *added[number + 1 :]]
             if better is None and self._unchanged(without, fitted, number, item) is None:
-                left = [fitted.refitted(fitted.model.without_term(k)) for k in range(number, len(added))]
+                later = range(number + 1, len(added))
+                left = [without, *(fitted.refitted(fitted.model.without_term(k)) for k in later)]
                 least = min(range(len(left)), key=lambda k: left[k].deviance)
                 fitted = fit(left[least].model, fitted.rows, fitted.scatter, turns=2)
                 added = [a for k, a in enumerate(added) if k != number + least]
             elif better is not None and better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
-                added = [*others, better]
+                added = [*added[:number], *added[number + 1 :], better]
         return fitted, added
 
     def _unchanged(

@@ -174,12 +174,12 @@ def search_pairs(
 ) -> list[Candidate]:
     """Return candidates of pairs, with p-values adjusted over single channels and pairs, strongest first.
 
-    Of the campaign's own columns those are paired that explain most alone (`singles` are sorted), at most
+    Of the campaign's own columns those that explain least alone (`singles` are sorted) are left out beyond
     `MOST_PAIRED`.
     """
     own = set(open_columns(tests.fitted.rows.table))
-    paired = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in own))[:MOST_PAIRED]
-    usable = [c for c in _usable(channels) if c.name not in own or not singles or c.name in paired]
+    left_out = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in own))[MOST_PAIRED:]
+    usable = [c for c in _usable(channels) if c.name not in left_out]
     found = [c for pair in itertools.combinations(usable, 2) for c in _pair_candidates(tests, *pair)]
     if not found:
         return []

@@ -163,26 +163,22 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config:
     return Plot("finding", title, (panel, errors.panels[0]), (*STAGES, *floor))
 
 
-BY_STROKE = ["run_id", "file", "stroke"]
-
-
 def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     """Return the mean residuals at each commanded speed and direction, as rows of table `channels`.
 
     Where no speed was commanded, measured ones that agree to two digits are one. Standard errors are from the
     strokes' means.
     """
-    found = {}
+    found, stroke = {}, ["run_id", "file", "stroke"]
     for stage, residuals in (("before", before), ("after", after)):
-        values = residuals.reindex(columns=[*BY_STROKE, "speed_mm_s", "speed_set_mm_s", "residual_N"])
-        means = values.groupby(BY_STROKE, sort=True).mean().reset_index()
+        values = residuals.reindex(columns=[*stroke, "speed_mm_s", "speed_set_mm_s", "residual_N"])
+        means = values.groupby(stroke).mean().reset_index()
         measured = means["speed_mm_s"].map(lambda value: float(f"{value:.2g}"))
         speed = (np.sign(measured) * means["speed_set_mm_s"]).fillna(measured)
         groups, farthest = means.groupby(speed), means["residual_N"].abs().groupby(speed).idxmax()
-        found["x"] = groups["residual_N"].mean().index.to_series()
         found[f"{stage}_N"], found[f"{stage}_se_N"] = groups["residual_N"].mean(), groups["residual_N"].sem()
         found[f"{stage}_run"] = farthest.map(means["run_id"])
-    return pd.DataFrame(found)
+    return pd.DataFrame(found).rename_axis("x").reset_index()
 
 
 # ---------------------------------------------------------------- residual by level
