@@ -214,7 +214,7 @@ def test_how_an_effect_acts(change, words):
 
 def test_a_significant_residual_below_the_scatter_of_repeats_is_said_beside_closed():
     left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005}
-    said = "The residual varies with displacement (mm) along strokes (p &lt; 0.001), by less than repeats scatter"
+    said = "varies with displacement (mm) along strokes (p &lt; 0.001), by less than repeats scatter."
     assert said in verdict(document(**left, significant=True), shapes(), Config())
     assert said not in verdict(document(**left, significant=False), shapes(), Config())
 
