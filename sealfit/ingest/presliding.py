@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealfit.ingest.segments import median, quantile
+from sealfit.ingest.segments import median, quantile, strong_wave
 
 # Rise lengths after which a rise is over: 1/50000 of it is left. 1/5000 still showed in means over a
 # campaign.
@@ -68,14 +68,6 @@ SKIPPED = (1.0, 2.0)
 LEAST_ROWS = 8
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0
-# Parts of equal rows into which a steady window is cut to see whether it begins within a transient, and how
-# many of the first may be left out: a longer change is an effect.
-PARTS, MOST_PARTS = 20, 2
-# Parts after these to which the parabola is fitted with which they are compared.
-COMPARED = 8
-# Standard errors, and share of the force, by which the first part must be off, one pair or the other. What
-# warming leaves beside the parabola in a stroke of low noise reaches 10 standard errors and 2 % of the force.
-OFF = ((20.0, 0.002), (8.0, 0.1))
 
 
 class Start(NamedTuple):
@@ -130,7 +122,8 @@ def rise_of(start: Start) -> Rise:
     Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a
     force that warming lets fall, is not. With much damping of the bristles (sigma_1) a fast stroke's force
     comes up at once, to more than its level, and falls to it by the same law; then the fall from its peak is
-    what has to be over.
+    what has to be over. Where something is left in the window, a strong wave, such as a ripple, is taken out
+    first.
 
     Notes
     -----
@@ -143,6 +136,16 @@ def rise_of(start: Start) -> Rise:
     >>> 5.1 < end < 5.8
     True
     """
+    rise = _rise_or_fall(start)
+    if rise.length_mm > 0.0 and rise.end_mm >= 0.99 * SETTLED * rise.length_mm:
+        return rise
+    late = int(start.distance_mm.searchsorted(EARLY[1] * start.distance_mm[-1]))
+    wave = strong_wave(start.distance_mm, start.force_N, late)
+    return _rise_or_fall(start._replace(force_N=start.force_N - wave)) if wave.any() else rise
+
+
+def _rise_or_fall(start: Start) -> Rise:
+    """Return the rise of a start, or the fall from the peak that damping makes of it."""
     if (peak := _early_peak(start)) is not None:
         turned, peak_mm = _turned(start, peak), float(start.distance_mm[peak])
         fall = _rise(turned)
@@ -220,7 +223,7 @@ def _explained(start: Start, length_mm: float) -> float:
 
 def _on_plateau(start: Start, begin_mm: float | None = None) -> Start:
     """Return a start from where the speed has reached its plateau, or from a later distance."""
-    begin_mm = start.plateau_mm if begin_mm is None else begin_mm
+    begin_mm = begin_mm or start.plateau_mm
     rows = slice(max(start.ramp_end, int(start.distance_mm.searchsorted(begin_mm))), None)
     return Start(start.distance_mm[rows] - begin_mm, start.force_N[rows], 0)
 
@@ -423,26 +426,3 @@ def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> float:
         bend = before - 2.0 * here + after
         step = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
     return float(lengths_mm[best] * (lengths_mm[1] / lengths_mm[0]) ** step)
-
-
-def transient_rows(force_N: np.ndarray) -> int:
-    """Return how many of the first rows of a steady window are a transient that the law did not reach.
-
-    The force of n rows is cut into parts. A first part whose mean is far off the parabola through later ones
-    is left out, with the second if that is off, too: a rise or an overshoot of a few samples at a high speed
-    is not fitted, and an effect of so short a distance could not be told from it. Of the reversed force it is
-    the number of last rows.
-    """
-    size = len(force_N) // PARTS
-    if size < 1:
-        return 0
-    means = force_N[: size * PARTS].reshape(PARTS, size).mean(axis=1)
-    powers = np.vander(np.arange(MOST_PARTS + COMPARED, dtype=float), 3)
-    later = slice(MOST_PARTS, MOST_PARTS + COMPARED)
-    inverse = np.linalg.pinv(powers[later])
-    residual = means[: len(powers)] - powers @ (inverse @ means[later])
-    spread = np.sqrt(np.sum(residual[later] ** 2) / (COMPARED - 3))
-    error = spread * np.sqrt(1.0 + ((powers[:MOST_PARTS] @ inverse) ** 2).sum(axis=1))
-    level, size_N = abs(float(means.mean())), np.abs(residual[:MOST_PARTS])
-    off = np.any([size_N > np.maximum(k * error, share * level) for k, share in OFF], axis=0)
-    return size * int(np.count_nonzero(np.logical_and.accumulate(off)))

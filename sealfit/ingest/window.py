@@ -8,8 +8,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import chdtrc
 
-from sealfit.ingest.presliding import Start, rise_of, transient_rows
-from sealfit.ingest.segments import median, stretches, weighted_median
+from sealfit.ingest.presliding import Start, rise_of
+from sealfit.ingest.segments import median, stretches, transient_rows, weighted_median
 
 # Share of the plateau speed below which the platform rests. A ripple of the speed stays above it.
 REST = 0.5

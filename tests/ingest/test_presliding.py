@@ -7,7 +7,8 @@ from scipy.ndimage import uniform_filter1d
 
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.presliding import Start, _before, rise_of, transient_rows
+from sealfit.ingest.presliding import Start, _before, rise_of
+from sealfit.ingest.segments import transient_rows
 from sealfit.ingest.strokes import find_strokes
 
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
@@ -25,6 +26,7 @@ def bristle_trace(
     shape="straight",
     drift=0.0,
     ripple=0.0,
+    wave=0.2,
 ):
     """Return time, displacement and force of a stroke `ratio` bristle lengths long, after a rest of a second.
 
@@ -39,7 +41,7 @@ def bristle_trace(
         slid = SPEED * (since - ramp * -np.expm1(-since / ramp))
     bent = np.exp(-slid / LENGTH)  # damping: sigma_1 dz/dt, in N at the stroke's speed
     force = LEVEL + (begin - LEVEL) * bent + damping * np.gradient(slid, time) / SPEED * bent
-    noise = random.normal(0.0, NOISE, time.size) + ripple * np.cos(2 * np.pi * slid / (0.2 * LENGTH))
+    noise = random.normal(0.0, NOISE, time.size) + ripple * np.cos(2 * np.pi * slid / (wave * LENGTH))
     if drift:
         noise += uniform_filter1d(random.normal(0.0, drift, time.size), 8) * 8**0.5
     return time, slid + random.normal(0.0, blur, time.size), force + noise
@@ -82,6 +84,20 @@ def test_the_steady_force_does_not_depend_on_where_the_window_begins(ratio, more
 def test_a_ripple_does_not_hide_the_rise_of_a_reversed_stroke(ratio):
     _, steady = steady_forces(ratio, begin=-LEVEL, ripple=0.15 * LEVEL, hertz=50.0)
     assert steady == pytest.approx(LEVEL, rel=0.04)  # the rise begins 90 N below
+
+
+@pytest.mark.parametrize("ratio", [5.0, 8.0, 11.0])
+@pytest.mark.parametrize("wave", [0.4, 0.9])
+def test_a_ripple_does_not_bend_the_rise_that_is_taken_out(ratio, wave):
+    """What is left of the rise is that of the stroke without a ripple."""
+    ends = []
+    for ripple in (0.0, 0.2 * LEVEL):
+        time, place, force = bristle_trace(ratio, ripple=ripple, wave=wave)
+        (found,) = find_strokes(time, place, force, Strokes())
+        late = place > 0.55 * ratio * LENGTH
+        ends.append(found.presliding_N[found.steady & late].mean())
+    assert ends[0] < 0.0
+    assert ends[1] == pytest.approx(ends[0], rel=0.1, abs=1e-4 * LEVEL)
 
 
 @pytest.mark.parametrize("ratio", [6.0, 11.0, 30.0])
