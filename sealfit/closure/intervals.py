@@ -155,9 +155,8 @@ def mean_half_width(
     for covariance_of_groups, information in others:
         reach = np.full(half.shape, t_quantile(df))
         if len(information):
-            share = np.stack(
-                [tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information]
-            )
+            parts = [tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information]
+            share = np.maximum(parts, 0.0)
             share /= np.maximum(share.sum(axis=0), 1e-300)
             reach = np.where(
                 share.max(axis=0) > LARGEST_LEVERAGE, 0.0, stdtrit(satterthwaite_df(share), 0.975)

@@ -41,6 +41,15 @@ def test_a_group_that_decides_alone_says_nothing_of_its_scatter():
     np.testing.assert_allclose(half, t_quantile(1e6) * 0.1)
 
 
+def test_what_rounding_leaves_of_groups_that_tell_nothing_is_no_information():
+    groups = [(np.array([0]), np.array([[share]])) for share in (1e-100, -1e-100)]
+    with np.errstate(all="raise", under="ignore"):
+        half = mean_half_width(
+            Tangent.dense(np.array([[1.0]])), np.array([[1.0]]), 1e6, [Sandwich(np.array([[4.0]]), groups)]
+        )
+    np.testing.assert_allclose(half, t_quantile(1e6))  # the first decides alone
+
+
 def test_files_runs_and_specimens_are_asked_down_to_the_first_of_which_there_are_many():
     rows = make_rows(make_bins(bins=4), has_aging=True)
     counts = [rows.groups.starts[level].size for level in ("specimen", "run", "file")]
