@@ -133,11 +133,17 @@ def _drawn_tables(
         level_table("after", after, list(selection.last)),
     ]
     shapes = shape_table(after, config)
+    drawn = {"shapes": shapes, "shape_points": shape_points(after, shapes)}
+    if selection.inconclusive is not None:  # the last effect of a fit of its own
+        alone = selection.inconclusive.proposal.fitted
+        own, number = shape_table(alone, config), len(alone.model.terms) - 1
+        for name, more in (("shapes", own), ("shape_points", shape_points(alone, own))):
+            more = more[more["effect"] == number].assign(effect=len(selection.added))
+            drawn[name] = pd.concat([drawn[name], more], ignore_index=True) if len(drawn[name]) else more
     return {
         "levels": pd.concat(levels, ignore_index=True),
         "channels": channel_table(selection, before, after),
-        "shapes": shapes,
-        "shape_points": shape_points(after, shapes),
+        **drawn,
         "curves": curve_table(before, after),
     }
 

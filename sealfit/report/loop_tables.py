@@ -162,7 +162,7 @@ def _parameter(p: Mapping, effect: Mapping) -> dict:
 
 
 def _curve(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Config) -> dict | None:
-    """Return the head and a few places of a free shape along its first channel; None for a candidate."""
+    """Return the head and a few places of a free shape along its first channel; None if it is not stored."""
     own = shapes[shapes["effect"] == closure["effects"].index(effect)]
     if own.empty:
         return None

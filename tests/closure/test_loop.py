@@ -181,6 +181,11 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     assert (effect["channels"], effect["acts_on"], effect["level"]) == (["hardness_ShA"], "v_s", "condition")
     assert document["after"]["rmse_N"] == document["before"]["rmse_N"]
     assert made.tables["effects"].empty
+    shape, points = made.tables["shapes"], made.tables["shape_points"]
+    assert set(shape["effect"]) == set(points["effect"]) == {0}
+    assert set(points["x"]) <= set(hardness.values())
+    line = np.polyfit(points["x"].astype(float), points["value"], 1)
+    assert line[0] == pytest.approx(0.04, rel=0.2)
     assert any("second specimen" in run["why"] for run in document["next_runs"])
 
 

@@ -163,6 +163,17 @@ def test_a_card_has_target_parameters_and_alternatives(pages):
     assert "Replicate specimens would show" in text
 
 
+def test_a_candidate_has_a_panel_that_says_so(small, unsaved):
+    for name in ("shapes", "shape_points"):
+        own = small.tables[name]
+        small.tables[name] = pd.concat([own, own.assign(effect=1, channel="aging_days")])
+    page = build_report(*small.arguments).html
+    assert [alt.split(" along")[0] for alt in re.findall(r'alt="(Shape of [^"]*)', page)] == [
+        "Shape of warming by sliding (time)", "Shape of candidate: aging with an induction time"
+    ]  # fmt: skip
+    assert "candidate: aging" in page.split("candidate, not applied")[1].split("</article>")[0]
+
+
 def test_a_card_shows_the_symbol_of_a_parameter_that_an_effect_is_added_to(small, unsaved):
     small.closure["effects"][0] |= {"acts_on": "v_s", "operation": "add"}
     assert "added to v s : " in Page(build_report(*small.arguments).html).text

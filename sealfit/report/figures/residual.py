@@ -404,7 +404,7 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, c
         own = points[(points["effect"] == index) & (points["channel"] == channel)]
         draw = partial(draw_shape, rows=rows, effect=effect, units=config.units, points=own)
         scale = shape_scale(effect)
-        words = effect_label(effect, config.units)
+        words = ("candidate: " if effect["candidate"] else "") + effect_label(effect, config.units)
         alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
         alt += f"{shape_label(rows, effect, config.units)} from {number(scale * rows['value'].min())} to "
         alt += f"{number(scale * rows['value'].max())}."
