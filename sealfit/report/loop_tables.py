@@ -25,10 +25,9 @@ from sealfit.report.notation import (
     split_channels,
     symbol_html,
     together,
-    true_units,
 )
 from sealfit.report.summary import by_gain, level_words
-from sealfit.report.words import acts, meaning, target_html, with_symbols
+from sealfit.report.words import acts, in_words, meaning, target_html, with_symbols
 
 MOST_TESTS = 40
 CURVE_PLACES = 7  # of a free shape that a card lists
@@ -88,7 +87,9 @@ def refused_rows(closure: Mapping, config: Config) -> list[dict]:
     """Return the significant effects that were not accepted: label, p-value and reason."""
     return [
         {
-            "label": f"{entry['id']} along {_labels(entry['channels'], config)}",
+            "label": Markup("{}, acting on {}").format(
+                effect_label(entry, config.units), target_html(entry["acts_on"], config)
+            ),
             "p": p_value(entry["p_value"]),
             "reason": with_symbols(entry["reason"]),
         }
@@ -233,7 +234,7 @@ def next_runs(closure: Mapping, config: Config) -> list[dict]:
     """Return the recommended runs: the reason and the conditions."""
     return [
         {
-            "why": with_symbols(capital(true_units(entry["why"], config.units))),
+            "why": in_words(capital(entry["why"]), closure, config),
             "conditions": _wanted(entry["conditions"], config),
         }
         for entry in closure["next_runs"]

@@ -206,8 +206,8 @@ GREEK = {
 }  # fmt: skip
 _SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])(?:_?([0-9]+)|_([A-Za-z0-9]{{1,4}}))?")
 _SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displacement_mm", "distance_mm",
-          "speed_mm_s", "force_N", "load_N", *CALENDAR)  # fmt: skip
-_SLOT = re.compile(rf"\b(?:{'|'.join(_SLOTS)})\b")
+          "speed_mm_s", "force_N", "load_N", "time_s", "aging_days", "temperature_C",
+          "compression_ratio_pct", *CALENDAR)  # fmt: skip
 
 
 def symbol_html(name: str) -> Markup:
@@ -271,15 +271,21 @@ def short(text: object, longest: int = 34) -> str:
     return text if len(text) <= longest else text[: longest - 1].rstrip() + "…"
 
 
-def true_units(text: str, units: Units) -> str:
-    """Return a sentence with each slot's name replaced by its quantity and unit.
+def _slot(names: Collection[str] = ()) -> re.Pattern:
+    """Return a pattern of the slots and of those of a campaign's own columns that words would not contain."""
+    found = sorted({*_SLOTS, *(name for name in names if "_" in name)}, key=len, reverse=True)
+    return re.compile(rf"\b(?:{'|'.join(map(re.escape, found))})\b")
+
+
+def true_units(text: str, units: Units, names: Collection[str] = ()) -> str:
+    """Return a sentence with each name of a slot, or of `names`, replaced by its quantity and unit.
 
     Examples
     --------
     >>> true_units("force_N is stuck", Units({"force": ("torque", "mN m")}))
     'torque (mN m) is stuck'
     """
-    return _SLOT.sub(lambda found: channel_label(found[0], units), str(text))
+    return _slot(names).sub(lambda found: channel_label(found[0], units), str(text))
 
 
 def channel_label(name: str, units: Units) -> str:
@@ -342,7 +348,7 @@ def effect_label(effect: Mapping, units: Units) -> str:
     target = rf", (?:added to|factor on) {re.escape(str(effect.get('acts_on')))}(?=,|$)"
     force = units.quantity("force").removeprefix("friction ")
     label = re.sub(r"\bforce\b", force, re.sub(target, "", str(effect["label"])))
-    return _SLOT.sub(lambda found: channel_words(found[0], units), label)
+    return _slot(effect.get("channels", ())).sub(lambda found: channel_words(found[0], units), label)
 
 
 @dataclass(frozen=True)

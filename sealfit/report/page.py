@@ -43,7 +43,7 @@ from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter
 from sealfit.report.style import WIDTH, Plot
 from sealfit.report.summary import of_properties
 from sealfit.report.summary_lines import LACKING, property_sentences, values_clause
-from sealfit.report.words import left_over, undecided, verdict, with_left_channels
+from sealfit.report.words import left_over, undecided, verdict, with_left_channels, without_load
 from sealfit.tables import SCHEMAS
 
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
@@ -241,6 +241,8 @@ def answered(
     tables = with_after_fits(tables)
     if closure is not None:
         closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
+        if len(tables["steady"]) and tables["steady"]["load_N"].isna().all():
+            closure = without_load(closure)
     return tables, closure
 
 

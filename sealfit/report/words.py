@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -63,8 +64,10 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
         power = power_clause(closure, config.units)
         return _sentences("no effect beyond the declared model is significant", *errors, power)
     if closure["verdict"] == "cannot_tell":
-        untold = untold_clause(closure, config.units)
-        return _sentences(f"these files do not decide whether an effect is missing: {untold}", *errors)
+        lead = Markup("these files do not decide whether an effect is missing: {}")
+        return _sentences(
+            lead.format(in_words(untold_clause(closure, config.units), closure, config)), *errors
+        )
     effects = closure["effects"]
     added = [(effects.index(e), e) for e in by_gain(effects) if not e["candidate"]]
     lacked = left = ""
@@ -83,7 +86,14 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
 def undecided(closure: Mapping | None, config: Config) -> Markup:
     """Return what the files do not decide beside the effects that were found, in a sentence; may be empty."""
     untold = untold_clause(closure, config.units) if closure and closure["verdict"] == "closed" else ""
-    return _sentences(f"not decided by these files: {true_units(untold, config.units)}" if untold else "")
+    lead = Markup("not decided by these files: {}")
+    return _sentences(lead.format(in_words(untold, closure, config)) if untold else "")
+
+
+def in_words(text: str, closure: Mapping, config: Config) -> Markup:
+    """Return a sentence of closure.json with quantities and units for columns, and parameters as symbols."""
+    names = [entry["variable"] for entry in closure.get("sensitivity") or ()]
+    return with_symbols(true_units(text, config.units, names))
 
 
 def _missed_effects(
@@ -249,6 +259,17 @@ def _where(left: Mapping, config: Config) -> str:
     if level:
         text += f" {level_words(level)}"
     return f"{text} (p {p_value(left.get('p_value'))})" if known(left.get("p_value")) else text
+
+
+def without_load(closure: Mapping) -> dict:
+    """Return closure.json of a campaign without a load: F_s and F_c are fitted in place of mu_s and mu_c."""
+    return json.loads(
+        re.sub(
+            r'("acts_on": "|factor on |added to )mu(_[sc])?\b',
+            lambda found: found[1] + (f"F{found[2]}" if found[2] else "friction"),
+            json.dumps(closure),
+        )
+    )
 
 
 def with_left_channels(closure: Mapping, channels: Collection[str]) -> dict:

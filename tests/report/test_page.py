@@ -188,6 +188,24 @@ def test_torque_is_never_called_force_nor_its_slot(reports, pages):
     assert "no load given: torque is fitted instead of coefficients" in text
 
 
+def test_without_a_load_effects_act_on_friction_and_the_forces(unsaved):
+    made = torque_campaign()
+    why = "would distinguish linear in dust_mg, factor on mu from linear in dust_mg, added to mu_s"
+    wear = {**aging_campaign().closure["effects"][0], "label": "linear in dust_mg, factor on mu"}
+    place = {"variable": "dust_mg", "level": "run"}
+    made.closure |= {
+        "verdict": "unexplained",
+        "effects": [{**wear, "channels": ["dust_mg"]}],
+        "next_runs": [{"why": why, "conditions": {"dust_mg": 2.0}}],
+        "sensitivity": [{**dict.fromkeys(("smallest_N", "smallest_pct", "files_needed")), **place}],
+    }
+    text = Page(build_report(*made.arguments).html).text
+    assert "The declared model lacks linear in dust mg (" in text
+    assert "It scales friction and depends on dust mg" in text
+    assert "linear in dust mg, factor on friction from linear in dust mg, added to F s Measure" in text
+    assert "μ" not in text.split("Next runs")[0].split("Not distinguishable")[0]
+
+
 def test_a_loop_that_was_not_run_is_said_not_guessed(pages):
     text = pages["not_run"].text
     assert "The loop has not been run" in text
@@ -331,9 +349,10 @@ def test_the_page_states_the_sensitivity_and_the_effects_not_accepted():
     assert [row["smallest"].replace("\u00a0", " ") for row in rows] == ["0.12 N", "none"]
     assert [row["level"] for row in rows] == ["along strokes", "between runs"]
     assert rows[0]["files"] == "1,200"
-    refused = {"id": "ripple", "channels": ["displacement_mm"], "p_value": 1e-6, "reason": "it is too small"}
-    (row,) = refused_rows({"refused": [refused]}, Config())
-    assert row["label"] == "ripple along displacement (mm)"
+    label = "ripple along displacement_mm, factor on mu_s"
+    refused = {"label": label, "acts_on": "mu_s", "channels": ["displacement_mm"], "p_value": 1e-6}
+    (row,) = refused_rows({"refused": [{**refused, "reason": "it is too small"}]}, Config())
+    assert row["label"] == "ripple along displacement, acting on <i>μ</i><sub>s</sub>"
 
 
 def test_an_earlier_report_is_no_step_of_this_one():

@@ -5,7 +5,7 @@ from report.made_tables import empty, shapes
 
 from sealfit.config import Config
 from sealfit.report.summary import outlier_clause, quality_clause
-from sealfit.report.words import acts, does, left_over, verdict, with_left_channels
+from sealfit.report.words import acts, does, left_over, undecided, verdict, with_left_channels
 
 NUMBERS = {
     "rmse_N": 1.3,
@@ -217,6 +217,19 @@ def test_a_significant_residual_below_the_scatter_of_repeats_is_said_beside_clos
     said = "varies with displacement (mm) along strokes (p &lt; 0.001), by less than repeats scatter."
     assert said in verdict(document(**left, significant=True), shapes(), Config())
     assert said not in verdict(document(**left, significant=False), shapes(), Config())
+
+
+def test_what_is_not_decided_has_names_in_words():
+    seen = {**SEEN, "variable": "dust_mg", "smallest_pct": None, "cannot_tell": True}
+    refused = {"label": "linear in time_s, factor on mu_s", "p_value": 1e-4, "weak": True}
+    closure = document() | {"sensitivity": [seen], "refused": [refused]}
+    text = str(undecided(closure, Config()))
+    assert text.startswith(
+        "Not decided by these files: linear in time (s), factor on <i>μ</i><sub>s</sub> (p"
+    )
+    assert "dust mg (no effect" in text
+    untold = verdict(closure | {"verdict": "cannot_tell"}, empty("shapes"), Config())
+    assert "is missing: linear in time (s), factor on <i>μ</i><sub>s</sub> (p" in untold
 
 
 def test_what_is_left_is_called_scatter_only_if_it_is():
