@@ -157,6 +157,7 @@ def test_every_condition_lies_on_the_master_curve_whichever_way_temperature_acts
     for laws in (arrhenius(), arrhenius(15.0, "loss")):
         table = campaign(noise=1e-4, series=SERIES, laws=laws, days=DAYS, ways=(1,))
         _, curves = joint_laws(table, fit_conditions(table, Config()), Config())
+        assert curves["quantity"].unique().tolist() == ["mu_s", "mu_c"]
         own = curves[curves["quantity"] == "mu_s"]
         law = own[own["kind"] == "law"].sort_values("scaled_days")
         values = own[own["kind"] == "value"]

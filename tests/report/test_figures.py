@@ -217,6 +217,13 @@ def test_scaled_days_are_plain_numbers(ax):
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0", "1", "10"]
 
 
+def test_a_master_curve_is_called_by_its_quantity(made):
+    titles = [
+        panel.title for panel in draw_all(made.tables, made.closure, made.config)["master_curve"].panels
+    ]
+    assert titles == ["Static friction coefficient μ_s", "Coulomb friction coefficient μ_c"]
+
+
 # ---------------------------------------------------------------- the loop
 def test_errors_stand_beside_the_noise_floor(ax, made):
     draw_errors(ax, made.closure, TORQUE)

@@ -79,9 +79,10 @@ def law_tables(data: Mapping[tuple[str, str], tuple[Aged, str]]) -> tuple[pd.Dat
 
 
 def _quantities(levels: Levels) -> list[tuple[str, str]]:
-    """Return rubber and quantity of all values, in order."""
-    pairs = levels.table[["rubber", "quantity"]].drop_duplicates()
-    return sorted(pairs.itertuples(index=False, name=None))
+    """Return rubber and quantity of all values, in order; mu_s comes before mu_c."""
+    pairs = levels.table[["rubber", "quantity"]].drop_duplicates().itertuples(index=False, name=None)
+    order = [*FORCES, *FORCES.values()]
+    return sorted(pairs, key=lambda pair: (pair[0], order.index(pair[1])))
 
 
 def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:

@@ -14,6 +14,7 @@ from sealfit.config import Config
 from sealfit.report.drawing import explain
 from sealfit.report.notation import (
     ConditionNames,
+    capital,
     count,
     given,
     is_unaged,
@@ -285,6 +286,10 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 # The values of all conditions over aging time scaled by the rate at their temperature.
 
 MARKERS = "os^Dv<>"
+QUANTITIES = {
+    "mu_s": "static friction coefficient μ_s", "mu_c": "Coulomb friction coefficient μ_c",
+    "F_s": "static friction F_s", "F_c": "Coulomb friction F_c",
+}  # fmt: skip
 
 
 def draw_master_curve(
@@ -340,9 +345,10 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
         shown = pd.concat([rows["value"], earlier.loc[earlier["kind"] == "law", "value"]])
         limits = {"ylim": padded(shown.min(), shown.max())}
         draw = partial(draw_master_curve, rows=rows, colours=colours, units=config.units, before=earlier)
-        title = f"{rubber}, {symbol_plain(quantity)}" if several else symbol_plain(quantity)
+        words = QUANTITIES.get(quantity, symbol_plain(quantity))
+        title = f"{rubber}, {words}" if several else words
         alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
-        panels.append(Panel(title, alt, draw, limits=limits))
+        panels.append(Panel(short(capital(title), 40), alt, draw, limits=limits))
     legend = [
         Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)
     ]
