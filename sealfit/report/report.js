@@ -265,8 +265,9 @@ for (const box of document.querySelectorAll(".box")) {
   tools.className = "tools";
   tools.append(
     button("Copy", `Copy: ${name}`, event => {
-      navigator.clipboard.writeText(csv(table).replaceAll("\r\n", "\n"));
-      event.target.textContent = "Copied";
+      const { target } = event; // a page that came by http has no clipboard
+      const done = navigator.clipboard?.writeText(csv(table).replaceAll("\r\n", "\n")) ?? Promise.reject();
+      done.then(() => "Copied", () => "Refused by the browser").then(text => (target.textContent = text));
     }),
     button("CSV", `Save as CSV: ${name}`, () => save("\ufeff" + csv(table), "text/csv", `${name}.csv`)),
   );

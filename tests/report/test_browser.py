@@ -59,7 +59,7 @@ DRIVE = """<!doctype html><title>not measured</title><body><script>
 const frame = document.createElement("iframe");
 frame.style.width = "1200px";
 frame.style.height = "2000px";
-frame.onload = () => {
+frame.onload = async () => {
   const page = frame.contentDocument, found = {};
   const tip = page.querySelector(".tip"), point = page.querySelector("svg use[data-text]");
   const box = point.getBoundingClientRect();
@@ -108,6 +108,14 @@ frame.onload = () => {
   save("#parameters");
   found.parameters = found.csv;
   save("#errors");
+  const clipboard = { writeText: async text => { found.copy = text; } };
+  Object.defineProperty(frame.contentWindow.navigator, "clipboard", { get: () => clipboard });
+  const copies = [...page.querySelectorAll(".tools button:first-child")].slice(0, 2);
+  copies[0].click();
+  clipboard.writeText = () => Promise.reject();
+  copies[1].click();
+  await new Promise(done => setTimeout(done));
+  found.copied = copies.map(copy => copy.textContent);
   const ids = [...page.querySelectorAll("[id]")].map(e => e.id);
   found.single = new Set(ids).size === ids.length;
   document.title = "driven " + JSON.stringify(found);
@@ -153,6 +161,8 @@ def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_p
     assert found["name"] == "Errors_before_and_after.csv"
     lines = found["csv"].removeprefix("\ufeff").splitlines()
     assert len({line.count(",") for line in lines if '"' not in line}) == 1
+    assert found["copy"].splitlines() == lines
+    assert found["copied"] == ["Copied", "Refused by the browser"]
     parameters = list(csv.reader(found["parameters"].removeprefix("\ufeff").splitlines()))
     assert parameters[0][:6] == ["condition", "μs", "before", "95 %", "usys", "μc"]
     assert len(parameters[0]) == len(parameters[1]) == 1 + 4 * 4
