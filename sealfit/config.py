@@ -124,6 +124,10 @@ class TraceFormat(Strict):
     """Our name = the file's name, or its position from 1; with the unit that its numbers are in: `force_N =
     {name = "Kraft", unit = "kgf"}`.
     """
+    rate_Hz: float | None = Field(None, gt=0, le=MOST)
+    """Rows per second of files without a column of time: it counts from 0 at the first row of data. For files
+    that differ in rate, one config each.
+    """
     optional: list[str] = Field(default_factory=list)
     """Those of `columns` that a file may lack."""
     other_columns: Literal["channels", "ignore"] = "channels"
@@ -142,6 +146,17 @@ class TraceFormat(Strict):
     """Speed column whose integral over time is the displacement."""
     integrate_per: Literal["s", "min"] = "s"
     """Time unit of that speed; `"min"` for rpm."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_time(cls, table: object) -> object:
+        """Leave the default column of time out where the rate is given; raise ValueError for both."""
+        if not isinstance(table, dict) or table.get("rate_Hz") is None:
+            return table
+        for key in ("columns", "compute"):
+            if isinstance(own := table.get(key), dict) and "time_s" in own:
+                raise ValueError(f"both rate_Hz and {key}.time_s give the time. Take one of them out")
+        return {"columns": {name: name for name in ("displacement_mm", "force_N")}} | table
 
     @property
     def their_columns(self) -> dict[str, str | int]:

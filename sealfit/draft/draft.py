@@ -15,7 +15,15 @@ from sealfit.draft.files_found import look, read_tables
 from sealfit.draft.runs_table import find_table
 from sealfit.errors import RequestError
 
-SHOWN = ("trace.columns.", "condition", "files.glob", "files.name_pattern", "files.runs_columns", "strokes.")
+SHOWN = (
+    "trace.columns.",
+    "trace.rate_Hz",
+    "condition",
+    "files.glob",
+    "files.name_pattern",
+    "files.runs_columns",
+    "strokes.",
+)
 """Guesses that the summary repeats: the others are in the draft."""
 
 

@@ -9,6 +9,7 @@ from datetime import datetime
 
 from sealfit.draft.vocabulary import Unit, name_and_unit, plain, setting, unit_of
 from sealfit.ingest.files import as_number
+from sealfit.units import conversion
 
 SETTINGS = {
     "temperature_C": "temperature",
@@ -22,6 +23,10 @@ SETTINGS = {
 _LINE = re.compile(r'^"?(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
 _SPECIMEN = re.compile(r"(specimen|probe|sample|pruefling|muster)( (id|nr|no|number|nummer|name))?")
 _NUMBER = re.compile(r"^[-+]?\d+(?:[.,]\d+)?(?=$|[\s;,\t\"°%A-Za-zµ])")
+_SIZE = re.compile(r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?")
+_SAMPLED = r"(?:sampl|abtast|mess|scan|acqui|logg|data|daten|campion|echantillon|muestre)"
+_RATE = re.compile(rf"{_SAMPLED}.*(?:rate|freq)|(?:rate|freq).*{_SAMPLED}")  # not that of a motion
+_STEP = re.compile(rf"{_SAMPLED}.*(?:interval|period)|(?:interval|period).*{_SAMPLED}|\bdt\b|\bdelta [tx]\b")
 _ISO = re.compile(r"20\d\d-[01]\d-[0-3]\d[T ][0-2]\d:[0-5]\d(?::[0-5]\d)?(?!\d)")
 _DAYS = (
     (re.compile(r"[0-3]?\d\.[01]?\d\.20\d\d"), "%d.%m.%Y"),
@@ -91,6 +96,28 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
         if _everywhere(pattern, headers):
             found[ours] = Setting(ours, pattern, unit, number, line.strip())
     return list(found.values())
+
+
+def rate_in(headers: Sequence[Sequence[str]], decimal: str) -> tuple[float, str] | None:
+    """Return the rows per second that a header line gives, the same in every file, and the line; or None."""
+    for line in headers[0]:
+        match = _LINE.match(line)
+        size = _SIZE.match(match["value"]) if match else None
+        value = as_number(size.group(), decimal or ".") if size else None
+        if (
+            not value
+            or value < 0
+            or len(set(_found(_after(match["key"], f"({_SIZE.pattern})"), headers))) > 1
+        ):
+            continue
+        words, unit = plain(match["key"]), name_and_unit(match["key"])[1]
+        unit = unit or unit_of(match["value"][size.end() :].strip(' ;,\t"'))
+        if _RATE.search(words):
+            return value * (1000.0 if unit is not None and unit.name == "kHz" else 1.0), line.strip()
+        if _STEP.search(words) and (unit is None or unit.dimension == "time"):
+            step_s = conversion(unit.name if unit else "s", "s")(value)
+            return float(f"{1 / step_s:.9g}"), line.strip()
+    return None
 
 
 def started_in(headers: Sequence[Sequence[str]]) -> When | None:

@@ -13,7 +13,7 @@ from sealfit.draft.columns import BY_BEHAVIOUR, Column, Roles
 from sealfit.draft.config_text import Notes, column_guesses, date_lines, file_column
 from sealfit.draft.dialect import STRAYS
 from sealfit.draft.files_found import Found
-from sealfit.draft.header_lines import settings_in, started_in
+from sealfit.draft.header_lines import rate_in, settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
@@ -161,10 +161,7 @@ def column_keys(
         _column_doubts(column, role, guesses[0].key, roles, notes)
     if roles.displacement is None and roles.speed is not None:
         helpers += _integrated(roles.speed, notes)
-    clock = _clock(found) if roles.time is None else None
-    if clock is not None:
-        evidence = f"column {clock[0]} '{clock[1]}': times of day; seconds count from the first"
-        notes.guess("trace.columns.time_s", clock[1] or clock[0], evidence)
+    clock = _clock_or_rate(found, notes) if roles.time is None else None
     _missing_slots(roles, clock is not None, notes)
     if roles.force is not None and roles.force.unit is not None:
         unit, words = roles.force.unit, plain(roles.force.label)
@@ -243,13 +240,21 @@ def _rotation(angle: Unit, source: str, notes: Notes) -> None:
     notes.doubt("strokes", reason, fix, (f"turn = {conversion('turn', angle.name)(1.0):.10g}",))
 
 
-def _clock(found: Found) -> tuple[int, str] | None:
-    """Return position (from 1) and name of the first column of times of day; None if there is none."""
+def _clock_or_rate(found: Found, notes: Notes) -> tuple[int, str] | None:
+    """Add the first column of times of day, or the header's rate; return position (from 1, or 0) and name."""
     one = found.dialect
     for i, cell in enumerate(split_line(one.first, one.delimiter)):
         if i not in one.numbers and seconds_of_day([cell]) is not None:
-            return i + 1, one.names[i] if i < len(one.names) and one.names_are_cells else ""
-    return None
+            name = one.names[i] if i < len(one.names) and one.names_are_cells else ""
+            evidence = f"column {i + 1} '{name}': times of day; seconds count from the first"
+            notes.guess("trace.columns.time_s", name or i + 1, evidence)
+            return i + 1, name
+    rate = rate_in([one.header for one in found.sniffed], one.decimal)
+    if rate is None:
+        return None
+    evidence = f"no column of time; rows per second by the header of every file looked at: '{rate[1]}'"
+    notes.guess("trace.rate_Hz", rate[0], evidence)
+    return 0, ""
 
 
 def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:
@@ -264,6 +269,7 @@ def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:
         other = {"displacement": roles.speed is not None, "time": has_clock}.get(role, False)
         if getattr(roles, role) is None and not other:
             fix = f"Name it as {SLOTS[role]}, by the file's name of the column or by its position."
+            fix += " Or give the rows per second as rate_Hz under [trace]." if role == "time" else ""
             notes.doubt("trace.columns", reason, fix, (f"{SLOTS[role]} = 1",))
 
 

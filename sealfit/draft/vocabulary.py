@@ -69,7 +69,7 @@ UNITS = {
         for length in _LENGTHS
         for time in _TIMES
     },
-    **{spelled: Unit("none", spelled) for spelled in ("V", "mV", "A", "Hz", "mV/V", "mm/mm")},
+    **{spelled: Unit("none", spelled) for spelled in ("V", "mV", "A", "Hz", "kHz", "mV/V", "mm/mm")},
 }
 _BY_LOWER = {spelled.lower(): unit for spelled, unit in reversed(UNITS.items())}
 

@@ -238,6 +238,8 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
     columns, dropped, found = channel_columns(columns, good, cells.line, config, file)
     faults = [*opened.faults, *cells.faults, *found]
     columns = _in_our_units(columns, config, layout, file)
+    if settings.rate_Hz is not None:  # a row that is left out takes its time, too
+        columns["time_s"] = np.arange(len(good)) / settings.rate_Hz
     good &= ~dropped
     bad = len(good[first:]) - int(np.count_nonzero(good[first:]))
     good[:first] = False

@@ -284,3 +284,33 @@ def test_times_of_day_are_found_as_the_time(tmp_path):
     assert not any("there is no time" in doubt.reason for doubt in made.doubts)
     table = read_trace(tmp_path, TraceRef("b.csv", {}), config).table
     npt.assert_allclose(table["time_s"], one.time_s, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("line", "rate"),
+    [
+        ("Abtastrate: {:g} Hz", 40.0),
+        ("Sampling Rate [kHz];{:g}", 0.04),
+        ("Sample interval (ms);{:g}", 25.0),
+        ("Delta_X;{:.6E}", 0.025),
+    ],
+)
+def test_without_a_time_the_rate_of_the_header_gives_it(line, rate, tmp_path):
+    for one in exports.records(speeds=(5.0,)):
+        columns = exports.table([one.displacement_mm, one.force_N], ";", 4)
+        head = f"Rig 7;\nTest frequency: 2 Hz;\n{line.format(rate)}\nWeg [mm];Kraft [N]\n"
+        exports.write(tmp_path, f"T80_d{one.days}_r{one.repeat}.txt", head + columns)
+    made, config, ingested = read(tmp_path)
+    assert f"'{line.format(rate)}'" in {g.key: g.evidence for g in made.guesses}["trace.rate_Hz"]
+    assert config.trace.rate_Hz == 40.0
+    assert not any("time" in doubt.reason for doubt in made.doubts)
+    assert ingested.tables["runs"]["used"].all()
+
+
+def test_files_of_different_rates_are_a_doubt_that_names_the_key(tmp_path):
+    for one in exports.records():
+        columns = exports.table([one.displacement_mm, one.force_N], ";", 4)
+        head = f"Abtastrate: {1 / one.time_s[1]:g} Hz\nWeg [mm];Kraft [N]\n"
+        exports.write(tmp_path, f"T80_d{one.days}_v{one.speed:g}_r{one.repeat}.txt", head + columns)
+    (doubt,) = (one for one in draft(tmp_path).doubts if "there is no time" in one.reason)
+    assert "rate_Hz" in doubt.fix

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trace_helpers import HEADER, ROWS, changed, config, csv_of, read, refused
 
-from sealfit.errors import BadFile
+from sealfit.config import parse_config
+from sealfit.errors import BadFile, ConfigError
 from sealfit.ingest.cells import decimal_fix
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_trace
@@ -54,6 +55,27 @@ def test_a_bad_cell_costs_its_row_and_is_named_with_line_value_and_fix(
     assert trace.rows_read == 100
     assert 12 not in trace.line
     npt.assert_array_equal(np.delete(np.arange(2, 102), 10), trace.line)
+
+
+def test_a_rate_gives_the_time_of_files_without_one(tmp_path):
+    content = csv_of([row.partition(",")[2] for row in changed(10, "0.9,x,1.0").splitlines()[1:]])
+    content = content.replace(HEADER, "displacement_mm,force_N")
+    trace = read(tmp_path, content, "[trace]\nrate_Hz = 50")
+    (fault,) = trace.faults
+    assert (fault.check, fault.line) == ("not_a_number", 12)
+    npt.assert_allclose(trace.table["time_s"], np.delete(np.arange(100) / 50, 10), rtol=1e-15)
+    fault = refused(tmp_path, content, "[trace.columns]\ndisplacement_mm = 1\nforce_N = 2")
+    assert (fault.check, fault.column) == ("missing_column", "time_s")
+    assert "rate_Hz" in fault.fix
+
+
+@pytest.mark.parametrize("table", ["columns = { time_s = 1, force_N = 2 }", "compute = { time_s = 'n / 9' }"])
+def test_a_time_and_a_rate_are_refused(table):
+    with pytest.raises(ConfigError, match=r"both rate_Hz and (columns|compute)\.time_s give the time"):
+        parse_config(f"[trace]\nrate_Hz = 100\n{table}", "rig.toml")
+    for rate in ("0", "-1", "nan", "'fast'"):
+        with pytest.raises(ConfigError, match="rate_Hz"):
+            parse_config(f"[trace]\nrate_Hz = {rate}", "rig.toml")
 
 
 def test_a_footer_is_looked_for_below_the_header(tmp_path):
