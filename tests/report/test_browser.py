@@ -27,7 +27,8 @@ for (const width of widths) {
   frame.style.border = "0";
   frame.onload = () => {
     const page = frame.contentDocument, images = [...page.images], root = page.documentElement;
-    const boxes = [...page.querySelectorAll("body *")].filter(e => !e.closest(".box") && !e.closest("pre"));
+    const inside = e => (e.closest(".box") && !e.closest(".explained")) || e.closest("pre");
+    const boxes = [...page.querySelectorAll("body *")].filter(e => !inside(e));
     const right = Math.ceil(Math.max(...boxes.map(e => e.getBoundingClientRect().right)));
     const drawings = [...page.querySelectorAll(".panels svg")], all = images.length + drawings.length;
     const shown = images.filter(i => i.complete && i.naturalWidth > 0).length

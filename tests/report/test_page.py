@@ -163,6 +163,11 @@ def test_a_card_has_target_parameters_and_alternatives(pages):
     assert "Replicate specimens would show" in text
 
 
+def test_a_legend_has_only_what_its_panels_show(unsaved):
+    legends = re.findall(r'<ul class="legend">.*?</ul>', build_report(*aging_campaign().arguments).html, re.S)
+    assert ["noise floor" in legend for legend in legends[:3]] == [True, False, False]
+
+
 def test_a_candidate_has_a_panel_that_says_so(small, unsaved):
     for name in ("shapes", "shape_points"):
         own = small.tables[name]
@@ -348,7 +353,7 @@ def test_the_page_states_the_sensitivity_and_the_effects_not_accepted():
     rows = sensitivity_rows({"sensitivity": [seen, unseen]}, Config())
     assert [row["smallest"].replace("\u00a0", " ") for row in rows] == ["0.12 N", "none"]
     assert [row["level"] for row in rows] == ["along strokes", "between runs"]
-    assert rows[0]["files"] == "1,200"
+    assert rows[0]["files"] == "1200"
     label = "ripple along displacement_mm, factor on mu_s"
     refused = {"label": label, "acts_on": "mu_s", "channels": ["displacement_mm"], "p_value": 1e-6}
     (row,) = refused_rows({"refused": [{**refused, "reason": "it is too small"}]}, Config())
