@@ -91,7 +91,7 @@ def refused_rows(closure: Mapping, config: Config) -> list[dict]:
                 effect_label(entry, config.units), target_html(entry["acts_on"], config)
             ),
             "p": p_value(entry["p_value"]),
-            "reason": with_symbols(entry["reason"]),
+            "reason": in_words(entry["reason"], closure, config),
         }
         for entry in closure.get("refused") or ()
     ]

@@ -311,11 +311,14 @@ def _content(
 def fit_badge(closure: Mapping | None) -> tuple[str, str]:
     """Return how well the model fits: the state, and a few words; both empty if the loop was not run."""
     quality = (closure or {}).get("fit_quality") or {"state": ""}
+    ratio = quality.get("ratio") or 0
     words = {
         "": "",
         "unknown": "Fit: not known",
         "within_scatter": "Fit: within the scatter of repeats",
-        "above_scatter": f"Fit: {quality.get('ratio') or 0:.2g} times the scatter of repeats",
+        "above_scatter": f"Fit: {ratio:.2g} times the scatter of repeats"
+        if ratio >= 1
+        else "Fit: a lack of fit, below the scatter of repeats",
     }
     return quality["state"], words[quality["state"]]
 

@@ -281,6 +281,8 @@ def quality_clause(closure: Mapping) -> str:
     if quality["state"] == "within_scatter":
         return "the error is within the scatter of repeats"
     times = f"the error is {quality['ratio']:.2g} times the scatter of repeats"
+    if quality["ratio"] < 1:
+        times += ", but a part of it is the same in all repeats"
     return f"{times} (lack of fit: p = {quality['p_value']:.1g})"
 
 

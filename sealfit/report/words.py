@@ -70,17 +70,17 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
         )
     effects = closure["effects"]
     added = [(effects.index(e), e) for e in by_gain(effects) if not e["candidate"]]
-    lacked = left = ""
+    lacked = left = better = ""
     if added:
         many = f"{COUNTED.get(len(added), len(added))} effects: " if len(added) > 1 else ""
         missed = Markup(joined(_missed_effects(added, shapes, config)))
         lacked = Markup("the declared model lacks {}{}").format(many, missed)
-        errors[0] = Markup("with {}, {}").format("them" if len(added) > 1 else "it", errors[0])
+        better = Markup("with {}, {}").format("them" if len(added) > 1 else "it", errors.pop(0))
     if closure["verdict"] != "closed":
         left = f"a significant residual remains that no effect explains: {_where(closure['left'], config)}"
     elif closure["left"].get("significant"):
         left = f"{_where(closure['left'], config)}, by less than repeats scatter"
-    return _sentences(lacked, left, *errors)
+    return _sentences(lacked, better, left, *errors)
 
 
 def undecided(closure: Mapping | None, config: Config) -> Markup:
@@ -93,7 +93,8 @@ def undecided(closure: Mapping | None, config: Config) -> Markup:
 def in_words(text: str, closure: Mapping, config: Config) -> Markup:
     """Return a sentence of closure.json with quantities and units for columns, and parameters as symbols."""
     names = [entry["variable"] for entry in closure.get("sensitivity") or ()]
-    return with_symbols(true_units(text, config.units, names))
+    force = config.units.quantity("force").removeprefix("friction ")
+    return with_symbols(true_units(re.sub(r"\bforce\b", force, text), config.units, names))
 
 
 def _missed_effects(

@@ -302,6 +302,12 @@ def test_a_factor_is_drawn_in_percent(ax, made):
     npt.assert_allclose(ax.lines[-1].get_ydata()[-1], -100 * DROP, rtol=1e-6)
 
 
+def test_a_shape_along_repeats_has_ticks_at_repeats_only(ax, made):
+    rows, points = shapes(), shape_points().iloc[:3].assign(x=[1.0, 2.0, 3.0])
+    draw_shape(ax, rows.assign(x=np.linspace(1, 3, len(rows))), made.closure["effects"][0], Units(), points)
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["1", "2", "3"]
+
+
 def test_partial_residuals_lie_behind_an_effect(ax, made):
     points = shape_points()
     draw_shape(ax, shapes(), made.closure["effects"][0], Units(), points)

@@ -4,8 +4,9 @@ from report.made_campaigns import aging_campaign, torque_campaign
 from report.made_tables import empty, shapes
 
 from sealfit.config import Config
+from sealfit.report.page import fit_badge
 from sealfit.report.summary import outlier_clause, quality_clause
-from sealfit.report.words import acts, does, left_over, undecided, verdict, with_left_channels
+from sealfit.report.words import acts, does, in_words, left_over, undecided, verdict, with_left_channels
 
 NUMBERS = {
     "rmse_N": 1.3,
@@ -163,7 +164,8 @@ def test_unexplained_says_where_it_sits():
         "A significant residual remains that no effect explains: the residual varies with displacement (mm)"
         in text
     )
-    assert "With it, the rms error on held-out runs falls from 1.42 N to 0.31 N" in text
+    # "it" is the effect, so this comes before the residual.
+    assert "4.5]). With it, the rms error on held-out runs falls from 1.42 N to 0.31 N" in text
 
 
 def test_an_error_that_grows_is_not_called_falling():
@@ -255,6 +257,21 @@ def test_why_the_lack_of_fit_is_not_known_is_said():
     unknown = {"fit_quality": {"state": "unknown", "ratio": None, "p_value": None}}
     assert "without repeats" in quality_clause({**unknown, "noise_floor_N": None})
     assert "too many parameters" in quality_clause({**unknown, "noise_floor_N": 0.1})
+
+
+def test_a_lack_of_fit_below_the_scatter_of_repeats_is_not_called_a_multiple_of_it():
+    small = {"fit_quality": {"state": "above_scatter", "ratio": 0.85, "p_value": 6e-4}, "noise_floor_N": 0.1}
+    assert (
+        "0.85 times the scatter of repeats, but a part of it is the same in all repeats ("
+        in quality_clause(small)
+    )
+    assert fit_badge(small) == ("above_scatter", "Fit: a lack of fit, below the scatter of repeats")
+
+
+def test_sentences_name_the_torque_where_it_is_measured():
+    closure = {"refused": [], "sensitivity": []}
+    text = in_words("ripple, added to force: less than 1 % of the force", closure, torque_campaign().config)
+    assert text == "ripple, added to torque: less than 1 % of the torque"
 
 
 def test_files_that_were_left_out_are_named():

@@ -358,6 +358,8 @@ def draw_shape(
         ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
         if channel not in CALENDAR and is_logarithmic(x, LOG_SPAN):
             log_axis(ax)
+        elif points is not None and len(points):
+            value_ticks(ax, points["x"].to_numpy(float))
     else:
         x = np.arange(len(rows))
         spread = np.nan_to_num(np.abs(np.stack([value - lo, hi - value])))
