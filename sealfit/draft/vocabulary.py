@@ -130,14 +130,14 @@ _COLUMN_WORDS = (
     ("temperature", r"temp(?!s\b|o\b)"),
     ("humidity", r"humid|feucht"),
     ("pressure", r"pressure|druck(?!kraft)"),
-    ("time", r"time|zeit|x.?value|elapsed|sekunde|temps\b|tempo\b|tiempo"),
+    ("time", r"time|zeit|x.?value|elapsed|sekunde|temps\b|tempo\b|tiempo|tijd"),
     ("load", r"normal|\bfz\b|\bfn\b|anpress|auflast|andruck|vertical"),
     ("speed", r"speed|velocity|geschwind|\bvel\b|drehzahl|vitesse|velocit|velocid"),
     ("torque", r"torque|moment"),
-    ("force", r"force|kraft|friction|reib|tangential|load.?cell|effort|forza|fuerza"
+    ("force", r"force|kraft|friction|reib|tangential|load.?cell|effort|forza|fuerza|kracht"
               r"|kmd|\bfx\b|\bft\b|\bfr\b|\bfy\b|\bload\b"),
-    ("displacement", r"displace|deplace|spostam|desplaz|position|extension|crosshead|weg|verschieb|travel"
-                     r"|traverse|\bhub\b|stroke|lvdt|verfahr|\bpos\b|path|distance|auslenk|slide|schlitten"
+    ("displacement", r"displace|deplace|spostam|desplaz|verplaats|position|extension|crosshead|weg|verschieb"
+                     r"|travel|traverse|\bhub\b|stroke|lvdt|verfahr|\bpos\b|path|distance|auslenk|slide|schlitten"
                      r"|angle|winkel|rotation|revolution|umdrehung"),
 )  # fmt: skip
 _LETTERS = {"t": "time", "f": "force", "v": "speed", **dict.fromkeys("xys", "displacement")}
@@ -173,17 +173,17 @@ def column_role(name: str) -> tuple[str, int]:
 
 # Columns of a table of runs, and keys of header lines.
 _SETTING_WORDS = (
-    ("file", r"\bfile|datei"),
-    ("started_at", r"\bstart|date\b|datum|begin|timestamp|zeitstempel|uhrzeit"),
+    ("file", r"\bfile|datei|archivo|fichier"),
+    ("started_at", r"\bstart|date\b|datum|fecha|begin|timestamp|zeitstempel|uhrzeit"),
     (
         "temperature_C",
         r"^temp|^oven$|^ofen$|(aging|ageing|alterungs?|auslagerungs?|lager|ofen|oven) ?temp|temp.*aging",
     ),
-    ("aging_days", r"aging|ageing|\baged?\b|alter|auslager|lager|\bdays?\b|\btage?\b"),
-    ("compression_ratio_pct", r"compress|verpress|stauch|height|hoehe"),
-    ("speed_mm_s", r"speed|velocity|geschwind|vorschub|feed"),
-    ("load_N", r"load\b|normal|auflast|\blast\b|anpress"),
-    ("repeat", r"\brep|wiederhol|\bwdh"),
+    ("aging_days", r"aging|ageing|\baged?\b|alter|auslager|lager|\b(days?|tage?|dias|jours|giorni|dagen)\b"),
+    ("compression_ratio_pct", r"compres|verpress|stauch|height|hoehe"),
+    ("speed_mm_s", r"speed|velocit|velocid|vitesse|snelheid|geschwind|vorschub|feed"),
+    ("load_N", r"load\b|normal|auflast|\blast\b|anpress|carga"),
+    ("repeat", r"\brep|wiederhol|\bwdh|herhal"),
     ("specimen_id", r"specimen|probe\b|sample|pruefling|muster"),
     ("rubber", r"material|rubber|gummi|compound|werkstoff|mischung|elastomer"),
     ("run_id", r"\brun|versuch"),
@@ -214,16 +214,16 @@ BEFORE = {
     **dict.fromkeys(("d", "D", "t", "day", "days", "tag", "tage", "age", "aged", "alter", "j"), "aging_days"),
     **dict.fromkeys(("v", "V", "speed", "vel", "velocity", "geschw"), "speed_mm_s"),
     **dict.fromkeys(("r", "R", "rep", "repeat", "run", "w", "W", "wdh", "wiederholung"), "repeat"),
-    **dict.fromkeys(("test", "trial", "essai", "prova", "ensayo", "rip"), "repeat"),
+    **dict.fromkeys(("test", "trial", "essai", "prova", "ensayo", "rip", "herhaling"), "repeat"),
     **dict.fromkeys(("F", "FN", "Fn", "L", "N", "load", "last"), "load_N"),
     **dict.fromkeys(("S", "s", "P", "sp", "spec", "specimen", "sample", "probe", "rawdata"), "specimen_id"),
 }
 AFTER = {
-    **dict.fromkeys(("C", "degC", "°C", "grad", "deg", "gradi", "grados"), ("temperature_C", "")),
+    **dict.fromkeys(("C", "degC", "°C", "grad", "deg", "gradi", "grados", "graden"), ("temperature_C", "")),
     **dict.fromkeys(("F", "degF", "°F"), ("temperature_C", "degF")),
     **dict.fromkeys(("pct", "%", "percent", "prozent"), ("compression_ratio_pct", "")),
     **dict.fromkeys(("d", "day", "days", "tag", "tage", "j", "jours"), ("aging_days", "")),
-    **dict.fromkeys(("giorni", "dias", "días"), ("aging_days", "")),
+    **dict.fromkeys(("giorni", "dias", "días", "dagen"), ("aging_days", "")),
     **dict.fromkeys(("h", "hr", "hrs", "hours", "std"), ("aging_days", "h")),
     **dict.fromkeys(("w", "wk", "weeks", "wochen"), ("aging_days", "week")),
     **dict.fromkeys(("mms", "mm s", "mmps", "mm/s", "mmpers"), ("speed_mm_s", "")),

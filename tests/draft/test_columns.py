@@ -8,7 +8,7 @@ from sealfit.config import parse_config
 from sealfit.draft import motion
 from sealfit.draft.dialect import sniff, sniffed_delimiter
 from sealfit.draft.draft import draft
-from sealfit.draft.vocabulary import AFTER, UNITS, column_role, name_and_unit
+from sealfit.draft.vocabulary import AFTER, UNITS, column_role, name_and_unit, setting
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import as_utf8
 from sealfit.ingest.reader import read_trace
@@ -179,6 +179,17 @@ def test_strokes_are_counted(strokes, sign):
 )  # fmt: skip
 def test_names_of_columns_in_several_languages(name, role):
     assert column_role(name)[0] == role
+
+
+def test_names_of_settings_in_several_languages():
+    spanish = "Archivo Fecha Compresión Días Velocidad Repetición Carga"
+    ours = "file started_at compression_ratio_pct aging_days speed_mm_s repeat load_N"
+    assert [setting(name) for name in spanish.split()] == ours.split()
+    assert setting("Temperatura de envejecimiento") == "temperature_C"
+    others = "Fichier Jours Vitesse Dagen Snelheid Herhaling"
+    assert [setting(name) for name in others.split()] == [
+        "file", "aging_days", "speed_mm_s", "aging_days", "speed_mm_s", "repeat"
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

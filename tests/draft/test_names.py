@@ -37,6 +37,7 @@ AGED = {"temperature_C": 60.0, "aging_days": 4.0, "speed_mm_s": 5.0, "repeat": 1
         ("T{T}_j{d}_V{v}_essai{r}.csv", AGED),
         ("{T}gradi_{d}giorni_{v}mm-s_rip{r}.csv", AGED),
         ("{T}grados_{d}días_{v}mmps_ensayo{r}.csv", AGED),
+        ("{T}graden/{d}dagen/snelheid{v}mms_herhaling{r}.txt", AGED),
     ],
 )
 def test_a_way_of_naming_files_is_read(template, expected):
