@@ -73,7 +73,7 @@ def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
             "level": level_words(entry["level"]),
             "smallest": _sized(entry["smallest_N"], unit, "none"),
             "share": _sized(entry["smallest_pct"], "%", NOTHING),
-            "files": number(entry["files_needed"]),
+            "files": given(entry["files_needed"]),
         }
         for entry in closure.get("sensitivity") or ()
     ]
