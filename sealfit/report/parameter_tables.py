@@ -25,6 +25,7 @@ from sealfit.report.style import MOST_ROWS, spread
 from sealfit.report.words import with_symbols
 
 MOST_LAWS = 4  # listed per quantity
+ROUNDING = 1e-12  # of coefficients of about 1 and forces of some N
 
 
 def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> list[dict]:
@@ -51,8 +52,8 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
                     "criterion": number(first["criterion"]) if rank > 1 else "0",
                     "energy": _with_interval(by, "E"),
                     "kappa": _with_interval(by, "kappa"),
-                    "heldout_series": number(first["heldout_series"]),
-                    "heldout_last_day": number(first["heldout_last_day"]),
+                    "heldout_series": _error(first["heldout_series"]),
+                    "heldout_last_day": _error(first["heldout_last_day"]),
                     "lack_of_fit": number(first["lack_of_fit_p"], 2) if known(first["lack_of_fit_p"]) else "",
                     "chosen": rank == 1,
                     "before": False,
@@ -62,6 +63,11 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
             if rank == 1 and (old := earlier.get((rubber, quantity))):
                 found.append({**old, "criterion": NOTHING, "chosen": False, "before": True})
     return found
+
+
+def _error(value: float) -> str:
+    """Return an error of coefficients; one that is rounding alone is zero."""
+    return number(0.0 if value < ROUNDING else value)
 
 
 def _with_interval(by: pd.DataFrame, name: str) -> str:

@@ -49,3 +49,8 @@ def test_without_effects_nothing_is_doubled(unsaved):
     page = Page(build_report(*made.arguments).html)
     assert "without the effects" not in page.text
     assert "at the reference state of its effects" not in page.text
+
+
+def test_an_error_that_is_rounding_alone_is_zero(made):
+    laws = made.tables["aging_laws"].assign(heldout_last_day=2.2e-16, heldout_series=0.0352)
+    assert {(row["heldout_last_day"], row["heldout_series"]) for row in law_rows(laws)} == {("0", "0.0352")}
