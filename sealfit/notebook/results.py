@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -269,12 +269,12 @@ class Results:
 
         return Plots(self._answered)
 
-    def predict(self, points: pd.DataFrame) -> pd.DataFrame:
+    def predict(self, points: pd.DataFrame | Mapping[str, Sequence]) -> pd.DataFrame:
         """Return the points with the force, before and after, and 95 % intervals, as `sealfit predict` does.
 
         Parameters
         ----------
-        points : DataFrame
+        points : DataFrame, or mapping of column names to values
             The condition columns, signed `speed_mm_s`, and what else the model needs; a message says what is
             missing.
 
@@ -285,7 +285,7 @@ class Results:
         """
         from sealfit.closure.prediction_csv import points_of
 
-        store = self._current(ANSWERED)
+        store, points = self._current(ANSWERED), pd.DataFrame(points)
         answers = commands.answers_to(points_of(points), store)
         return frames.with_units(answers.set_axis(points.index), store.config.units)
 

@@ -272,6 +272,7 @@ def test_a_prediction_is_the_commands_to_the_last_digit(results, out, tmp_path):
 
 def test_points_as_words_are_points_as_numbers(results):
     npt.assert_array_equal(results.predict(POINTS.astype(str))[FORCES], results.predict(POINTS)[FORCES])
+    npt.assert_array_equal(results.predict(POINTS.to_dict("list"))[FORCES], results.predict(POINTS)[FORCES])
 
 
 def test_a_lifetime_is_the_commands(results, out):
