@@ -19,7 +19,6 @@ from sealfit.ingest.averages import bin_table, mean_traces
 from sealfit.ingest.categorical import condition_columns, keys_of
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.files import as_number
-from sealfit.ingest.segments import median
 from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_strokes
 from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints
@@ -228,7 +227,7 @@ def _at_speeds(strokes: Mapping[str, list], tolerance: float) -> dict[str, list]
         own = own[np.argsort(speed[own])]
         for part in np.split(own, np.flatnonzero(np.diff(np.log(speed[own])) > np.log1p(tolerance)) + 1):
             for i in part:
-                commanded[i] = float(f"{median(speed[part]):.3g}")
+                commanded[i] = float(f"{np.median(speed[part]):.3g}")
                 names[i] = f"{run} at {commanded[i]:g}"
     return {"run_id": names.tolist(), "speed_set_mm_s": commanded}
 

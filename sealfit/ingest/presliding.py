@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealfit.ingest.segments import median, quantile, strong_wave
+from sealfit.ingest.segments import strong_wave
 
 # Rise lengths after which a rise is over: 1/50000 of it is left. 1/5000 still showed in means over a
 # campaign.
@@ -176,7 +176,7 @@ def _turned(start: Start, peak: int) -> Start:
     """Return the fall from a peak, turned upside down: it comes up as a rise does."""
     distance, force = start.distance_mm, start.force_N
     early, half = (int(distance.searchsorted(share * distance[-1])) for share in EARLY)
-    level = median(force[max(early, peak) : half])
+    level = np.median(force[max(early, peak) : half])
     return Start(distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0))
 
 
@@ -321,7 +321,7 @@ def _level_N(start: Start) -> float | None:
     plateau = force[max(low, start.ramp_end) : high]
     if len(plateau) < 8:
         return None
-    level, begin = median(plateau), float(force[0])
+    level, begin = np.median(plateau), float(force[0])
     below = _below(plateau, begin) or (begin < FAR_BELOW * level and _below(force[slice(*late)], begin))
     return level if level - begin > 0.02 * abs(level) and below else None
 
@@ -348,7 +348,7 @@ def _below(plateau_N: np.ndarray, begin_N: float) -> bool:
         return False
     steps = np.abs(plateau_N[1:] - plateau_N[:-1])
     to_noise = 1.0 / (0.6745 * math.sqrt(2.0))
-    return begin_N < quantile(plateau_N, 0.01) - 4.0 * (median(steps) * to_noise)
+    return begin_N < np.quantile(plateau_N, 0.01) - 4.0 * (np.median(steps) * to_noise)
 
 
 def _arrival_mm(distance_mm: np.ndarray, force_N: np.ndarray) -> float:
@@ -356,7 +356,7 @@ def _arrival_mm(distance_mm: np.ndarray, force_N: np.ndarray) -> float:
     low, high = np.searchsorted(distance_mm, [share * distance_mm[-1] for share in LATE])
     if high - low < 8:
         return 0.0
-    return float(distance_mm[int(np.argmax(force_N >= quantile(force_N[low:high], 0.02)))])
+    return float(distance_mm[int(np.argmax(force_N >= np.quantile(force_N[low:high], 0.02)))])
 
 
 def _scale_mm(start: Start, level_N: float | None) -> float:

@@ -50,31 +50,6 @@ class Pieces:
         return np.repeat(per_piece, self.size)
 
 
-def median(values: np.ndarray) -> float:
-    """Return the median, as `np.median` does, of an array that holds no nan."""
-    half, odd = divmod(len(values), 2)
-    ordered = np.partition(values, half)
-    return float(ordered[half]) if odd else float((ordered[:half].max() + ordered[half]) / 2.0)
-
-
-def quantile(values: np.ndarray, share: float) -> float:
-    """Return the quantile between neighbours, as `np.quantile` does, of an array that holds no nan.
-
-    Examples
-    --------
-    >>> quantile(np.array([3.0, 1.0, 2.0, 4.0]), 0.5), quantile(np.array([3.0, 1.0, 2.0, 4.0]), 0.9)
-    (2.5, 3.7)
-    """
-    place = (len(values) - 1) * share
-    low = int(place)
-    ordered = np.partition(values, low)
-    below = float(ordered[low])
-    if low + 1 == len(values):
-        return below
-    above, part = float(ordered[low + 1 :].min()), place - low
-    return above - (above - below) * (1.0 - part) if part >= 0.5 else below + (above - below) * part
-
-
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     """Return the value at which half of the weight lies at smaller ones; 0 where there is no weight.
 

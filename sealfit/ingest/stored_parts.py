@@ -21,7 +21,6 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, Asked, Columns, Part, read_part
-from sealfit.ingest.segments import median
 from sealfit.store import parquet
 from sealfit.store.staged_writes import PARQUET, disk, file_size, sync
 
@@ -100,7 +99,7 @@ def noise_from_bends(bends: np.ndarray) -> float:
     Their variance is six times a sample's; the median absolute deviation is blind to where the signal itself
     bends.
     """
-    return 1.4826 * median(np.abs(bends - median(bends))) / np.sqrt(6.0) if bends.size else 0.0
+    return 1.4826 * np.median(np.abs(bends - np.median(bends))) / np.sqrt(6.0) if bends.size else 0.0
 
 
 # ---------------------------------------------------------------- stored parts

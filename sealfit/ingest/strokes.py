@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from sealfit.config import Strokes
-from sealfit.ingest.segments import median, quantile, smoothed, stretches
+from sealfit.ingest.segments import smoothed, stretches
 from sealfit.ingest.window import SAME_SPEED, SPEED_NOISE, STANDSTILL, slope, speed_along, steady_window
 
 # Share of the travel of a motion that a steady speed covers at least. It is ten times what counts as a rest
@@ -212,7 +212,7 @@ def steady_speeds(
     speed = (x[high] - x[low]) / (time_s[high] - time_s[low])
     found: list[slice] = []
     for rows in _flat_parts(speed, np.diff(x, prepend=x[0]), slice(0, n), least, settings):
-        ratio = median(speed[rows]) / median(speed[found[-1]]) if found else np.inf
+        ratio = np.median(speed[rows]) / np.median(speed[found[-1]]) if found else np.inf
         if abs(np.log(ratio)) < np.log1p(2.0 * tolerance):  # the same speed after a rest
             found[-1] = slice(found[-1].start, rows.stop)
         else:
@@ -221,7 +221,7 @@ def steady_speeds(
         return whole
     cuts = [a.stop - 1 + int(speed[a.stop - 1 : b.start + 1].argmin()) for a, b in pairwise(found)]
     rested = [
-        speed[cut] < STANDSTILL * median(speed[rows]) for cut, rows in zip(cuts, found[1:], strict=True)
+        speed[cut] < STANDSTILL * np.median(speed[rows]) for cut, rows in zip(cuts, found[1:], strict=True)
     ]
     begins = [cut if rest else rows.start for cut, rest, rows in zip(cuts, rested, found[1:], strict=True)]
     return list(zip(map(slice, [0, *cuts], [*cuts, n]), [0, *begins], strict=True))
@@ -247,7 +247,7 @@ def _flat_parts(
     lowest, covered = own[order], np.cumsum(step[order])
     last = lowest.searchsorted(lowest * (1.0 + tolerance) ** 2, "right") - 1
     most = int((covered[last] - covered + step[order]).argmax())
-    level = median(lowest[most : last[most] + 1])
+    level = np.median(lowest[most : last[most] + 1])
     # Beyond the part, too: a piece of a ramp is as flat as it is short.
     near = [slice(*ends) for ends in stretches(np.abs(speed - level) < 2.0 * tolerance * level)]
     here = [slice(max(rows.start, within.start), min(rows.stop, within.stop)) for rows in near]
@@ -256,8 +256,8 @@ def _flat_parts(
     if way[longest] < least_mm:
         return []
     rows, here = near[longest], here[longest]
-    off = speed[rows] / median(speed[rows]) - 1.0
-    ends = quantile(off, OFF_SPEED), quantile(off, 1.0 - OFF_SPEED)
+    off = speed[rows] / np.median(speed[rows]) - 1.0
+    ends = np.quantile(off, OFF_SPEED), np.quantile(off, 1.0 - OFF_SPEED)
     found = []
     if len(off) >= settings.min_samples and max(map(abs, ends)) <= 0.5 * tolerance:
         first, after = (int(np.argmax(np.sign(end[0]) * end <= SAME_SPEED)) for end in (off, off[::-1]))
@@ -282,14 +282,14 @@ def displacement_noise_mm(displacement_mm: np.ndarray, order: int = 2) -> float:
     if len(displacement_mm) <= order:
         return 0.0
     bends, times = np.diff(displacement_mm, order), math.comb(2 * order, order)
-    noise = quantile(np.abs(bends), 0.9) / (1.645 * np.sqrt(times))
+    noise = np.quantile(np.abs(bends), 0.9) / (1.645 * np.sqrt(times))
     steps = np.abs(np.diff(displacement_mm))
     beside = np.zeros(len(steps))
     beside[1:] += steps[:-1]
     beside[:-1] += steps[1:]
     single = steps > 2.0 * beside
     if steps[single].sum() > 0.5 * steps.sum():
-        noise = max(noise, median(steps[single]) / np.sqrt(12.0))
+        noise = max(noise, np.median(steps[single]) / np.sqrt(12.0))
     return float(noise)
 
 

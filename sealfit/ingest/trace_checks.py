@@ -11,7 +11,6 @@ from scipy.ndimage import median_filter
 from sealfit.config import Config, Quality
 from sealfit.errors import KEPT, ConfigError, Fault
 from sealfit.ingest.file_names import TraceRef
-from sealfit.ingest.segments import median, quantile
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm
 from sealfit.units import Units
 
@@ -48,9 +47,9 @@ def displacement_spikes(
     off = displacement_mm - median_filter(displacement_mm, NEIGHBOURS, mode="mirror")
     # At a turn the median lags by one step of the fastest samples around, never by more than a few of the
     # usual ones.
-    step = median(np.abs(np.diff(displacement_mm)))
+    step = np.median(np.abs(np.diff(displacement_mm)))
     noise = displacement_noise_mm(displacement_mm)
-    least = max(STEPS * step, APART * quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
+    least = max(STEPS * step, APART * np.quantile(np.abs(off), USUAL), 1e-9 * float(np.ptp(displacement_mm)))
     spikes = np.abs(off) > max(settings.spike_sigma * noise, least)
     # At its ends the median of a motion that does not rest is a step behind.
     for end, beside in ((0, slice(1, NEIGHBOURS)), (-1, slice(-NEIGHBOURS, -1))):
@@ -80,9 +79,9 @@ def force_spikes(
     for stroke in strokes:
         steady[stroke.rows] = True
     usual = off[steady] if steady.any() else off
-    least = max(0.5 * resolution(force_N), 1e-9 * median(np.abs(force_N)), 1e-300)
-    noise = max(1.4826 * median(np.abs(usual)), least)
-    apart = APART * quantile(np.abs(usual), USUAL)
+    least = max(0.5 * resolution(force_N), 1e-9 * np.median(np.abs(force_N)), 1e-300)
+    noise = max(1.4826 * np.median(np.abs(usual)), least)
+    apart = APART * np.quantile(np.abs(usual), USUAL)
     suspects = np.abs(off) > max(settings.spike_sigma * noise, apart)
     if not suspects.any():
         return keep, []
@@ -201,13 +200,13 @@ def _of_cuts(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, fl
     with np.errstate(all="ignore"):  # beyond 1e308 there is no speed: nan or inf, and no check
         path, time = np.abs(np.diff(displacement_mm)), np.diff(time_s)
         speeds = path / time
-        fast = speeds[speeds > 0.5 * quantile(speeds, 0.9)]
-        return float(path.sum() / time.sum()), median(fast) if len(fast) else math.nan
+        fast = speeds[speeds > 0.5 * np.quantile(speeds, 0.9)]
+        return float(path.sum() / time.sum()), float(np.median(fast)) if len(fast) else math.nan
 
 
 def _strokes(displacement_mm: np.ndarray) -> int:
     """Return how often a trace goes from its lowest quarter to its highest or back: roughly, its strokes."""
-    low, high = quantile(displacement_mm, 0.01), quantile(displacement_mm, 0.99)
+    low, high = np.quantile(displacement_mm, 0.01), np.quantile(displacement_mm, 0.99)
     quarter = 0.25 * (high - low)
     ends = displacement_mm[(displacement_mm < low + quarter) | (displacement_mm > high - quarter)]
     return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))

@@ -9,7 +9,7 @@ from scipy.ndimage import median_filter
 from scipy.special import chdtrc
 
 from sealfit.ingest.presliding import Start, rise_of
-from sealfit.ingest.segments import median, stretches, transient_rows, weighted_median
+from sealfit.ingest.segments import stretches, transient_rows, weighted_median
 
 # Share of the plateau speed below which the platform rests. A ripple of the speed stays above it.
 REST = 0.5
@@ -215,7 +215,7 @@ def acceleration(
     """
     n = len(time_s)
     # The SD of a second difference over `half` steps is sqrt(6) noise / (half step)^2.
-    step = median(np.diff(time_s))
+    step = np.median(np.diff(time_s))
     half = np.ceil(np.sqrt(np.sqrt(6.0) * noise_mm / max(wanted, 1e-300)) / step)
     half = int(np.clip(half, 1, max(n // 16, 1)))
     at = np.clip(np.arange(n), half, n - 1 - half)
@@ -235,7 +235,7 @@ def first_motion(force_N: np.ndarray, since: int) -> int:
     own = force_N[since:]
     if len(own) < 8:
         return since
-    begin, level = median(own[: max(len(own) // 100, 3)]), median(own)
+    begin, level = np.median(own[: max(len(own) // 100, 3)]), np.median(own)
     share = (own - begin) / (level - begin) if level != begin else np.ones(len(own))
     up = _first(share > HALF_UP)
     still = _last(share[:up] < ONSET) if up else None
@@ -356,7 +356,7 @@ class _Motion:
         """
         joined: list[tuple[int, int]] = []
         time_s, along_mm, half = self.time_s, self.along_mm, self.half
-        step = median(np.diff(time_s))
+        step = np.median(np.diff(time_s))
         for first, last in stretches(moves):
             if joined:
                 a, b = max(joined[-1][1] - half, 0), min(first + half, len(time_s) - 1)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from sealfit.fit.dynamic.starts import LEAST, Part
-from sealfit.ingest.segments import Pieces, median
+from sealfit.ingest.segments import Pieces
 from sealfit.ingest.stored_parts import noise_from_bends
 from sealfit.physics import bristle_limit
 
@@ -31,7 +31,7 @@ class Cells:
         self._size = np.array([part.force_N.size for part in parts], np.int64)
         reach = np.array([part.distance_mm[-1] for part in parts], float)
         self.samples, self.reach_mm = (
-            np.array([median(values[own]) for own in self.groups.slices]) for values in (self._size, reach)
+            np.array([np.median(values[own]) for own in self.groups.slices]) for values in (self._size, reach)
         )
         self.count = np.clip(self.samples.astype(int), LEAST, MOST_CELLS)
         width = int(self.count.max(initial=0))

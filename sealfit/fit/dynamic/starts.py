@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from sealfit.fit.least_squares import levenberg_marquardt
-from sealfit.ingest.segments import median
 from sealfit.ingest.stored_parts import noise_from_bends, stroke_index, strokes_of
 
 # Starting values of the length of a ramp, in time steps.
@@ -90,7 +89,7 @@ def _fit_some(
     there = np.arange(rows) < sizes[:, None]
     time, along = np.zeros(there.shape), np.zeros(there.shape)
     time[there], along[there] = np.concatenate(times_s), np.concatenate(alongs_mm)
-    step = np.array([median(np.diff(time)) for time in times_s])
+    step = np.array([np.median(np.diff(time)) for time in times_s])
     # Time at which a start at full speed would have given the same displacement.
     each, last = np.arange(len(sizes)), sizes - 1
     lagged = time[each, last] - (along[each, last] - along[:, 0]) / paces_mm_s
@@ -334,7 +333,7 @@ def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
 
 def _half_width(stroke: Along) -> int:
     """Return the filter's half-width in rows that gives the local speed to `ROUGH` of the steady speed."""
-    step = stroke.pace_mm_s * median(np.diff(stroke.time_s))
+    step = stroke.pace_mm_s * np.median(np.diff(stroke.time_s))
     half = np.arange(1, max(2, len(stroke.time_s) // 16))
     enough = stroke.noise_mm * np.sqrt(3.0 / (half * (half + 1) * (2 * half + 1))) <= ROUGH * step
     return int(half[enough.argmax()] if enough.any() else half[-1])
