@@ -178,31 +178,19 @@ def width_of(body: bytes, delimiter: str) -> int:
 
 
 def read_cells(
-    bodies: Sequence[tuple[str, bytes]], layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
-) -> list[Cells]:
-    """Return the data of trace files that have the same header, those of each file by themselves.
+    body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str], file: str
+) -> Cells:
+    """Return the data of a trace file.
 
-    `bodies` are what messages call each file, and its data lines as clean UTF-8 (`body_of`); `numeric` are
-    the positions (from 0) that must hold numbers, and the names that messages call them.
+    `body` are its data lines as clean UTF-8 (`body_of`); `numeric` are the positions (from 0) that must hold
+    numbers, and the names that messages call them.
     """
-    sizes = [body.count(b"\n") + 1 for _, body in bodies]
-    columns = _fast(b"\n".join(body for _, body in bodies), sum(sizes), layout, settings, numeric)
-    if len(bodies) > 1 and (columns is None or any(values.dtype == object for values in columns.values())):
-        # One file spoils the reading of all, or what is text in one file may be numbers in another.
-        return [cells for one in bodies for cells in read_cells([one], layout, settings, numeric)]
+    rows = body.count(b"\n") + 1
+    columns = _fast(body, rows, layout, settings, numeric)
     if columns is None:
-        ((file, body),) = bodies
-        return [_patient(body, layout, settings, numeric, file)]
-    stops = np.cumsum(sizes)
-    return [
-        Cells(
-            {i: values[stop - size : stop] for i, values in columns.items()},
-            np.arange(layout.first_line, layout.first_line + size),
-            np.zeros(size, bool),
-            (),
-        )
-        for size, stop in zip(sizes, stops, strict=True)
-    ]
+        return _patient(body, layout, settings, numeric, file)
+    line = np.arange(layout.first_line, layout.first_line + rows)
+    return Cells(columns, line, np.zeros(rows, bool), ())
 
 
 def array_cells(

@@ -158,7 +158,7 @@ class Part:
 
 def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
     """Return the strokes and the tables of one part of a campaign, both in memory."""
-    files = read_strokes(asked.refs, campaign, config)
+    files = [read_strokes(ref, campaign, config) for ref in asked.refs]
     strokes = stroke_columns(files, config)
     known = pa.table({name: _array(values) for name, values in strokes.items()})
     tables: dict[str, pa.Table] = {}

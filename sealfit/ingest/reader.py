@@ -82,79 +82,55 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
         If the file must be left out: missing, empty, binary, a column missing, too many bad rows, a speed
         that contradicts the commanded one. It carries every fault found, the deciding one last.
     """
-    (found,) = read_traces([(ref, read_bytes(campaign, ref.file))], config)
-    if isinstance(found, BadFile):
-        raise found
-    return found
+    return parse_trace(read_bytes(campaign, ref.file), ref, config)
 
 
-def read_traces(files: Sequence[tuple[TraceRef, bytes]], config: Config) -> list[Trace | BadFile]:
-    """Return a trace for each of several files, or why it must be left out.
-
-    Files with the same header are parsed in one go: Arrow hands every call over to another thread, which
-    takes longer than to parse a short file.
-    """
-    found: list[Trace | BadFile | _Opened] = []
-    alike: dict[tuple, list[int]] = {}
-    for i, (ref, raw) in enumerate(files):
-        try:
-            one = _open(raw, ref, config.trace)
-            found.append(one)
-            key = one.layout, one.width, one.settings.delimiter, bool(one.arrays)
-            alike.setdefault(key, []).append(i)
-        except BadFile as error:
-            found.append(error)
-    for members in alike.values():
-        made = _cells([files[i][0].file for i in members], [found[i] for i in members])
-        for i, cells in zip(members, made, strict=True):
-            try:
-                found[i] = _trace(cells, found[i], files[i][0], config)
-            except BadFile as error:
-                found[i] = error
-    return found
+def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
+    """Return the trace that the bytes of a file hold; raises as `read_trace`."""
+    of_arrays = kind_of(ref.file, config.trace) in OF_ARRAYS
+    read = _read_arrays if of_arrays else _read_text
+    return _trace(read(raw, ref, config.trace), ref, config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Opened:
-    """A trace file before its cells are parsed.
+class _Read:
+    """The cells of a trace file; `ours` holds our name of each position (from 0)."""
 
-    `body` are its data lines, `width` is the number of cells in the first of them; `ours` holds our name of
-    each position (from 0), `numeric` those that must hold numbers. `settings` say how the text is written.
-    Where the file is not text, `arrays` are its columns.
-    """
-
-    layout: Layout
-    body: bytes
-    width: int
+    cells: Cells
     ours: Mapping[int, str]
-    numeric: Mapping[int, str]
-    settings: TraceFormat
-    arrays: tuple[np.ndarray, ...]
+    layout: Layout
     faults: tuple[Fault, ...]
 
 
-def _open(raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Opened:
-    file, arrays, faults = ref.file, (), ()
-    if kind_of(file, settings) in OF_ARRAYS:
-        found = read_arrays(raw, file, settings)
-        arrays, faults = found.columns, found.faults
-        layout, body, width = Layout(found.header, found.names, None, 0, 1), b"", len(arrays)
-    else:
-        text, layout, settings = _text(raw, file, settings)
-        text = without_footer(text, settings.footer, layout.start)
-        if ref.cut:
-            text, fault = whole_lines(text, file)
-            faults = (fault,)
-        body = body_of(text, layout, settings, file)
-        width = width_of(body, settings.delimiter)
-        _refuse_narrow(layout, width, settings, file)
+def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Read:
+    found = read_arrays(raw, ref.file, settings)
+    layout = Layout(found.header, found.names, None, 0, 1)
+    ours = locate(layout, len(found.names) or len(found.columns), settings, ref.file)
+    cells = array_cells(found.columns, _numeric(ours, settings), settings, ref.file)
+    return _Read(cells, ours, layout, found.faults)
+
+
+def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Read:
+    file, faults = ref.file, ()
+    text, layout, settings = _text(raw, file, settings)
+    text = without_footer(text, settings.footer, layout.start)
+    if ref.cut:
+        text, fault = whole_lines(text, file)
+        faults = (fault,)
+    body = body_of(text, layout, settings, file)
+    width = width_of(body, settings.delimiter)
+    _refuse_narrow(layout, width, settings, file)
     try:
         ours = locate(layout, len(layout.names) or width, settings, file)
     except BadFile as error:
         raise _names_below(error, layout, body, settings) from None
+    return _Read(read_cells(body, layout, settings, _numeric(ours, settings), file), ours, layout, faults)
+
+
+def _numeric(ours: Mapping[int, str], settings: TraceFormat) -> dict[int, str]:
+    """Return the positions that must hold numbers, and our names of them."""
     must = numeric_names(settings)
-    numeric = {i: name for i, name in ours.items() if name in must}
-    return _Opened(layout, body, width, ours, numeric, settings, arrays, faults)
+    return {i: name for i, name in ours.items() if name in must}
 
 
 def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat, file: str) -> None:
@@ -178,18 +154,6 @@ def _names_below(error: BadFile, layout: Layout, body: bytes, settings: TraceFor
             fix = f"The names stand in line {number}: set header_lines = {number} under [trace]."
             return BadFile(*(replace(fault, fix=fix) for fault in error.faults))
     return error
-
-
-def _cells(files: Sequence[str], opened: Sequence[_Opened]) -> list[Cells]:
-    """Return the cells of files that are alike."""
-    first = opened[0]
-    if not first.arrays:
-        bodies = [(file, one.body) for file, one in zip(files, opened, strict=True)]
-        return read_cells(bodies, first.layout, first.settings, first.numeric)
-    return [
-        array_cells(one.arrays, one.numeric, one.settings, file)
-        for file, one in zip(files, opened, strict=True)
-    ]
 
 
 def _text(
@@ -224,10 +188,10 @@ def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | 
     return header_fields(header, config)
 
 
-def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trace:
+def _trace(read: _Read, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the cells of a file make; raises as `read_trace`."""
-    settings, file, layout = config.trace, ref.file, opened.layout
-    columns = {name: cells.columns[i] for i, name in opened.ours.items() if i in cells.columns}
+    settings, file, layout, cells = config.trace, ref.file, read.layout, read.cells
+    columns = {name: cells.columns[i] for i, name in read.ours.items() if i in cells.columns}
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None:
         named = name_parts(file, config.files, config.conversions("names")) or {}
@@ -236,7 +200,7 @@ def _trace(cells: Cells, opened: _Opened, ref: TraceRef, config: Config) -> Trac
     first = settings.drop_first_rows
     counted = max(len(good) - first, 1)
     columns, dropped, found = channel_columns(columns, good, cells.line, config, file)
-    faults = [*opened.faults, *cells.faults, *found]
+    faults = [*read.faults, *cells.faults, *found]
     columns = _in_our_units(columns, config, layout, file)
     if settings.rate_Hz is not None:  # a row that is left out takes its time, too
         columns["time_s"] = np.arange(len(good)) / settings.rate_Hz

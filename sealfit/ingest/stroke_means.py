@@ -22,7 +22,7 @@ from sealfit.ingest.quality import (
     stroke_faults,
     swapped_faults,
 )
-from sealfit.ingest.reader import Trace, read_traces
+from sealfit.ingest.reader import Trace, parse_trace
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, speed_factor
 from sealfit.ingest.window import acceleration
@@ -45,23 +45,15 @@ class FileStrokes:
     samples: Mapping[str, np.ndarray] | None = None
 
 
-def read_strokes(refs: Sequence[TraceRef], campaign: Path, config: Config) -> list[FileStrokes]:
-    """Return the strokes of trace files; without strokes where a file must be left out, and why."""
-    made: dict[str, FileStrokes] = {}
-    opened: list[tuple[TraceRef, bytes]] = []
-    marks: dict[str, Fingerprint] = {}
-    for ref in refs:
-        try:
-            raw, marks[ref.file] = read_marked(campaign, ref.file)
-            opened.append((ref, raw))
-        except BadFile as error:
-            made[ref.file] = FileStrokes(ref.file, fingerprint(campaign / ref.file), 0, error.faults)
-    for (ref, _), trace in zip(opened, read_traces(opened, config), strict=True):
-        if isinstance(trace, BadFile):
-            made[ref.file] = FileStrokes(ref.file, marks[ref.file], 0, trace.faults)
-        else:
-            made[ref.file] = _file_strokes(trace, marks[ref.file], config)
-    return [made[ref.file] for ref in refs]
+def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
+    """Return the strokes of a trace file; none where it must be left out, and why."""
+    mark = None
+    try:
+        raw, mark = read_marked(campaign, ref.file)
+        trace = parse_trace(raw, ref, config)
+    except BadFile as error:
+        return FileStrokes(ref.file, mark or fingerprint(campaign / ref.file), 0, error.faults)
+    return _file_strokes(trace, mark, config)
 
 
 def _file_strokes(trace: Trace, mark: Fingerprint, config: Config) -> FileStrokes:

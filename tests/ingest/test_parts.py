@@ -161,9 +161,9 @@ def count_reading(monkeypatch, read):
 
     real = partitions.read_strokes
 
-    def counted(refs, *args):
-        read.extend(ref.file for ref in refs)
-        return real(refs, *args)
+    def counted(ref, *args):
+        read.append(ref.file)
+        return real(ref, *args)
 
     monkeypatch.setattr(partitions, "read_strokes", counted)
 

@@ -268,3 +268,9 @@ def test_the_fewest_rows_are_left_out_for_a_rising_time(tmp_path_factory, times)
     trace = read(tmp_path_factory.mktemp("t"), csv_of(rows), rig)
     assert len(trace.table) == max(longest)
     assert (np.diff(trace.table["time_s"]) > 0).all()
+
+
+def test_whole_numbers_of_any_size_are_a_channel(tmp_path):
+    big = 2**60 + 1
+    trace = read(tmp_path, csv_of([f"{row},{big + i}" for i, row in enumerate(ROWS)], HEADER + ",count"))
+    npt.assert_array_equal(trace.columns["count"], np.float64(big))
