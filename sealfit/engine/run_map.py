@@ -15,6 +15,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextvars import ContextVar
 from itertools import islice
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, TypeVar
@@ -126,7 +127,7 @@ def _apply(pickled: bytes) -> list:
 WAITING_PER_WORKER = 2  # chunks submitted ahead; bounds the memory of waiting results
 # Not fork: it copies the locks of pyarrow's and BLAS's threads without the threads that free them. A fork
 # server has no threads, and has loaded what the workers need before the first of them is wanted.
-START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+START = "forkserver"
 
 
 def in_processes(
@@ -142,8 +143,7 @@ def in_processes(
         If a process dies before it has answered (killed, or out of memory).
     """
     context = multiprocessing.get_context(START)
-    if START == "forkserver":
-        context.set_forkserver_preload([load])
+    context.set_forkserver_preload([load])
     executor = ProcessPoolExecutor(workers, context, _start_worker)
     sent: deque[Future[list]] = deque()
 
@@ -179,11 +179,6 @@ def _no_interrupt_for_children() -> Iterator[None]:
     A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not
     lost.
     """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    from multiprocessing import resource_tracker
-
     resource_tracker.ensure_running()  # started here, because it unblocks Ctrl-C when it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -208,8 +203,6 @@ def _main_out_of_sight() -> Iterator[None]:
 
 
 def _start_worker() -> None:
-    if sys.platform == "win32":
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
     one_thread()
     try:
         claim_memory()

@@ -96,7 +96,7 @@ def _read(campaign: Path, file: str, size: int | None = None) -> tuple[bytes, os
         raise bad_file(file, "path_outside", "lies outside the campaign folder.", fix)
     try:
         # A pipe would be waited for forever, unless it is opened without waiting.
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except OSError as error:
         raise _not_opened(path, file, error) from None
     try:
@@ -125,8 +125,6 @@ def _not_opened(path: Path, file: str, error: OSError) -> BadFile:
         return bad_file(file, "missing_file", reason, "Copy the file itself into the campaign.")
     if isinstance(error, FileNotFoundError):
         return bad_file(file, "missing_file", "does not exist.", _similar(path))
-    if os.path.exists(path) and not os.path.isfile(path):  # a folder, where folders cannot be opened
-        return bad_file(file, "unreadable_file", "is not a file.", "Check the path.")
     return _not_readable(file, error)
 
 

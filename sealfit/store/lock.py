@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import shutil
@@ -44,11 +45,6 @@ def undisturbed() -> Iterator[None]:
 # of this host is taken over at once. Another host's lock is never taken over: what runs there cannot be seen
 # from here. Where the file system has no locks, the process that the file names is looked for.
 
-try:
-    import fcntl
-except ImportError:  # pragma: no cover  (Windows)
-    fcntl = None
-
 LOCK = ".lock"
 
 
@@ -71,7 +67,7 @@ def _take(path: Path, option: str) -> int:
         try:
             if path.is_symlink():  # what it leads to would be written
                 path.unlink()
-            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         except OSError as error:
             fix = f"Choose another {option}, or fix its rights."
             raise OutError(f"cannot be written ({error.strerror}).", file=path.parent, fix=fix) from error
@@ -88,8 +84,6 @@ def _take(path: Path, option: str) -> int:
 
 def _locked(handle: int) -> bool | None:
     """Lock a file, and return whether that was possible; None where the file system has no locks."""
-    if fcntl is None:
-        return True
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
