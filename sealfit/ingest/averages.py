@@ -13,9 +13,6 @@ from sealfit.config import Bins
 
 # ---------------------------------------------------------------- average
 
-# The sum of correlations ends within so few lags, unless the noise is slow: then all are computed at once.
-LAGS = 20
-
 Samples = Mapping[str, np.ndarray]  # columns of equal length
 Strokes = Mapping[str, Sequence]
 
@@ -45,24 +42,12 @@ def standard_error(values: np.ndarray) -> float:
     square = float(centred @ centred)
     if square == 0.0:
         return 0.0
-    tau = 0.5
-    for lag in range(1, min(LAGS, n)):
-        tau += float(centred[lag:] @ centred[:-lag]) / square
-        if lag >= 5.0 * tau:
-            break
-    else:
-        tau = _slow_tau(centred)
-    return math.sqrt(square / (n - 1) * max(2.0 * tau, 1.0) / n)
-
-
-def _slow_tau(centred: np.ndarray) -> float:
-    """Return a series' autocorrelation time, all lags at once; the largest sum if the window never ends."""
-    n = len(centred)
     spectrum = np.fft.rfft(centred, 1 << (2 * n - 1).bit_length())  # padded so that no lag wraps around
     lagged = np.fft.irfft(spectrum * spectrum.conj())[:n]
-    tau = 0.5 + np.concatenate(([0.0], np.cumsum(lagged[1:] / lagged[0])))
-    inside = np.flatnonzero(np.arange(n) >= 5.0 * tau)
-    return float(tau[inside[0]] if len(inside) else tau.max())
+    sums = 0.5 + np.concatenate(([0.0], np.cumsum(lagged[1:] / square)))
+    inside = np.flatnonzero(np.arange(n) >= 5.0 * sums)
+    tau = float(sums[inside[0]] if len(inside) else sums.max())  # the largest if the window never ends
+    return math.sqrt(square / (n - 1) * max(2.0 * tau, 1.0) / n)
 
 
 def mean_by_group(values: np.ndarray, group: np.ndarray) -> np.ndarray:
