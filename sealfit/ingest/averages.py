@@ -50,12 +50,6 @@ def standard_error(values: np.ndarray) -> float:
     return math.sqrt(square / (n - 1) * max(2.0 * tau, 1.0) / n)
 
 
-def mean_by_group(values: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the mean of `values` in each group; NaN for a group without any."""
-    with np.errstate(invalid="ignore"):
-        return np.bincount(group, values) / np.bincount(group)
-
-
 def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
     """Return the most frequent label in each group, shape (groups,); None for a group without one."""
     codes, labels = pd.factorize(values)
@@ -121,7 +115,7 @@ def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, n
         if name == "row":
             continue
         if values.dtype.kind in "fiub":
-            made[name] = mean_by_group(values.astype(float, copy=False), group)
+            made[name] = np.bincount(group, values) / n
         else:
             made[name] = common_by_group(values, group, len(n))
     square = np.bincount(group, (samples["force_N"] - made["force_N"][group]) ** 2)
