@@ -67,16 +67,14 @@ class Dialect:
     footer: tuple[str, ...] = ()
 
 
-def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialect | None:
+def sniff(text: str, *, likely: str | None = None) -> Dialect | None:
     """Return how a text is written; None if it holds no table of numbers with at least two columns.
 
-    The text is the file, or with `whole` False its beginning; lines end in a line feed. `likely` is the
-    separator of files that are named alike: it is tried first, as clevercsv takes longer than all the rest.
+    Lines end in a line feed. `likely` is the separator of files that are named alike: it is tried first, as
+    clevercsv takes longer than all the rest.
     """
     lines = text.split("\n")
-    if not whole:
-        lines = lines[:-1]  # it may be cut
-    elif len(lines) > 2 * ENDS:
+    if len(lines) > 2 * ENDS:
         lines = lines[:ENDS] + lines[-ENDS:]
     sample = lines[:SAMPLE_LINES]
     mixed = None  # with columns of text: right only where no other separator leaves nothing but numbers
@@ -86,9 +84,9 @@ def sniff(text: str, *, whole: bool = True, likely: str | None = None) -> Dialec
         best = max(found, key=lambda block: block.rows * len(block.numbers))
         if best.rows >= MIN_ROWS and len(best.numbers) >= 2:
             if best.pure:
-                return _dialect(lines, delimiter, best, whole)
+                return _dialect(lines, delimiter, best)
             mixed = mixed or (delimiter, best)
-    return _dialect(lines, *mixed, whole) if mixed else None
+    return _dialect(lines, *mixed) if mixed else None
 
 
 def sniffed_delimiter(lines: Sequence[str]) -> str | None:
@@ -168,7 +166,7 @@ def _first_of_many(data: Sequence[bool]) -> int | None:
 # What stands above and below the data.
 
 
-def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Dialect:
+def _dialect(lines: list[str], delimiter: str, block: _Block) -> Dialect:
     core, start = frozenset(block.numbers), block.start
     numeric = [_numeric(line, delimiter, block.decimal) for line in lines[start:]]
     is_data = [found is not None and core <= found for found in numeric]
@@ -198,7 +196,7 @@ def _dialect(lines: list[str], delimiter: str, block: _Block, whole: bool) -> Di
         first=data[0],
         names_are_cells=names_at is None or rows[names_at] == _cells_of(header[names_at], delimiter),
         odd_lines=odd,
-        footer=tuple(below) if whole else (),
+        footer=tuple(below),
     )
 
 

@@ -151,9 +151,8 @@ def _sniffed(folder: Path, texts: Sequence[str]) -> tuple[dict[str, Dialect | No
         likely = None
         for file in evenly(members, SNIFFED):
             try:
-                text, whole = text_of(folder, file)
                 likely = "tab" if kind_of(file) in OF_ARRAYS else likely
-                dialects[file] = found = sniff(text, whole=whole, likely=likely)
+                dialects[file] = found = sniff(text_of(folder, file), likely=likely)
                 likely = found.delimiter if found is not None else likely
             except BadFile as error:
                 unreadable[file] = f"{error.fault.reason} {error.fault.fix}".strip()
@@ -167,10 +166,11 @@ def evenly(items: Sequence[str], count: int) -> list[str]:
     return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
 
 
-def text_of(folder: Path, file: str, *, first_sheet: bool = False) -> tuple[str, bool]:
-    """Return a file as text, and whether it is the whole file; cells of sheets and arrays lie between tabs.
+def text_of(folder: Path, file: str, *, first_sheet: bool = False) -> str:
+    """Return a file as text: cells of sheets and arrays lie between tabs.
 
-    Of a workbook it is the sheet with the most rows, or the first.
+    Of a large file it is the whole lines of the beginning, of a workbook the sheet with the most rows, or the
+    first.
 
     Raises
     ------
@@ -181,13 +181,14 @@ def text_of(folder: Path, file: str, *, first_sheet: bool = False) -> tuple[str,
     """
     kind = kind_of(file)
     if kind in OF_ARRAYS:
-        return _text_of_arrays(read_bytes(folder, file), file), True
+        return _text_of_arrays(read_bytes(folder, file), file)
     if kind == "xlsx":
         sheet = read_sheet(read_bytes(folder, file), file, None, first=first_sheet, longest=not first_sheet)
-        return sheet.text.decode(), True
+        return sheet.text.decode()
     whole = (folder / file).stat().st_size <= WHOLE_BYTES if (folder / file).exists() else True
     raw = read_bytes(folder, file, head=not whole)
-    return as_utf8(raw, "auto", file, head=not whole).decode("utf-8", "replace"), whole
+    text = as_utf8(raw, "auto", file, head=not whole).decode("utf-8", "replace")
+    return text if whole else text.rpartition("\n")[0]
 
 
 def _text_of_arrays(raw: bytes, file: str) -> str:
@@ -251,8 +252,8 @@ def read_tables(found: Found) -> dict[str, np.ndarray]:
     tables = {}
     for file in evenly(list(found.dialects), READ):
         dialect = found.dialects[file]
-        text, _ = text_of(found.folder, file)
-        table = _numbers(text.split("\n")[len(dialect.header) :], found.dialect)
+        lines = text_of(found.folder, file).split("\n")
+        table = _numbers(lines[len(dialect.header) :], found.dialect)
         if len(table) >= MIN_ROWS:
             tables[file] = table
     return tables

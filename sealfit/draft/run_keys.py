@@ -34,7 +34,6 @@ AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
 SPEED_UNITS = ("mm/min", "m/s", "cm/s", "um/s", "in/min", "in/s")
 _WHOLE_DAY = re.compile(r"\d{4}-\d\d-\d\d(?:[ T]00:00(?::00)?)?")  # a workbook's date is a midnight
-MOST_LISTED = 20  # files that are excluded by name; more are said in a sentence
 
 
 @dataclass(frozen=True)
@@ -207,19 +206,13 @@ def _without(names: Names, part: Part) -> Names:
 def source_keys(found: Found, source: Source, header: Collection[str], notes: Notes) -> None:
     """Add where files are, and what names and the table of runs say; `header` is what header lines give."""
     table = source.table
-    if table is not None and table.is_read:
-        if not table.is_runs_csv:
+    if table is not None:
+        if table.file != RUNS_CSV:
             notes.guess("files.runs_table", table.file, f"lists {table.named} of {len(found.traces)} traces")
         _table_keys(table, notes)
     else:
-        _glob_keys(found, source, notes)
-        if table is not None:
-            _table_keys(table, notes)
-            reason = f"'{table.file}' lists {table.named} of the trace files, but has not the ending .csv."
-            fix = f"Copy it to {RUNS_CSV}; the columns below are those of this table."
-            fix += " Without it, only names count."
-            notes.doubt("files.runs_columns", reason, fix)
-    if table is None or not table.is_read or not set(AGING_CONDITION) <= table.given:
+        _glob_keys(found, source.names, notes)
+    if table is None or not set(AGING_CONDITION) <= table.given:
         told = table is not None or bool(set(header) & set(AGING_CONDITION))
         _name_keys(source.names, len(found.traces), told, notes)
     _otherwise({f: one for f, one in found.otherwise.items() if table is None or f != table.file}, notes)
@@ -243,20 +236,14 @@ def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:
     notes.doubt("files", reason, f"One config reads files of one form. {fix}")
 
 
-def _glob_keys(found: Found, source: Source, notes: Notes) -> None:
+def _glob_keys(found: Found, names: Names, notes: Notes) -> None:
     pattern = glob_of(found.traces)
     notes.guess("files.glob", pattern, f"finds the trace files: {len(found.traces)}")
     matched = {p.relative_to(found.folder).as_posix() for p in found.folder.glob(pattern) if p.is_file()}
-    unmatched = set(source.names.unmatched)
-    table = {source.table.file} if source.table is not None else set()
-    surplus = (matched - set(found.traces)) | (unmatched & matched) | (table & matched)
-    if surplus:
-        excluded = _excluded(surplus, matched)
+    unmatched = set(names.unmatched)
+    if surplus := (matched - set(found.traces)) | (unmatched & matched):
         why = "no traces, or named or written otherwise than the rest"
-        notes.guess("files.exclude", excluded[:MOST_LISTED], why)
-        if len(excluded) > MOST_LISTED:
-            reason = f"{len(excluded) - MOST_LISTED} more files are no traces like the rest."
-            notes.doubt("files.exclude", reason, "Move them away, or add them here.")
+        notes.guess("files.exclude", _excluded(surplus, matched), why)
     if unmatched:
         shown = ", ".join(sorted(unmatched, key=natural)[:3])
         reason = f"{len(unmatched)} of {len(found.traces)} trace files are named otherwise: {shown}."

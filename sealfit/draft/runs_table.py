@@ -12,7 +12,6 @@ from sealfit.draft.files_found import text_of
 from sealfit.draft.vocabulary import UNAGED, Unit, name_and_unit, setting
 from sealfit.errors import BadFile
 from sealfit.ingest.files import as_number, split_line
-from sealfit.ingest.formats import kind_of
 from sealfit.ingest.listing import RUNS_CSV
 from sealfit.ingest.start_times import excel_time
 
@@ -38,17 +37,6 @@ class RunsTable:
     named: int
 
     @property
-    def is_runs_csv(self) -> bool:
-        """Whether the reader finds it by its name."""
-        return self.file == RUNS_CSV
-
-    @property
-    def is_read(self) -> bool:
-        """Whether it tells the files, as runs.csv or as `files.runs_table`."""
-        csv = PurePosixPath(self.file).suffix.lower() == ".csv"
-        return csv or kind_of(self.file) != "csv"
-
-    @property
     def given(self) -> set[str]:
         """Our columns that it gives."""
         return set(self.ours.values())
@@ -57,14 +45,14 @@ class RunsTable:
 def find_table(folder: Path, others: Sequence[str], traces: Sequence[str]) -> RunsTable | None:
     """Return the table of runs among files other than traces: runs.csv, else the one that names most."""
     tables = [table for file in others if (table := _table(folder, file, traces)) is not None]
-    return max(tables, key=lambda table: (table.is_runs_csv, table.named), default=None)
+    return max(tables, key=lambda table: (table.file == RUNS_CSV, table.named), default=None)
 
 
 def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
     try:
         if (folder / file).stat().st_size > MAX_BYTES:
             return None
-        text, _ = text_of(folder, file, first_sheet=True)
+        text = text_of(folder, file, first_sheet=True)
     except (BadFile, OSError):
         return None
     lines = [line for line in text.split("\n") if line.strip(" \t,;")]

@@ -354,13 +354,22 @@ def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_k
     assert "what 'Gewicht [kg]' of log.csv holds is not known here" in doubts
 
 
-def write_with_log(folder, columns, started):
+def write_with_log(folder, columns, started, log="log.csv"):
     """Write four traces, and a log with the time that `started(trace)` gives in the further `columns`."""
     rows = [f"File,Days,{columns}"]
     for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
         exports.write(folder, f"M{number}.csv", plain(one))
         rows.append(f"M{number}.csv,{one.days},{started(one)}")
-    exports.write(folder, "log.csv", "\n".join(rows) + "\n")
+    exports.write(folder, log, "\n".join(rows) + "\n")
+
+
+@pytest.mark.parametrize("log", ["log.csv", "log.txt"])
+def test_a_log_of_any_ending_is_read(tmp_path, log):
+    write_with_log(tmp_path, "Start", lambda one: f"2024-03-0{1 + one.days}T08:00:00", log)
+    made = parse_config(draft(tmp_path).text, "rig.toml")
+    assert made.files.runs_table == log
+    listing, _ = list_traces(tmp_path, made)
+    assert set(listing.columns["aging_days"]) == {0.0, 4.0}
 
 
 def test_a_log_with_whole_dates_and_a_clock_is_read(tmp_path):
