@@ -17,7 +17,7 @@ from sealfit.errors import BadFile, RequestError
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
 from sealfit.ingest.listing import RUNS_CSV, natural
-from sealfit.ingest.workbooks import read_sheet
+from sealfit.ingest.workbooks import LONGEST, read_sheet
 
 SNIFFED = 24
 """Files of one kind of name that are looked at, spread evenly: more would show the same."""
@@ -183,8 +183,8 @@ def text_of(folder: Path, file: str, *, first_sheet: bool = False) -> str:
     if kind in OF_ARRAYS:
         return _text_of_arrays(read_bytes(folder, file), file)
     if kind == "xlsx":
-        sheet = read_sheet(read_bytes(folder, file), file, None, first=first_sheet, longest=not first_sheet)
-        return sheet.text.decode()
+        sheet = 1 if first_sheet else LONGEST
+        return read_sheet(read_bytes(folder, file), file, sheet).text.decode()
     whole = (folder / file).stat().st_size <= WHOLE_BYTES if (folder / file).exists() else True
     raw = read_bytes(folder, file, head=not whole)
     text = as_utf8(raw, "auto", file, head=not whole).decode("utf-8", "replace")

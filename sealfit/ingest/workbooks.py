@@ -8,8 +8,8 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -23,6 +23,7 @@ from sealfit.ingest.formats import CALLED, damage_named, kind_of, library, value
 # ---------------------------------------------------------------- sheets
 
 HEAD_ROWS = 1000  # a header longer than this is no header
+LONGEST = object()  # stands for the sheet with the most rows
 _OLE = b"\xd0\xcf\x11\xe0"  # of .xls, and of the shell that Excel puts around an encrypted workbook
 _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
 _MERGED = re.compile(rb'mergeCell\b[^>]*?\bref="([A-Z]+\d+:[A-Z]+(\d+))"')
@@ -49,19 +50,12 @@ class Sheet:
 
 
 def read_sheet(
-    raw: bytes,
-    file: str,
-    sheet: str | int | None,
-    *,
-    decimal: str = ".",
-    first: bool = False,
-    longest: bool = False,
-    head: bool = False,
+    raw: bytes, file: str, sheet: str | int | object | None, *, decimal: str = ".", head: bool = False
 ) -> Sheet:
     """Return a sheet of a workbook as text: its name or number (from 1), or None for the only one with cells.
 
-    With `first`, None means the first sheet, with `longest` the one with the most rows; with `head`,
-    `HEAD_ROWS` rows are enough. Numbers are written with the mark `decimal`.
+    `LONGEST` is the one with the most rows. With `head`, `HEAD_ROWS` rows are enough. Numbers are written
+    with the mark `decimal`.
 
     Raises
     ------
@@ -70,24 +64,20 @@ def read_sheet(
     CampaignError
         If openpyxl is not installed.
     """
-    _refuse_others(raw, file)
-    openpyxl = library("openpyxl", file)
-    with damage_named(file, "xlsx"):
-        with _book(openpyxl, raw, formulas=True) as book:
-            title = _longest(book)[0] if longest else _title(book, sheet, first, file)
-            lines, formulas = _lines(book[title], decimal, head)
-        if formulas:
-            with _book(openpyxl, raw, formulas=False) as book:
-                lines, _ = _lines(book[title], decimal, head)
-                _refuse_unsaved(book[title], formulas, openpyxl.utils.get_column_letter, file)
-        return Sheet("\n".join(lines).encode("utf-8", "replace"), () if head else _merged(raw, title))
+    with _book(raw, file, formulas=True) as book:
+        title = _title(book, sheet, file)
+        lines, formulas = _lines(book[title], decimal, head)
+        merged = () if head else _merged(raw, title)
+    if formulas:
+        with _book(raw, file, formulas=False) as book:
+            lines, _ = _lines(book[title], decimal, head)
+            _refuse_unsaved(book[title], formulas, file)
+    return Sheet("\n".join(lines).encode("utf-8", "replace"), merged)
 
 
 def longest_sheet(raw: bytes, file: str) -> tuple[str, int]:
     """Return the name of the sheet with the most rows, and how many have cells; errors as `read_sheet`."""
-    _refuse_others(raw, file)
-    openpyxl = library("openpyxl", file)
-    with damage_named(file, "xlsx"), _book(openpyxl, raw, formulas=True) as book:
+    with _book(raw, file, formulas=True) as book:
         return _longest(book)
 
 
@@ -97,16 +87,15 @@ def _longest(book) -> tuple[str, int]:
 
 
 @contextmanager
-def _book(openpyxl, raw: bytes, *, formulas: bool) -> Iterator:
+def _book(raw: bytes, file: str, *, formulas: bool) -> Iterator:
     """Open a workbook to be read row by row, with its formulas or with the values that Excel kept of them."""
+    _refuse_others(raw, file)
+    openpyxl = library("openpyxl", file)
     options = {"read_only": True, "data_only": not formulas, "keep_links": False}
-    book = openpyxl.load_workbook(io.BytesIO(raw), **options)
-    try:
+    with damage_named(file, "xlsx"), closing(openpyxl.load_workbook(io.BytesIO(raw), **options)) as book:
         for sheet in book.worksheets:
             sheet.reset_dimensions()  # some writers note a size that is not so
         yield book
-    finally:
-        book.close()
 
 
 def _refuse_others(raw: bytes, file: str) -> None:
@@ -121,8 +110,10 @@ def _refuse_others(raw: bytes, file: str) -> None:
     raise bad_file(file, "binary_file", "is a workbook of old Excel (.xls).", "Save it as .xlsx.")
 
 
-def _title(book, wanted: str | int | None, first: bool, file: str) -> str:
+def _title(book, wanted: str | int | object | None, file: str) -> str:
     """Return the name of the sheet that is meant."""
+    if wanted is LONGEST:
+        return _longest(book)[0]
     titles = [sheet.title for sheet in book.worksheets]
     if isinstance(wanted, int):
         if 0 < wanted <= len(titles):
@@ -135,9 +126,7 @@ def _title(book, wanted: str | int | None, first: bool, file: str) -> str:
         close = nearest(wanted, titles)
         fix = f"Did you mean '{close}'?" if close else _listed(titles)
         raise bad_file(file, "missing_sheet", f"there is no sheet '{wanted}'.", fix)
-    if first and titles:
-        return titles[0]
-    filled = [sheet.title for sheet in book.worksheets if _is_filled(sheet)]
+    filled = [s.title for s in book.worksheets if any(map(_has_cell, s.iter_rows(values_only=True)))]
     if not filled:
         raise bad_file(file, "empty_file", "has no sheet with cells.", "Export it again.")
     if len(filled) > 1:
@@ -148,10 +137,6 @@ def _title(book, wanted: str | int | None, first: bool, file: str) -> str:
 
 def _listed(titles: list[str]) -> str:
     return f"The sheets are {', '.join(repr(title) for title in titles)}."
-
-
-def _is_filled(sheet) -> bool:
-    return any(map(_has_cell, sheet.iter_rows(values_only=True)))
 
 
 def _has_cell(row: Sequence[object]) -> bool:
@@ -189,8 +174,10 @@ def _cell(value: object, decimal: str) -> str:
     return '"' + text.replace('"', '""') + '"' if '"' in text else text
 
 
-def _refuse_unsaved(sheet, formulas: list[tuple[int, int]], letter: Callable[[int], str], file: str) -> None:
+def _refuse_unsaved(sheet, formulas: list[tuple[int, int]], file: str) -> None:
     """Raise `BadFile` if Excel kept no value of a formula."""
+    from openpyxl.utils import get_column_letter
+
     places = set(formulas)
     rows = sheet.iter_rows(max_row=max(row for row, _ in formulas), values_only=True)
     for number, row in enumerate(rows, start=1):
@@ -198,7 +185,7 @@ def _refuse_unsaved(sheet, formulas: list[tuple[int, int]], letter: Callable[[in
             if value is None and (number, place) in places:
                 reason = "the cell holds a formula whose value was not saved."
                 fix = "Open it in Excel and save it, or paste values over the formulas."
-                raise bad_file(file, "formula", reason, fix, line=number, column=letter(place))
+                raise bad_file(file, "formula", reason, fix, line=number, column=get_column_letter(place))
 
 
 def _merged(raw: bytes, title: str) -> tuple[tuple[str, int], ...]:
@@ -246,7 +233,7 @@ def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]
         with damage_named(file, kind):
             return _parquet_text(raw), "\t"
     if kind == "xlsx":
-        sheet = read_sheet(raw, file, config.files.runs_sheet, first=True)
+        sheet = read_sheet(raw, file, 1 if config.files.runs_sheet is None else config.files.runs_sheet)
         sheet.check(1, file)
         return sheet.text, "\t"
     fix = "Save it as .csv, .xlsx or .parquet."
