@@ -98,7 +98,7 @@ def test_conditions_may_stand_in_the_traces_as_constants(tmp_path):
         ('condition = ["speed_mm_s"]', "condition"),
         ('trace.names = "none"', "trace.columns.time_s"),
         ('files.columns.run_id = "{rig}"', "files"),
-        ('quantities.speed = {quantity = "speed", unit = "knot"}', "quantities"),
+        ('quantities.speed = {quantity = "speed", unit = "step/s"}', "quantities"),
     ],
 )
 def test_configs_that_cannot_be_meant_are_refused_before_any_file_is_opened(tmp_path, text, column):
