@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 
-import numpy as np
 import regex
 
 from sealfit.config import Config, TraceFormat
@@ -175,7 +174,6 @@ _MARKED_UP = {
     b'{"': "a JSON file",
     b"[{": "a JSON file",
 }
-_ASCII = ("auto", "utf-8", "utf8", "utf_8", "latin-1")  # encodings that are ASCII where the text is
 _CONTROL = bytes(set(range(32)) - {9, 10, 12, 13}) + b"\x7f"
 
 
@@ -205,8 +203,6 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
     BadFile
         If the bytes are not text in that encoding, or begin as files of other formats do.
     """
-    if _is_plain(raw) and encoding.lower() in _ASCII:
-        return raw
     _refuse_packed(raw, file)
     automatic = encoding == "auto"
     if automatic:
@@ -252,12 +248,6 @@ def refuse_marked_up(text: bytes, file: str) -> None:
     for mark, what in _MARKED_UP.items():
         if begin.startswith(mark):
             raise bad_file(file, "no_table", f"is {what}, not a table.", "Export the trace as CSV.")
-
-
-def _is_plain(raw: bytes) -> bool:
-    """Return whether the bytes are only letters, figures and marks of ASCII between line feeds."""
-    codes = np.frombuffer(raw, np.uint8)
-    return bool(codes.max(initial=0) < 127) and np.count_nonzero(codes < 32) == np.count_nonzero(codes == 10)
 
 
 def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
