@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
@@ -66,10 +66,7 @@ def _row_faults(check: str, name: str, rows: Rows, wrong: np.ndarray, file: str)
         shown = value if np.isfinite(value) else str(value)  # JSON has no nan
         return Fault(check, reason, line=int(rows.line[i]), value=shown, fix=fix, **place)
 
-    def rest(count: int) -> Fault:
-        return Fault(check, f"and {count} more rows: {reason}", value=float(count), **place)
-
-    return listed(np.flatnonzero(wrong), make, rest)
+    return listed(np.flatnonzero(wrong), make, check, f"rows: {reason}")
 
 
 def _out_of_order(time_s: np.ndarray) -> np.ndarray:
@@ -104,6 +101,7 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 # way: text where a number belongs, remarks typed beside a number, lines with too few or too many cells.
 
 OVERLOAD = 1e24  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
+OTHER_CELLS = "cells of this column that are not numbers."
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
 _CLOCK = re.compile(r"(?:.*[\sT])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:\s*([ap])\.?m\.?)?Z?", re.IGNORECASE)
 _DAY_S = 86400.0
@@ -143,17 +141,14 @@ class ColumnOfFile:
         fix = decimal_fix(cell, self.decimal) or "Put a number there or delete the line."
         return self.fault(row, "not_a_number", "is not a number.", value=cell.strip(), fix=fix)
 
-    def rest(self, count: int) -> Fault:
-        """Return the fault that counts further cells."""
-        reason = f"and {count} more cells of this column that are not numbers."
-        place = {"file": self.file, "column": self.name, "action": "row left out"}
-        return Fault("not_a_number", reason, value=float(count), **place)
 
-
-def listed(rows: np.ndarray, make: Callable[[int], Fault], rest: Callable[[int], Fault]) -> list[Fault]:
-    """Return a fault for each of the first rows and one counting the rest: nothing floods, all is counted."""
-    faults = [make(int(row)) for row in rows[:LISTED]]
-    return [*faults, rest(len(rows) - LISTED)] if len(rows) > LISTED else faults
+def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str) -> list[Fault]:
+    """Return a fault for each of the first rows, and one of `check` that counts the rest, `more`."""
+    faults, rest = [make(int(row)) for row in rows[:LISTED]], len(rows) - LISTED
+    if rest > 0:
+        reason, place = f"and {rest} more {more}", {"line": None, "value": float(rest)}
+        faults.append(replace(faults[0], check=check, reason=reason, fix="", **place))
+    return faults
 
 
 def body_of(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> bytes:
@@ -390,7 +385,7 @@ def _cell_faults(
             return column.not_a_number(i, cell)
         return column.fault(i, check, reason, value=value, fix=fix)
 
-    return listed(at, make, column.rest)
+    return listed(at, make, "not_a_number", OTHER_CELLS)
 
 
 def _remark(cell: str) -> str:
@@ -425,8 +420,4 @@ def _beyond_faults(at, rows, line, width, file) -> list[Fault]:
                 fix = "Decimal commas between commas? Export with another separator, or with decimal points."
         return Fault(check, reason, line=int(line[i]), value=value, fix=fix, **place)
 
-    def rest(count: int) -> Fault:
-        reason = f"and {count} more lines with cells beyond the last named column."
-        return Fault("too_many_cells", reason, value=float(count), **place)
-
-    return listed(at, make, rest)
+    return listed(at, make, "too_many_cells", "lines with cells beyond the last named column.")

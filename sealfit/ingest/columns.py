@@ -9,7 +9,7 @@ import pandas as pd
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import KEPT, NOTED, BadFile, Fault, nearest, shortened
-from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, listed, numbers_of
+from sealfit.ingest.cells import OTHER_CELLS, OVERLOAD, ColumnOfFile, listed, numbers_of
 from sealfit.ingest.expression import parse
 from sealfit.ingest.files import Layout, as_number, bad_file, split_line
 from sealfit.tables import BINS, RUNS
@@ -194,10 +194,7 @@ def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarr
         def make(i: int) -> Fault:
             return Fault("remark", "a remark; the row is kept.", line=int(line[i]), value=texts[i], **place)
 
-        def rest(count: int) -> Fault:
-            return Fault("remark", f"and {count} more remarks.", **place)
-
-        return listed(np.flatnonzero(full), make, rest)
+        return listed(np.flatnonzero(full), make, "remark", "remarks.")
     labels = len(set(texts[full]))
     if labels > MAX_LABELS and labels > 0.5 * full.sum():
         return [_left_out(name, f"{labels} different texts are too many for labels", "", file, NOTED)]
@@ -218,4 +215,4 @@ def _cell_faults(column: ColumnOfFile, at: np.ndarray, cells: np.ndarray) -> lis
         reason = "is not a measured number." if value != "" else "the cell holds no number."
         return column.fault(i, "not_finite", reason, value=value, fix="Fill it or delete the line.")
 
-    return listed(at, make, column.rest)
+    return listed(at, make, "not_a_number", OTHER_CELLS)
