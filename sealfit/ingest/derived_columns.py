@@ -217,9 +217,9 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
     found: list[tuple[int, Fault]] = []
 
     def add(name: str, wrong: Callable[[float], bool], reason: str, fix: str) -> None:
-        for i in np.flatnonzero(where(columns.get(name, []), wrong)).tolist():
-            value = columns[name][i]
-            found.append((i, entries[i].fault("out_of_range", reason, name, value=value, fix=fix)))
+        column = columns.get(name, [])
+        for i in np.flatnonzero(where(column, lambda v: not isinstance(v, str) and wrong(v))).tolist():
+            found.append((i, entries[i].fault("out_of_range", reason, name, value=column[i], fix=fix)))
 
     add("aging_days", lambda value: value < 0, "is below 0 days.", "Days count from 0, unaged.")
     fix = "A normal load presses; leave the cell empty if it is unknown."
@@ -228,18 +228,11 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
     add("speed_mm_s", lambda value: value == 0, "is not a sliding speed.", fix)
     fix = "Temperatures are in °C; give another unit in the rig config."
     for name in (name for name in columns if name.endswith("_C")):
-        add(name, _is_below_absolute_zero, "is not above absolute zero.", fix)
+        add(name, lambda value: value <= ABSOLUTE_ZERO_C, "is not above absolute zero.", fix)
+    reason, fix = "is larger than any quantity of a rig.", "Correct what gives it."
     for name in columns:
-        add(name, _is_overload, "is larger than any quantity of a rig.", "Correct what gives it.")
+        add(name, lambda value: abs(value) >= OVERLOAD, reason, fix)
     return [fault for _, fault in sorted(found, key=lambda one: one[0])]
-
-
-def _is_below_absolute_zero(value: float | str) -> bool:
-    return not isinstance(value, str) and value <= ABSOLUTE_ZERO_C
-
-
-def _is_overload(value: float | str) -> bool:
-    return not isinstance(value, str) and abs(value) >= OVERLOAD
 
 
 # ---------------------------------------------------------------- derive
