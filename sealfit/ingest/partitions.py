@@ -16,7 +16,7 @@ import pyarrow as pa
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.averages import bin_table, mean_traces
-from sealfit.ingest.categorical import condition_columns, keys_of
+from sealfit.ingest.categorical import columns_of, condition_columns, keys_of
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.files import as_number
 from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_strokes
@@ -200,8 +200,7 @@ def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, li
     stroke is one for each of them: `<run_id> at 42.1`.
     """
     rows = [row for made in files for row in made.strokes]
-    names = dict.fromkeys(name for row in rows for name in row)
-    columns = {name: [row.get(name) for row in rows] for name in names}
+    columns = columns_of(rows)
     for name in condition_columns(config):
         columns.setdefault(name, [math.nan] * len(rows))  # every file is unaged, and none says the rest
     if not rows:

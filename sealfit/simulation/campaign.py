@@ -45,6 +45,7 @@ SCHEMA = 1
 MADE_BY = "sealfit simulate"
 # Decimals of a mean force in N. They are far below any noise.
 DIGITS = 9
+OF_EFFECT = ("id", "channels", "acts_on", "operation", "form", "parameters")
 PER_FILE = (
     "file", "run_id", "direction", "speed_mm_s", "mean_force_N", "gain", "offset_N", "outlier", "defect",
 )  # fmt: skip
@@ -147,15 +148,7 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
         "spec": spec.model_dump(mode="json"),
         "physics": physics,
         "effects": [
-            {
-                "id": e.id,
-                "channels": list(e.channels),
-                "acts_on": e.acts_on,
-                "operation": e.operation,
-                "form": e.form,
-                "parameters": dict(e.parameters),
-                "rms_N": round(float(rms), DIGITS),
-            }
+            {**{name: getattr(e, name) for name in OF_EFFECT}, "rms_N": round(float(rms), DIGITS)}
             for e, rms in zip(steady_law(spec).effects, effect_rms_N, strict=True)
         ],
         "noise": [kind.model_dump(mode="json") for kind in spec.noise],
