@@ -50,10 +50,7 @@ def clean(rows: Rows, names: list[str], file: str) -> tuple[Rows, int, list[Faul
 _ROW_FAULTS = {  # check: (reason, fix)
     "not_finite": ("the computed value is not a finite number.", "Check [trace.compute]."),
     "overload": ("is an instrument's mark for overload.", "Check the sensor's range."),
-    "time_order": (
-        "time repeats or runs backwards.",
-        "Check the recorder's clock, or delete the line.",
-    ),
+    "time_order": ("time repeats or runs backwards.", "Check the recorder's clock, or delete the line."),
 }
 
 

@@ -135,11 +135,7 @@ MAX_LABELS = 20
 
 
 def channel_columns(
-    columns: Mapping[str, np.ndarray],
-    good: np.ndarray,
-    line: np.ndarray,
-    config: Config,
-    file: str,
+    columns: Mapping[str, np.ndarray], good: np.ndarray, line: np.ndarray, config: Config, file: str
 ) -> tuple[dict[str, np.ndarray], np.ndarray, list[Fault]]:
     """Return the columns that are of use, a mask of rows to leave out, and the faults.
 

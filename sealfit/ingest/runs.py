@@ -44,14 +44,7 @@ from sealfit.ingest.derived_columns import (
     with_computed,
     with_day_0,
 )
-from sealfit.ingest.file_names import (
-    Listing,
-    TraceRef,
-    channels_of,
-    matched_part,
-    name_parts,
-    unmatched,
-)
+from sealfit.ingest.file_names import Listing, TraceRef, channels_of, matched_part, name_parts, unmatched
 from sealfit.ingest.files import bad_file, cut_files
 from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt

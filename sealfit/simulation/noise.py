@@ -176,12 +176,7 @@ def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> Scat
 
 
 def sample_noise_N(
-    noise: Sequence[Noise],
-    force_N: np.ndarray,
-    time_s: np.ndarray,
-    speed_mm_s: float,
-    file: int,
-    seed: int,
+    noise: Sequence[Noise], force_N: np.ndarray, time_s: np.ndarray, speed_mm_s: float, file: int, seed: int
 ) -> np.ndarray:
     """Return the noise of one trace's samples in N, shape (n,): white, autocorrelated and proportional.
 
