@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path, PurePosixPath
 
 from sealfit.config import AGING_CONDITION
@@ -13,7 +12,7 @@ from sealfit.draft.vocabulary import UNAGED, Unit, name_and_unit, setting
 from sealfit.errors import BadFile
 from sealfit.ingest.files import as_number, split_line
 from sealfit.ingest.listing import RUNS_CSV
-from sealfit.ingest.start_times import excel_time
+from sealfit.ingest.start_times import time_of
 
 NAMING = 0.5
 """Share of a column's cells that must be names of trace files: a log may list tests that were not kept."""
@@ -106,18 +105,10 @@ def _fits(meaning: str, column: Sequence[str]) -> bool:
     if not full:
         return False
     if meaning == "started_at":
-        return all(_is_iso(cell) or excel_time(cell.replace(",", ".")) for cell in full)
+        return all(time_of(cell.replace(",", ".")) for cell in full)
     if meaning in ("specimen_id", "run_id", "rubber", "file"):
         return True
     if meaning in AGING_CONDITION:  # the words for unaged rubber
         full = [cell for cell in full if cell.lower() not in UNAGED]
     numbers = [cell for cell in full if as_number(cell) is not None or as_number(cell, ",") is not None]
     return len(numbers) > 0.8 * len(full)
-
-
-def _is_iso(cell: str) -> bool:
-    try:
-        datetime.fromisoformat(cell)
-    except ValueError:
-        return False
-    return True

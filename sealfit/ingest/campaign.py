@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -39,6 +38,7 @@ from sealfit.ingest.stored_parts import (
 from sealfit.progress import timed
 from sealfit.store.manifest import Fingerprint, Fingerprints, fingerprint
 from sealfit.store.parquet import spelled_out
+from sealfit.store.staged_writes import file_size
 from sealfit.tables import RUNS, STEADY
 
 # ---------------------------------------------------------------- inputs
@@ -201,18 +201,11 @@ def ingest_campaign(
 def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndarray]:
     """Return the files of each part, by their numbers in the listing."""
     sizes = [
-        _size(os.path.join(campaign, file)) if marks[file].size is None else marks[file].size
+        marks[file].size or file_size(f"{campaign}/{file}") or 0  # 0: reading it will say why
         for file in listing.files
     ]
     plan = plan_parts(listing.conditions, listing.columns["run_id"], sizes)
     return [np.array(files) for files in plan]
-
-
-def _size(path: str) -> int:
-    try:
-        return os.stat(path).st_size
-    except OSError:  # reading it will say why
-        return 0
 
 
 def _known_parts(

@@ -272,12 +272,8 @@ def _named_columns(table: pa.Table, layout: Layout) -> dict[int, np.ndarray] | N
     return columns
 
 
-def _is_number(kind: pa.DataType) -> bool:
-    return pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_null(kind)
-
-
 def _column(column: pa.ChunkedArray) -> np.ndarray:
-    if _is_number(column.type):
+    if pa.types.is_floating(column.type) or pa.types.is_integer(column.type) or pa.types.is_null(column.type):
         return column.cast(pa.float64(), safe=False).to_numpy()  # a whole number beyond 2**53 is rounded
     cells = column.cast(pa.string()).to_pylist()
     return np.array([(cell or "").strip() or None for cell in cells], dtype=object)

@@ -68,17 +68,14 @@ def with_day_0(columns: Columns, config: Config) -> Columns:
         return columns
     changed = {"aging_days": put(days, dict.fromkeys(np.flatnonzero(said).tolist(), 0.0))}
     for name in others:
-        words = where(columns[name], _is_word if name in _AGED_ONLY else _means_unaged)
+        is_word = (lambda cell: math.isnan(_number(cell))) if name in _AGED_ONLY else _means_unaged
+        words = where(columns[name], is_word)
         changed[name] = put(columns[name], dict.fromkeys(np.flatnonzero(unaged & words).tolist()))
     return columns | changed
 
 
 def _means_unaged(cell: float | str) -> bool:
     return isinstance(cell, str) and cell.strip().lower() in UNAGED_WORDS
-
-
-def _is_word(cell: float | str) -> bool:
-    return math.isnan(_number(cell))
 
 
 def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
@@ -107,7 +104,7 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
         values = np.broadcast_to(values, len(entries)).astype(float)
         whole = np.ones(len(entries), bool)  # files with a value in every column that is read
         for cells in read.values():
-            whole &= where(cells, _is_fine)
+            whole &= where(cells, lambda value: isinstance(value, str) or math.isfinite(value))
         reason = f'is computed as "{text}", which is no number here.'
         fix = "Correct the cells that it reads, or the expression."
         wrong = np.flatnonzero(whole & ~np.isfinite(values)).tolist()
@@ -127,10 +124,6 @@ def _refuse_words(entries: list[Entry], column: str, cells: Sequence, computed: 
         reason = f"is not a number, and runs.compute.{computed} reads it."
         fault = entries[words[0]].fault("not_a_number", reason, column, value=cells[words[0]])
         raise CampaignError([replace(fault, action="stopped", fix="Correct the cell, or leave it empty.")])
-
-
-def _is_fine(value: float | str) -> bool:
-    return isinstance(value, str) or math.isfinite(value)
 
 
 def _as_array(column: Column) -> np.ndarray:

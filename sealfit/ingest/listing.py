@@ -148,7 +148,8 @@ def read_table(
     # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
     if delimiter != ",":
         columns = {name: mapped(column, _decimal_point) for name, column in columns.items()}
-    columns = {name: column if name == needed else mapped(column, _said) for name, column in columns.items()}
+    for name in columns.keys() - {needed}:
+        columns[name] = [None if cell is None or cell.lower() in MISSING else cell for cell in columns[name]]
     return lines, columns, faults + found
 
 
@@ -161,10 +162,6 @@ def _lines(text: bytes) -> Iterator[tuple[int, str]]:
 
 def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in split_line(line, delimiter)]
-
-
-def _said(cell: str) -> str | None:
-    return None if cell.lower() in MISSING else cell
 
 
 def _decimal_point(cell: str) -> str:

@@ -82,7 +82,10 @@ def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[i
     parts: list[list[int]] = [[]]
     filled = 0.0
     for condition, of_run in sorted(whole.items()):
-        weights = {run: _weight(files, sizes) for run, files in of_run.items()}
+        weights = {  # how much of a part the files of each run fill
+            run: max(len(files) / PART_FILES, sum(sizes[i] for i in files) / PART_BYTES)
+            for run, files in of_run.items()
+        }
         total = sum(weights.values())
         if filled >= LEAST and filled + total > MOST:
             parts.append([])
@@ -97,11 +100,6 @@ def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[i
             parts.append([])
             filled = 0.0
     return [sorted(part) for part in parts if part]
-
-
-def _weight(files: Sequence[int], sizes: Sequence[int]) -> float:
-    """Return how much of a part these files fill."""
-    return max(len(files) / PART_FILES, sum(sizes[i] for i in files) / PART_BYTES)
 
 
 def _cut(name: str, weight: float) -> bool:

@@ -61,7 +61,7 @@ def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[C
         return columns, []
     formats = config.files.date_format
     texts = mapped(columns["started_at"], lambda value: str(value).strip())
-    read = {text: _time(text, formats) for text in set(texts) if text is not None}
+    read = {text: time_of(text, formats) for text in set(texts) if text is not None}
     times = mapped(texts, read.__getitem__)
     faults = [
         entries[i].fault("not_a_time", _reason(formats), "started_at", value=text, fix=_fix(text))
@@ -90,7 +90,7 @@ def _with_none(values: pd.Series) -> Column:
     return [None if math.isnan(value) else value for value in values.tolist()]
 
 
-def _time(text: str, formats: Sequence[str]) -> datetime | None:
+def time_of(text: str, formats: Sequence[str] = ()) -> datetime | None:
     """Return the time by the first format that fits, else ISO 8601, else Excel's serial number, or None."""
     in_formats = (_read(datetime.strptime, text, one) for one in formats)
     return next(filter(None, in_formats), None) or _read(datetime.fromisoformat, text) or excel_time(text)

@@ -116,7 +116,10 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
     size = [stroke.stop - stroke.start for stroke in strokes]
     origin = np.array([stroke.origin for stroke in strokes])
     since = time_s[origin] if len(strokes) > 1 else np.zeros(1)
-    turns = [_turn_of(displacement[stroke.start : stroke.stop], config.strokes.turn) for stroke in strokes]
+    turn, turns = config.strokes.turn, np.zeros(len(strokes))  # where the turn of each stroke begins
+    if turn is not None:
+        middle = [np.median(displacement[stroke.start : stroke.stop]) for stroke in strokes]
+        turns = turn * np.floor(np.array(middle) / turn)
     return {
         "stroke": np.repeat([stroke.number for stroke in strokes], size),
         "time_s": time_s - np.repeat(since, size),
@@ -129,11 +132,6 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         "distance_mm": np.abs(displacement - np.repeat(displacement[origin], size)),
         **{name: values for name, values in trace.columns.items() if name not in SLOTS},
     }
-
-
-def _turn_of(displacement_mm: np.ndarray, turn: float | None) -> float:
-    """Return the displacement at which the turn of a stroke begins; 0 without turns."""
-    return 0.0 if turn is None else turn * float(np.floor(np.median(displacement_mm) / turn))
 
 
 def _stroke_rows(

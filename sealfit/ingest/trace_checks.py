@@ -220,12 +220,12 @@ def speed_fault(
     mean, plateau = (factor * speed for speed in measured_speed(time_s, displacement_mm))
     if not (0 < plateau < math.inf and mean < math.inf):  # nothing moves: said where strokes are sought
         return None
-    measured = _nearest(commanded, mean, plateau)
+    measured = sorted((commanded, mean, plateau))[1]  # between the two, nearest to the commanded one
     if abs(measured / commanded - 1) <= tolerance:
         return None
     of_means = [factor * speed for speed in _speeds_of_means(time_s, displacement_mm)]
     if np.isfinite(of_means).all():
-        measured = _nearest(commanded, *of_means)
+        measured = sorted((commanded, *of_means))[1]
     ratio = measured / commanded
     if abs(ratio - 1) <= tolerance:
         return None
@@ -243,11 +243,6 @@ def speed_fault(
     first = f"Is the unit in the rig config right ({', '.join(declared)})? " if declared else ""
     fix = first + _mix_up(ratio, time_s, displacement_mm, tolerance)
     return Fault("speed_disagreement", reason, action="file left out", fix=fix, **place)
-
-
-def _nearest(commanded: float, mean: float, plateau: float) -> float:
-    """Return what lies between the mean and the plateau speed and nearest to the commanded one."""
-    return min(max(commanded, min(mean, plateau)), max(mean, plateau))
 
 
 def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:

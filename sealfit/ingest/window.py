@@ -386,7 +386,7 @@ class _Motion:
         ramp = max(took - 1.7 * self.half * step, 0.0)
         half_way = still + int(np.argmax(self.speed[still : arrived + 1] >= 0.5 * self.plateau))
         shape = took / max(float(time_s[half_way] - time_s[still]), step)
-        after = _after_ramp(shape) * ramp
+        after = np.interp(shape, *zip(STRAIGHT, LAG, strict=True)) * ramp
         return int(time_s.searchsorted(time_s[arrived] + after)) + self.half // 3 + 1
 
     def stop_begin(self, first: int, last: int) -> int:
@@ -403,12 +403,6 @@ class _Motion:
         step = float(time_s[last - 1] - time_s[first]) / max(last - 1 - first, 1)
         brake = max(float(time_s[stopped] - time_s[left]) - 1.7 * self.half * step, 0.0)
         return int(time_s.searchsorted(time_s[left] - BEFORE_STOP * brake)) - self.half // 3
-
-
-def _after_ramp(shape: float) -> float:
-    """Return how much of the ramp follows 90 % of the plateau, from the times to 90 % and to 50 % of it."""
-    (low, least), (high, most) = STRAIGHT, LAG
-    return least + (most - least) / (high - low) * (min(max(shape, low), high) - low)
 
 
 def _first(mask: np.ndarray) -> int | None:
