@@ -101,27 +101,31 @@ def name_parts(
     """
     texts: dict[str, str] = {}
     values: dict[str, float | str] = {}
+
+    def say(name: str, text: str, value: float | str) -> None:
+        if name in conversions and isinstance(value, float):
+            value = conversions[name].of_cell(value)
+            text = f"{value:.12g}"
+        texts[name], values[name] = text, value
+
     if settings.name_pattern is not None:
         match = found_by(settings.name_pattern, file, whole=True)
         if match is None:
             return None
         for name, text in match.groupdict(default="").items():
-            mapped = settings.values.get(name, {}).get(text)
-            if mapped is None:
-                texts[name] = text
-                values[name] = text if name in TEXT_COLUMNS or name in settings.text_parts else _value(text)
+            known = settings.values.get(name, {})
+            mapped = known.get(text, text)
+            if isinstance(mapped, int | float):
+                say(name, f"{mapped:g}", float(mapped))
             else:
-                texts[name] = f"{mapped:g}" if isinstance(mapped, int | float) else mapped
-                values[name] = float(mapped) if isinstance(mapped, int | float) else mapped
-            _convert(name, texts, values, conversions)
+                stays = text in known or name in (*TEXT_COLUMNS, *settings.text_parts)
+                say(name, mapped, mapped if stays else _value(mapped))
     for name, expression in settings.compute.items():
-        values[name] = float(evaluate(parse(expression), values))
-        texts[name] = f"{values[name]:g}"
-        _convert(name, texts, values, conversions)
+        value = float(evaluate(parse(expression), values))
+        say(name, f"{value:g}", value)
     for name, template in settings.columns.items():
-        texts[name] = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
-        values[name] = texts[name] if name in TEXT_COLUMNS else _value(texts[name])
-        _convert(name, texts, values, conversions)
+        text = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
+        say(name, text, text if name in TEXT_COLUMNS else _value(text))
     return {name: value for name, value in values.items() if value != "" or name.startswith("_")}
 
 
@@ -180,13 +184,6 @@ def unmatched(file: str, pattern: str) -> tuple[str, str]:
 
 def _short(text: str) -> str:
     return f"'{shortened(text, 30)}'" if text else "nothing"
-
-
-def _convert(name: str, texts: dict[str, str], values: dict, conversions: Mapping[str, Conversion]) -> None:
-    """Change the number of a column to our unit, where the config gives the one that it is in."""
-    if name in conversions and isinstance(values[name], float):
-        values[name] = conversions[name].of_cell(values[name])
-        texts[name] = f"{values[name]:.12g}"
 
 
 def _value(text: str) -> float | str:
