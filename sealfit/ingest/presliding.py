@@ -223,7 +223,7 @@ def _explained(start: Start, length_mm: float) -> float:
 
 def _on_plateau(start: Start, begin_mm: float | None = None) -> Start:
     """Return a start from where the speed has reached its plateau, or from a later distance."""
-    begin_mm = begin_mm or start.plateau_mm
+    begin_mm = start.plateau_mm if begin_mm is None else begin_mm
     rows = slice(max(start.ramp_end, int(start.distance_mm.searchsorted(begin_mm))), None)
     return Start(start.distance_mm[rows] - begin_mm, start.force_N[rows], 0)
 
