@@ -104,12 +104,10 @@ def rate_in(headers: Sequence[Sequence[str]], decimal: str) -> tuple[float, str]
         match = _LINE.match(line)
         size = _SIZE.match(match["value"]) if match else None
         value = as_number(size.group(), decimal or ".") if size else None
-        if (
-            not value
-            or value < 0
-            or len(set(_found(_after(match["key"], f"({_SIZE.pattern})"), headers))) > 1
-        ):
+        if not value or value < 0:
             continue
+        if len(set(_found(_after(match["key"], f"({_SIZE.pattern})"), headers))) > 1:
+            continue  # files differ
         words, unit = plain(match["key"]), name_and_unit(match["key"])[1]
         unit = unit or unit_of(match["value"][size.end() :].strip(' ;,\t"'))
         if _RATE.search(words):

@@ -173,7 +173,7 @@ def column_keys(
     if helpers:
         evidence = "read for the columns computed below, no channels of their own"
         notes.guess("trace.drop_columns", helpers, evidence)
-    _other_columns(found, roles, clock[1] if clock is not None else "", notes)
+    _other_columns(found, roles, clock or "", notes)
 
 
 def _evidence(column: Column, role: str, roles: Roles, read: int) -> str:
@@ -240,21 +240,24 @@ def _rotation(angle: Unit, source: str, notes: Notes) -> None:
     notes.doubt("strokes", reason, fix, (f"turn = {conversion('turn', angle.name)(1.0):.10g}",))
 
 
-def _clock_or_rate(found: Found, notes: Notes) -> tuple[int, str] | None:
-    """Add the first column of times of day, or the header's rate; return position (from 1, or 0) and name."""
+def _clock_or_rate(found: Found, notes: Notes) -> str | None:
+    """Add the first column of times of day, or the header's rate; None if there is neither.
+
+    The name of the column is returned, which may be empty.
+    """
     one = found.dialect
     for i, cell in enumerate(split_line(one.first, one.delimiter)):
         if i not in one.numbers and seconds_of_day([cell]) is not None:
             name = one.names[i] if i < len(one.names) and one.names_are_cells else ""
             evidence = f"column {i + 1} '{name}': times of day; seconds count from the first"
             notes.guess("trace.columns.time_s", name or i + 1, evidence)
-            return i + 1, name
+            return name
     rate = rate_in([one.header for one in found.sniffed], one.decimal)
     if rate is None:
         return None
     evidence = f"no column of time; rows per second by the header of every file looked at: '{rate[1]}'"
     notes.guess("trace.rate_Hz", rate[0], evidence)
-    return 0, ""
+    return ""
 
 
 def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:

@@ -95,14 +95,20 @@ def suggestion(name: str, known: Sequence[str]) -> str:
     return f"The columns are {shortened(names, LONGEST_LIST)}." if names else ""
 
 
+BY_RATE = "give the rows per second as rate_Hz under [trace]"
+BY_SPEED = "integrate it from a speed column"
+
+
 def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
     """Raise `BadFile` if, after everything is computed, a slot that every trace needs is not there."""
-    missing = [name for name in SLOTS[:3] if name not in table]
-    fix = "Name it under [trace.columns], compute it under [trace.compute], {}."
-    end = {"time_s": "or give the rows per second as rate_Hz under [trace]"}
-    ends = {name: fix.format(end.get(name, "or integrate it from a speed column")) for name in missing}
-    if missing:
-        raise BadFile(*(missing_column(name, layout, file, text) for name, text in ends.items()))
+    found = []
+    for name in SLOTS[:3]:
+        if name not in table:
+            last = BY_RATE if name == "time_s" else BY_SPEED
+            fix = f"Name it under [trace.columns], compute it under [trace.compute], or {last}."
+            found.append(missing_column(name, layout, file, fix))
+    if found:
+        raise BadFile(*found)
 
 
 def missing_column(column: str | int, layout: Layout, file: str, fix: str, reason: str = NO_COLUMN) -> Fault:
