@@ -122,8 +122,8 @@ def rise_of(start: Start) -> Rise:
     Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a
     force that warming lets fall, is not. With much damping of the bristles (sigma_1) a fast stroke's force
     comes up at once, to more than its level, and falls to it by the same law; then the fall from its peak is
-    what has to be over. Where something is left in the window, a strong wave, such as a ripple, is taken out
-    first.
+    what has to be over. A strong wave, such as a ripple, is taken out of a stroke if the rise takes more than
+    a third of it.
 
     Notes
     -----
@@ -136,12 +136,13 @@ def rise_of(start: Start) -> Rise:
     >>> 5.1 < end < 5.8
     True
     """
-    rise = _rise_or_fall(start)
-    if rise.length_mm > 0.0 and rise.end_mm >= 0.99 * SETTLED * rise.length_mm:
+    rise, length = _rise_or_fall(start), float(start.distance_mm[-1])
+    if 0.0 < SETTLED * rise.length_mm < length / 3.0:
         return rise
-    late = int(start.distance_mm.searchsorted(EARLY[1] * start.distance_mm[-1]))
+    late = int(start.distance_mm.searchsorted(EARLY[1] * length))
     wave = strong_wave(start.distance_mm, start.force_N, late)
-    return _rise_or_fall(start._replace(force_N=start.force_N - wave)) if wave.any() else rise
+    without = _rise_or_fall(start._replace(force_N=start.force_N - wave)) if wave.any() else rise
+    return without if SETTLED * without.length_mm >= length / 3.0 else rise
 
 
 def _rise_or_fall(start: Start) -> Rise:
