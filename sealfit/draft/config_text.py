@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sealfit.draft.columns import Column
-from sealfit.draft.header_lines import When
+from sealfit.draft.dialect import When
 from sealfit.draft.vocabulary import Unit
 from sealfit.units import Units
 

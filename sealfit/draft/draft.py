@@ -11,8 +11,7 @@ from sealfit.draft import run_keys, trace_keys
 from sealfit.draft.columns import columns_of, find_roles
 from sealfit.draft.config_text import Doubt, Guess, Notes, config_text
 from sealfit.draft.file_names import read_names
-from sealfit.draft.files_found import look, read_tables
-from sealfit.draft.runs_table import find_table
+from sealfit.draft.files_found import find_table, look, read_tables
 from sealfit.errors import RequestError
 
 SHOWN = (

@@ -8,12 +8,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sealfit.draft import motion
-from sealfit.draft.columns import BY_BEHAVIOUR, Column, Roles
+from sealfit.draft.columns import (
+    BY_BEHAVIOUR,
+    Column,
+    Roles,
+    mean_speed,
+    plateau_speeds,
+    rises,
+    several_speeds,
+    stroke_count,
+)
 from sealfit.draft.config_text import Notes, column_guesses, date_lines, file_column
-from sealfit.draft.dialect import STRAYS
+from sealfit.draft.dialect import STRAYS, rate_in, settings_in, started_in
 from sealfit.draft.files_found import Found
-from sealfit.draft.header_lines import rate_in, settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
@@ -302,7 +309,7 @@ def _other_columns(found: Found, roles: Roles, clock: str, notes: Notes) -> None
 
 def _channel(column: Column, taken: set[str]) -> str:
     """Return a name for a column as a channel, none of those taken; "" for a ratio, a counter or a copy."""
-    if column.copy_of or column.role not in CHANNELS or all(motion.rises(values) for values in column.values):
+    if column.copy_of or column.role not in CHANNELS or all(rises(values) for values in column.values):
         return ""
     unit = f"_{column.unit.suffix}" if column.unit is not None else ""
     label = "_".join(plain(name_and_unit(column.label)[0]).split())
@@ -387,12 +394,12 @@ def motion_keys(
     strokes: dict[str, list[list[float]]] = {}
     for i, file in enumerate(files):
         if roles.displacement is None:
-            strokes[file] = [[motion.mean_speed(roles.speed.values[i])]]
+            strokes[file] = [[mean_speed(roles.speed.values[i])]]
             continue
         time, displacement = in_s(roles.time.values[i]), in_mm(roles.displacement.values[i])
-        strokes[file] = motion.plateau_speeds(time, displacement)
+        strokes[file] = plateau_speeds(time, displacement)
     speeds = {file: [speed for stroke in found for speed in stroke] for file, found in strokes.items()}
-    several = {file: found for file, all_ in speeds.items() if (found := motion.several_speeds(all_))}
+    several = {file: found for file, all_ in speeds.items() if (found := several_speeds(all_))}
     steps = {file: found for file, found in several.items() if max(map(len, strokes[file])) > 1}
     if steps:
         evidence = f"several steady speeds in a stroke, {_shown_speeds(steps, files)}: each is a stroke"
@@ -421,6 +428,6 @@ def motion_words(roles: Roles) -> str:
     """Return what the motion is like, for the summary."""
     strokes = 1
     if roles.displacement is not None:
-        strokes = int(np.median([motion.stroke_count(values) for values in roles.displacement.values]))
+        strokes = int(np.median([stroke_count(values) for values in roles.displacement.values]))
     many = "one stroke" if strokes == 1 else f"about {strokes} strokes"
     return f"{many} in a file, {'both ways' if roles.both_ways else 'one way'}"

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sealfit.config import parse_config
-from sealfit.draft import motion
+from sealfit.draft.columns import plateau_speeds, stroke_count
 from sealfit.draft.dialect import sniff, sniffed_delimiter
 from sealfit.draft.draft import draft
 from sealfit.draft.vocabulary import AFTER, UNITS, column_role, name_and_unit, setting
@@ -157,9 +157,9 @@ def test_strokes_of_a_file_at_different_speeds_are_a_doubt(tmp_path):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_strokes_are_counted(strokes, sign):
     (one,) = exports.records(days=(1,), speeds=(5.0,), repeats=(1,), strokes=strokes)
-    assert motion.stroke_count(sign * one.displacement_mm) == strokes
+    assert stroke_count(sign * one.displacement_mm) == strokes
     expected = [5.0 * sign * (-1) ** i for i in range(strokes)]
-    found = motion.plateau_speeds(one.time_s, sign * one.displacement_mm)
+    found = plateau_speeds(one.time_s, sign * one.displacement_mm)
     assert [len(speeds) for speeds in found] == [1] * strokes
     assert [speed for (speed,) in found] == pytest.approx(expected, rel=0.05)
 
