@@ -18,7 +18,7 @@ from sealfit.errors import BadFile, RequestError
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
 from sealfit.ingest.listing import RUNS_CSV, natural
-from sealfit.ingest.start_times import time_of
+from sealfit.ingest.runs import time_of
 from sealfit.ingest.workbooks import LONGEST, read_sheet
 
 SNIFFED = 24

@@ -21,7 +21,7 @@ from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import channels_of, name_parts
 from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import RUNS_CSV, natural
-from sealfit.ingest.start_times import excel_time, usual_formats
+from sealfit.ingest.runs import excel_time, usual_formats
 from sealfit.units import Units, conversion
 
 NO_CONDITION = {

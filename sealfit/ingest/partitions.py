@@ -15,11 +15,10 @@ import pyarrow as pa
 
 from sealfit.config import Config
 from sealfit.errors import Fault
-from sealfit.ingest.averages import bin_table, mean_traces
+from sealfit.ingest.averages import ALONG, FileStrokes, bin_table, mean_traces, read_strokes
 from sealfit.ingest.categorical import columns_of, condition_columns, keys_of
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.files import as_number
-from sealfit.ingest.stroke_means import ALONG, FileStrokes, read_strokes
 from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints
 from sealfit.store.parquet import as_dictionary, to_arrow
