@@ -13,8 +13,7 @@ from sealfit.closure.intervals import degrees_of_freedom, t_quantile
 from sealfit.config import Config
 from sealfit.fit.aging.all_series import joint_laws
 from sealfit.fit.aging.law import search_limits
-from sealfit.fit.aging.law_profiles import CurveInterval
-from sealfit.fit.aging.law_table import Curve, Estimate, covariance_rows, law_rows, without_law
+from sealfit.fit.aging.law_table import Curve, CurveInterval, Estimate, covariance_rows, law_rows, without_law
 from sealfit.fit.aging.series import CURVE_POINTS, aging_curves, fit_series
 from sealfit.fit.dynamic.fit import fit_dynamic
 from sealfit.fit.joint.declared import series_of_curve

@@ -12,7 +12,7 @@ from sealfit.effects import EFFECTS
 from sealfit.fit.joint.estimate import fit, fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
-from sealfit.fit.joint.start import start_model
+from sealfit.fit.joint.search import start_model
 
 
 def test_curves_go_both_ways_over_the_speeds_of_each_condition_at_its_mean_load():

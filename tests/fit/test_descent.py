@@ -18,8 +18,8 @@ from sealfit.fit.joint.search import (
     least_squares_within,
     search_nonlinear,
     solve_linear,
+    start_model,
 )
-from sealfit.fit.joint.start import start_model
 from sealfit.fit.joint.whitening import Component, Scatter
 
 SCATTER = Scatter(

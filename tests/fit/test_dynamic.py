@@ -10,8 +10,8 @@ import pytest
 from sealfit.config import load_config
 from sealfit.fit.dynamic.bristle_model import Curve, Stroke
 from sealfit.fit.dynamic.fit import fit_dynamic
+from sealfit.fit.dynamic.presliding import fit_stiffness
 from sealfit.fit.dynamic.starts import starts_of, strokes_along
-from sealfit.fit.dynamic.stiffness import fit_stiffness
 from sealfit.fit.steady.fit import fit_conditions
 from sealfit.fit.stored_tables import whole_steady_fit
 from sealfit.ingest import partitions

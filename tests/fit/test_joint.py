@@ -11,7 +11,7 @@ from sealfit.fit.joint.declared import declare, speed_clusters
 from sealfit.fit.joint.estimate import _searched, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
 from sealfit.fit.joint.rows import make_rows, thin
-from sealfit.fit.joint.start import start_model
+from sealfit.fit.joint.search import start_model
 
 WAVE = Effect(
     id="wave",

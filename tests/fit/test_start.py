@@ -5,9 +5,9 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.fit.joint import start
+from sealfit.fit.joint import search
 from sealfit.fit.joint.rows import make_rows
-from sealfit.fit.joint.start import pairs_and_shared, start_model
+from sealfit.fit.joint.search import pairs_and_shared, start_model
 
 
 def _dense(columns, code, shared, values):
@@ -47,8 +47,8 @@ def test_series_that_start_together_are_solved_once(monkeypatch):
     rows = make_rows(bins_helpers.make_bins(temperatures=(40.0, 60.0, 80.0), bins=4), has_aging=True)
     one_by_one = start_model(rows)
     solved = []
-    whole = start._per_condition
-    monkeypatch.setattr(start, "_per_condition", lambda *given: solved.append(given[3]) or whole(*given))
+    whole = search._per_condition
+    monkeypatch.setattr(search, "_per_condition", lambda *given: solved.append(given[3]) or whole(*given))
     together = start_model(rows, together=True)
     assert [np.unique(conditions).size for conditions in solved] == [
         13

@@ -12,13 +12,14 @@ from scipy.sparse import csr_array, diags_array
 
 from sealfit.config import Config
 from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
-from sealfit.fit.aging.law_profiles import curve_errors, curve_intervals
 from sealfit.fit.aging.law_table import (
     DAYS_FOR_LAW,
     Curve,
     Estimate,
     OneQuantity,
     covariance_rows,
+    curve_errors,
+    curve_intervals,
     law_rows,
     statistics_rows,
     t_of_95,

@@ -11,10 +11,9 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
-from sealfit.fit.dynamic.breakaway import break_away_rows, largest_rows, peaks
 from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke, mean_over
+from sealfit.fit.dynamic.presliding import Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
 from sealfit.fit.dynamic.starts import Along, Part, Start, starts_of, strokes_along, whole_strokes
-from sealfit.fit.dynamic.stiffness import Stiffness, fit_stiffness
 from sealfit.fit.joint.rows import nesting_run
 from sealfit.fit.steady.fit import condition_keys, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces

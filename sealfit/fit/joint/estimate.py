@@ -21,8 +21,7 @@ from sealfit.fit.joint.prior import (
     smoothed,
 )
 from sealfit.fit.joint.rows import Cache, Rows
-from sealfit.fit.joint.search import descend, search_nonlinear
-from sealfit.fit.joint.start import start_model
+from sealfit.fit.joint.search import descend, search_nonlinear, start_model
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import estimate_components, estimate_scatter
 from sealfit.fit.joint.whitening import Scatter, Whitening

@@ -25,7 +25,7 @@ from scipy.special import fdtrc
 
 from sealfit.fit.aging.series import PAIRS, steady_covariance, values_of
 from sealfit.fit.joint.declared import series_of_curve
-from sealfit.fit.joint.start import pairs_and_shared
+from sealfit.fit.joint.search import pairs_and_shared
 from sealfit.fit.least_squares import covariance_of, even_grid
 from sealfit.fit.steady.condition import FULL, Condition
 from sealfit.fit.steady.fit import FORCES, solve_conditions
