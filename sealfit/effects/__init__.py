@@ -5,10 +5,10 @@ number of parameters depends on the data; `sealfit.effects.user` reads the effec
 describes an effect.
 """
 
-from sealfit.effects import aging_laws, closed_forms, history, products, sensors, sliding, warming
+from sealfit.effects import aging_laws, closed_forms, sensors, sliding, warming
 from sealfit.effects.contract import Effect
 
-FAMILIES = (warming, sensors, history, sliding, aging_laws, closed_forms, products)
+FAMILIES = (warming, sensors, sliding, aging_laws, closed_forms)
 
 EFFECTS = {
     effect.id: effect for family in FAMILIES for effect in vars(family).values() if isinstance(effect, Effect)

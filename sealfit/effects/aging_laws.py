@@ -12,6 +12,10 @@ GAS_CONSTANT = 8.314462618
 ZERO_C = 273.15
 # Standard laboratory temperature of rubber tests in degrees Celsius, ISO 23529.
 STANDARD_C = 23.0
+# Targets of laws over the days of aging, most likely first.
+ON_COEFFICIENTS = (
+    ("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply"),
+)  # fmt: skip
 
 
 def arrhenius_aging_shape(inputs, *, A, E):
@@ -133,13 +137,7 @@ AGING_FLOOR = Effect(
     form="A ln(max(1, t / t_f))",
     reference="no more than {t_f} days",
     reads=("aging_days",),
-    acts_on=(
-        ("mu", "multiply"),
-        ("mu_c", "add"),
-        ("mu_s", "add"),
-        ("mu_c", "multiply"),
-        ("mu_s", "multiply"),
-    ),
+    acts_on=ON_COEFFICIENTS,
     parameters=(
         Parameter("A", "{y}", 0.03, (-10.0, 10.0), "fall given back per factor e of the time", linear=True),
         Parameter("t_f", "{x}", 8.0, (1e-3, 1e5), "day from which it is given back", search="inside"),
@@ -173,13 +171,7 @@ AGING_INDUCTION = Effect(
     form="A (t / t_i) exp(1 - t / t_i)",
     reference="unaged",
     reads=("aging_days",),
-    acts_on=(
-        ("mu", "multiply"),
-        ("mu_c", "add"),
-        ("mu_s", "add"),
-        ("mu_c", "multiply"),
-        ("mu_s", "multiply"),
-    ),
+    acts_on=ON_COEFFICIENTS,
     parameters=(
         Parameter("A", "{y}", 0.05, (-10.0, 10.0), "largest lag behind the logarithmic law", linear=True),
         Parameter("t_i", "{x}", 2.0, (1e-3, 1e5), "day of the largest lag", search="inside"),
@@ -213,13 +205,7 @@ AGING_DELAY = Effect(
     equation=r"h = A [\ln(1 + t / b) - \ln(1 + \max(t - t_i, 0) / b)]",
     form="A (ln(1 + t / b) - ln(1 + max(t - t_i, 0) / b))",
     reads=("aging_days",),
-    acts_on=(
-        ("mu", "multiply"),
-        ("mu_c", "add"),
-        ("mu_s", "add"),
-        ("mu_c", "multiply"),
-        ("mu_s", "multiply"),
-    ),
+    acts_on=ON_COEFFICIENTS,
     parameters=(
         Parameter("A", "{y}", 0.05, (-10.0, 10.0), "loss for each unit of the logarithm", linear=True),
         Parameter("t_i", "{x}", 2.0, (1e-3, 1e5), "day on which aging starts", search="inside"),

@@ -44,6 +44,8 @@ ANYWHERE: tuple[tuple[Target, Operation], ...] = (
     ("mu_s", "add"),
     ("mu_c", "add"),
 )
+# Targets of the climate of the room.
+ROOM = ANYWHERE[:5]
 
 
 @dataclass(frozen=True, slots=True)

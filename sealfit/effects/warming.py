@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, reference
+from sealfit.effects.contract import AMPLITUDE, ROOM, Effect, Parameter, reference
 
 
 def warming_time_shape(inputs, *, A, tau):
@@ -260,13 +260,7 @@ LAB_TEMPERATURE = Effect(
     form="A (T - T_ref)",
     reference="{lab_temperature_C} = {lab_temperature_C_ref}",
     reads=("lab_temperature_C",),
-    acts_on=(
-        ("mu", "multiply"),
-        ("force", "add"),
-        ("force", "multiply"),
-        ("mu_s", "multiply"),
-        ("mu_c", "multiply"),
-    ),
+    acts_on=ROOM,
     parameters=(Parameter("A", "{y}/{x}", -0.005, AMPLITUDE, "change per degree", linear=True),),
     shape=lab_temperature_shape,
     source="Friction and temperature of rubber: Grosch 1963, Proc. R. Soc. A 274, 21-39, "
