@@ -28,11 +28,11 @@ from sealfit.closure.after import after_fits
 from sealfit.closure.loop import close_loop
 from sealfit.config import load_config
 from sealfit.engine import one_thread
+from sealfit.fit.aging import fit_series
 from sealfit.fit.aging.all_series import law_of
 from sealfit.fit.aging.lifetime import Goal, lifetime, over_laws
-from sealfit.fit.aging.series import fit_series
-from sealfit.fit.joint.estimate import Fitted
-from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.joint import Fitted
+from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.simulation import Spec, load_truth, simulate, truth_path
 

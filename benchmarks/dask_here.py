@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from sealfit.engine.cluster import Cluster
+from sealfit.engine.run_map import Cluster
 from sealfit.errors import RequestError
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -24,7 +24,7 @@ from sealfit.closure.ripple_selection import numbered
 from sealfit.closure.score_test import project
 from sealfit.closure.subsampling import merged_bins
 from sealfit.config import load_config
-from sealfit.fit.joint.estimate import fitted_at
+from sealfit.fit.joint import fitted_at
 from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import Rows, make_rows
 from sealfit.fit.joint.whitening import Component, Scatter

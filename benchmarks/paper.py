@@ -29,7 +29,7 @@ from sealfit.report.notation import count
 from sealfit.report.style import compose, look
 from sealfit.simulation import simulate
 from sealfit.simulation.model import Growth, Physics
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 # Published: 0.835 and 0.822 at 60 degC without and with compression to 80 %, where unaged rubber has 0.93513:
 # the loss is 0.885 of that at 80 %. 35.1 N of 49.4 N are left at 80 degC, 0.70319 of 0.93513 at 60 degC: the

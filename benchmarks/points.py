@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import evaluate
 from sealfit.fit.joint.rows import Rows, point_rows
 from sealfit.simulation import Spec
-from sealfit.simulation.channels import CategoryChannel, NumericChannel, SlowChannel
+from sealfit.simulation.noise import CategoryChannel, NumericChannel, SlowChannel
 
 # Share of the aged points at days between the tested ones.
 BETWEEN = 0.5

@@ -30,7 +30,7 @@ from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.config import load_config
 from sealfit.errors import SealfitError
-from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
 
 LOAD, SIGMA_0, SIGMA_2, V_S = 49.03, 100.0, 0.05, 5.0

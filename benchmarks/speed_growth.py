@@ -38,11 +38,11 @@ import pandas as pd
 from sealfit.config import Config
 steady, fit, step = pd.read_parquet(sys.argv[1]), sys.argv[2], sys.argv[3]
 if step == "fit-steady":
-    from sealfit.fit.steady.fit import fit_conditions
+    from sealfit.fit.steady import fit_conditions
     fit_conditions(steady, Config()).to_parquet(fit)
 else:
     from sealfit.fit.aging.all_series import joint_laws
-    from sealfit.fit.aging.series import aging_curves, fit_series
+    from sealfit.fit.aging import aging_curves, fit_series
     steady_fit = pd.read_parquet(fit)
     aging_curves(fit_series(steady_fit, Config()))
     joint_laws(steady, steady_fit, Config())

@@ -10,7 +10,7 @@ from pathlib import Path
 from in_turns import in_turns, ratios, show
 from process_tree import watched
 
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 HEAVY = ("numpy", "pandas", "scipy", "pyarrow", "pydantic", "jinja2", "matplotlib")
 SAMPLE = Path(__file__).parents[1] / "sample_data" / "simulated"

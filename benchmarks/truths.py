@@ -21,7 +21,7 @@ from sealfit.closure.result import channels_of, effect_level
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter
 from sealfit.effects.free import LEVELS, levels_effect
-from sealfit.fit.joint.estimate import Fitted, fit
+from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.model import Model, Term
 from sealfit.fit.joint.rows import Rows
 from sealfit.ingest.expression import evaluate, parse

@@ -202,7 +202,7 @@ def init(
 ) -> None:
     """Draft a rig config from a folder of files."""
     from sealfit import commands
-    from sealfit.draft.draft import summary_lines
+    from sealfit.draft import summary_lines
 
     end("init", commands.init(folder, output, force=force), summary_lines, as_json)
 

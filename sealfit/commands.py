@@ -12,9 +12,8 @@ from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault, OutError, RequestError, StaleError
 from sealfit.pipeline import FAULTY
 from sealfit.progress import Silent
-from sealfit.store import paths
+from sealfit.store import Store, paths
 from sealfit.store.manifest import ConfigCopy
-from sealfit.store.out_folder import Store
 from sealfit.store.paths import OPTION, existing_out, own_effects_folder, what_differs
 from sealfit.units import Units
 
@@ -36,7 +35,7 @@ def init(folder: Path, output: Path, *, force: bool = False) -> dict:
     RequestError
         If there is no such folder, or no trace file in it that is text.
     """
-    from sealfit.draft.draft import draft
+    from sealfit.draft import draft
 
     if output.suffix.lower() != ".toml":
         fix = "Give --output a name that ends in .toml."
@@ -199,7 +198,7 @@ def _laws_of(store: Store, asked: LifetimeRequest, model: str) -> tuple[list[Joi
 
 def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame], list[dict]]:
     """Return a model's table `steady`, the fit of its conditions, and the effects taken out of them."""
-    from sealfit.fit.stored_tables import whole_steady_fit
+    from sealfit.fit import whole_steady_fit
 
     if model == "before":
         store.require("fit-steady")

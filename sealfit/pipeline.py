@@ -12,9 +12,8 @@ from sealfit.engine import claim_memory
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault
 from sealfit.progress import Silent, timed
-from sealfit.store import manifest, paths
+from sealfit.store import Store, manifest, paths
 from sealfit.store.manifest import BATCH, STEPS, ConfigCopy, Properties, fingerprint
-from sealfit.store.out_folder import Store
 from sealfit.store.staged_writes import Staged
 
 if TYPE_CHECKING:
@@ -219,7 +218,7 @@ def _ingest(store: Store, staged: Staged, options: Options, progress: Silent) ->
 
 
 def _fit_steady(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
-    from sealfit.fit.steady.fit import fit_conditions
+    from sealfit.fit.steady import fit_conditions
 
     steady = store.read("steady")
     progress.say(f"fitting {steady['condition'].nunique()} conditions")
@@ -244,9 +243,9 @@ def _fit_properties(store: Store, staged: Staged, progress: Silent) -> Counted:
 def _fit_aging(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
     if store.state.properties is not None:
         return _fit_properties(store, staged, progress)
+    from sealfit.fit import whole_steady_fit
+    from sealfit.fit.aging import aging_curves, fit_series
     from sealfit.fit.aging.all_series import joint_laws
-    from sealfit.fit.aging.series import aging_curves, fit_series
-    from sealfit.fit.stored_tables import whole_steady_fit
 
     config = store.seen_config("fit-aging")
     no_law = "no aging_days in the condition: there is no aging law to fit"
@@ -260,8 +259,8 @@ def _fit_aging(store: Store, staged: Staged, options: Options, progress: Silent)
 
 
 def _fit_dynamic(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
-    from sealfit.fit.dynamic.fit import fit_dynamic
-    from sealfit.fit.stored_tables import whole_steady_fit
+    from sealfit.fit import whole_steady_fit
+    from sealfit.fit.dynamic import fit_dynamic
 
     progress.say("fitting the pre-sliding part")
     tables, config = (store.read("steady"), whole_steady_fit(store.read)), store.seen_config("fit-dynamic")
@@ -293,7 +292,7 @@ def _close_loop(store: Store, staged: Staged, options: Options, progress: Silent
 
 def _write(staged: Staged, tables: Mapping[str, pd.DataFrame]) -> None:
     """Write tables, those of a fit in the parts in which it is stored."""
-    from sealfit.fit.stored_tables import stored
+    from sealfit.fit import stored
 
     for name, table in tables.items():
         for part, rows in stored(name, table).items():

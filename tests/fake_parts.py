@@ -172,10 +172,10 @@ def put_in(monkeypatch):
     parts = Parts()
     places = {
         "sealfit.ingest.campaign": ["ingest_campaign", "Place"],
-        "sealfit.fit.steady.fit": ["fit_conditions"],
-        "sealfit.fit.aging.series": ["fit_series", "aging_curves"],
+        "sealfit.fit.steady": ["fit_conditions"],
+        "sealfit.fit.aging": ["fit_series", "aging_curves"],
         "sealfit.fit.aging.all_series": ["joint_laws"],
-        "sealfit.fit.dynamic.fit": ["fit_dynamic"],
+        "sealfit.fit.dynamic": ["fit_dynamic"],
         "sealfit.closure.after": ["after_fits"],
         "sealfit.closure.loop": ["close_loop"],
         "sealfit.closure.predict": ["predict"],

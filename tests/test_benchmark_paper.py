@@ -10,7 +10,7 @@ import pytest
 from paper_numbers import MEASURED, as_printed, compared, condition, printed_errors
 
 from sealfit.config import Config
-from sealfit.ingest.categorical import add_keys
+from sealfit.ingest.columns import add_keys
 
 
 def test_the_printed_prediction_of_mu_c_needs_another_start():

@@ -16,7 +16,7 @@ from process_tree import watched
 from speed_growth import DESIGNS, many_conditions
 
 from sealfit.config import load_config
-from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
 
 

@@ -17,14 +17,13 @@ pytest.importorskip("distributed")
 from dask_here import DaskHere
 
 from sealfit.closure import loop
-from sealfit.engine.cluster import Cluster
-from sealfit.engine.run_map import on_cluster, run_map
+from sealfit.engine.run_map import Cluster, on_cluster, run_map
 from sealfit.errors import RequestError, WorkerError
 from sealfit.ingest import partitions
 from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED, STEPS, run
 from sealfit.progress import Silent
 from sealfit.simulation import load_spec, simulate
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -91,7 +90,7 @@ def process_id(_):
 
 
 def test_an_answer_that_comes_as_the_wait_ends_is_taken(left_whole, monkeypatch):
-    monkeypatch.setattr("sealfit.engine.cluster.LOOK_S", 0.02)
+    monkeypatch.setattr("sealfit.engine.run_map.LOOK_S", 0.02)
     with on_cluster(str(left_whole.file)):
         assert list(run_map(answer_late, range(120), together=1)) == list(range(120))
         with pytest.raises(TimeoutError, match="too slow"):
@@ -120,7 +119,7 @@ def test_a_lost_scheduler_is_a_clear_error_wherever_it_is_missed(dask, tmp_path)
 
 
 def test_work_that_kills_every_worker_is_a_clear_error(dask, monkeypatch):
-    monkeypatch.setattr("sealfit.engine.cluster.ALONE_S", 3.0)
+    monkeypatch.setattr("sealfit.engine.run_map.ALONE_S", 3.0)
     with on_cluster(str(dask.file)), pytest.raises(WorkerError, match=r"no workers left.*start them again"):
         list(run_map(fatal, range(1)))
 
@@ -134,7 +133,7 @@ def test_a_folder_that_workers_do_not_see_is_refused(left_whole, tmp_path):
 
 
 def test_no_scheduler_is_a_clear_error(monkeypatch):
-    monkeypatch.setattr("sealfit.engine.cluster.CONNECT_S", 0.5)
+    monkeypatch.setattr("sealfit.engine.run_map.CONNECT_S", 0.5)
     with pytest.raises(RequestError, match=r"no Dask scheduler answers at tcp://127.0.0.1:1\. Start one"):
         Cluster("tcp://127.0.0.1:1")
 

@@ -3,7 +3,7 @@ import pytest
 
 from sealfit.config import Config
 from sealfit.errors import SealfitError
-from sealfit.ingest.categorical import add_keys, condition_columns
+from sealfit.ingest.columns import add_keys, condition_columns
 
 
 def keys(table, config=None):

@@ -9,7 +9,7 @@ import pytest
 from measured import emps_plateaus, kidney, kidney_plain, measured
 
 from sealfit.pipeline import STEPS, run
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 pytestmark = pytest.mark.skipif(
     measured() is None, reason="SEALFIT_MEASURED names no folder of measured data"

@@ -18,8 +18,8 @@ import pytest
 
 from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED
 from sealfit.simulation import load_truth, true_force
+from sealfit.store import Store
 from sealfit.store.manifest import STEPS
-from sealfit.store.out_folder import Store
 from sealfit.tables import SCHEMAS
 
 SPEC = """

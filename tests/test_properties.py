@@ -12,7 +12,7 @@ import sealfit
 from sealfit import commands, pipeline
 from sealfit.cli import app
 from sealfit.errors import OutError, RequestError, StaleError
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 HARDNESS = Path(__file__).parents[1] / "sample_data" / "hardness.csv"
 PROPERTY = "hardness_shore_A"

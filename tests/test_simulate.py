@@ -72,7 +72,7 @@ def test_a_failure_leaves_the_last_campaign_and_no_litter(tmp_path, monkeypatch)
             raise OSError(28, "No space left on device")
         return real(source, target)
 
-    monkeypatch.setattr("sealfit.simulation.campaign.os.replace", full)
+    monkeypatch.setattr("sealfit.simulation.os.replace", full)
     with pytest.raises(OutError, match="No space left on device"):
         simulate(SMALL.model_copy(update={"seed": 2}), tmp_path / "a")
     assert tree(tmp_path) == before
@@ -88,7 +88,7 @@ def test_a_ctrl_c_half_way_brings_the_last_campaign_back(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return real(source, target)
 
-    monkeypatch.setattr("sealfit.simulation.campaign.os.replace", interrupted)
+    monkeypatch.setattr("sealfit.simulation.os.replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         simulate(SMALL.model_copy(update={"seed": 2}), tmp_path / "a")
     assert tree(tmp_path) == before

@@ -21,10 +21,9 @@ from small_tables import small
 
 from sealfit.config import parse_config
 from sealfit.errors import ConfigError, OutError, StaleError
-from sealfit.store import parquet, staged_writes
-from sealfit.store.lock import LOCK
+from sealfit.store import Store, parquet, staged_writes
 from sealfit.store.manifest import STAGING, STATE, STEPS, ConfigCopy, State, fingerprint, seen_config, to_json
-from sealfit.store.out_folder import Store
+from sealfit.store.staged_writes import LOCK
 from sealfit.tables import BINS, INPUTS, QUALITY, RUNS
 from sealfit.units import Units
 
@@ -265,7 +264,7 @@ def test_a_step_is_not_given_what_its_key_does_not_hold():
 
 def test_another_version_makes_everything_stale(out, campaign, monkeypatch):
     do_all(out, campaign)
-    for module in ("store.manifest", "store.out_folder"):
+    for module in ("store.manifest", "store"):
         monkeypatch.setattr(f"sealfit.{module}.__version__", "99.0")
     assert stale(out) == list(STEPS)
     with pytest.raises(StaleError, match=r"made by sealfit .*, this is 99.0"):
@@ -534,7 +533,7 @@ import sys, time
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 from sealfit.store.manifest import ConfigCopy
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 with Store.writing(Path({out!r}), Path({campaign!r}), ConfigCopy.at(None)) as store:
     print("holds", flush=True)
@@ -622,8 +621,7 @@ def test_results_written_while_they_are_read_are_not_mixed(out, campaign):
 
 def test_every_folder_in_which_a_step_puts_files_is_synced(tmp_path, campaign, monkeypatch):
     out, synced = tmp_path / "new" / "out", []
-    for module in ("staged_writes", "lock"):
-        monkeypatch.setattr(f"sealfit.store.{module}.sync", lambda path: synced.append(Path(path)))
+    monkeypatch.setattr("sealfit.store.staged_writes.sync", lambda path: synced.append(Path(path)))
     with Store.writing(out, campaign, ConfigCopy.at(None)) as store, store.step("ingest") as staged:
         staged.table("steady", small("steady"))
         staged.text("plots/a.svg", "<svg/>")

@@ -51,7 +51,7 @@ from faults import (
 
 from sealfit.errors import SealfitError
 from sealfit.notebook.results import open as open_results
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 READ_S = 1.0  # how long the readers read before and after a write
 WAIT_S = 0.05  # longest wait of a reader before a table

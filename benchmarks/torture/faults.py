@@ -55,14 +55,14 @@ from faulty_disk import KILLED, SPACE, Disk
 from process_tree import tree
 
 from sealfit import cli
+from sealfit import store as out_folder
 from sealfit.errors import SealfitError
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.report import page
 from sealfit.report.drawing import Drawn
 from sealfit.simulation import load_spec, simulate
-from sealfit.store import out_folder
+from sealfit.store import PROVENANCE, Store
 from sealfit.store.manifest import STATE
-from sealfit.store.out_folder import PROVENANCE, Store
 
 SPEC = """
 name = "small"
@@ -156,12 +156,12 @@ def hold_time() -> None:
 # ---------------------------------------------------------------- remembered computations
 
 COMPUTED = (
-    ("sealfit.fit.steady.fit", "fit_conditions"),
-    ("sealfit.fit.aging.series", "fit_series"),
-    ("sealfit.fit.aging.series", "aging_curves"),
+    ("sealfit.fit.steady", "fit_conditions"),
+    ("sealfit.fit.aging", "fit_series"),
+    ("sealfit.fit.aging", "aging_curves"),
     ("sealfit.fit.aging.all_series", "joint_laws"),
     ("sealfit.fit.aging.property", "fit_properties"),
-    ("sealfit.fit.dynamic.fit", "fit_dynamic"),
+    ("sealfit.fit.dynamic", "fit_dynamic"),
     ("sealfit.closure.loop", "close_loop"),
     ("sealfit.closure.after", "after_fits"),
     ("sealfit.fit.aging.all_series", "law_of"),

@@ -60,7 +60,7 @@ from pollution import (
 from sealfit.cli import app, exit_code
 from sealfit.config import load_config
 from sealfit.errors import SealfitError
-from sealfit.store.lock import LOCK
+from sealfit.store.staged_writes import LOCK
 
 LIMIT_S = 10
 KINDS = ("cut", "bit", "bits", "swapped", "doubled", "zeros", "other file", "inserted")
@@ -238,8 +238,8 @@ def _apart(read: Callable[[bytes], object], raw: bytes) -> tuple[str, str]:
 
 # Pure computations, done once for equal arguments: what is tested is what is read and written around them.
 COMPUTED = (
-    ("sealfit.fit.steady.fit", "fit_conditions"), ("sealfit.fit.aging.all_series", "joint_laws"),
-    ("sealfit.fit.dynamic.fit", "fit_dynamic"), ("sealfit.closure.loop", "close_loop"),
+    ("sealfit.fit.steady", "fit_conditions"), ("sealfit.fit.aging.all_series", "joint_laws"),
+    ("sealfit.fit.dynamic", "fit_dynamic"), ("sealfit.closure.loop", "close_loop"),
     ("sealfit.closure.after", "after_fits"), ("sealfit.report.page", "build_report"),
 )  # fmt: skip
 

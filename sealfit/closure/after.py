@@ -11,16 +11,16 @@ import pandas as pd
 
 from sealfit.closure.intervals import degrees_of_freedom, t_quantile
 from sealfit.config import Config
+from sealfit.fit.aging import CURVE_POINTS, aging_curves, fit_series
 from sealfit.fit.aging.all_series import joint_laws
 from sealfit.fit.aging.law import search_limits
 from sealfit.fit.aging.law_table import Curve, CurveInterval, Estimate, covariance_rows, law_rows, without_law
-from sealfit.fit.aging.series import CURVE_POINTS, aging_curves, fit_series
-from sealfit.fit.dynamic.fit import fit_dynamic
+from sealfit.fit.dynamic import fit_dynamic
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.declared import series_of_curve
-from sealfit.fit.joint.estimate import Fitted
 from sealfit.fit.joint.model import Model, Term, evaluate
 from sealfit.fit.joint.rows import POWER, Rows, point_rows
-from sealfit.fit.steady.fit import FORCES, fit_conditions, parameter_units, table_row
+from sealfit.fit.steady import FORCES, fit_conditions, parameter_units, table_row
 from sealfit.fit.steady.uncertainty import SHIFT
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import timed

@@ -25,15 +25,15 @@ from sealfit.closure.criteria import (
     WEAK_P,
     WITHIN_P,
 )
+from sealfit.closure.error_sizes import between_speeds, blocks, covered, foldable, folds, whole_settings
 from sealfit.closure.forms import describe
-from sealfit.closure.heldout import between_speeds, blocks, covered, foldable, folds, whole_settings
 from sealfit.closure.intervals import mean_se
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
 from sealfit.closure.ripples import agreement, pass_shifts
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
-from sealfit.fit.joint.estimate import Fitted, fit, with_reml_smoothness
+from sealfit.fit.joint import Fitted, fit, with_reml_smoothness
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening

@@ -1,21 +1,34 @@
-"""Size of the residual and its level: errors, noise floor and lack of fit."""
+"""Sizes of errors, noise floor and lack of fit, and the rows that are held out to measure predictions."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pandas as pd
 from numpy.polynomial import Legendre
 from scipy.special import fdtrc
 
+from sealfit.closure.channels import level_values, settings
+from sealfit.closure.criteria import (
+    BLOCKS_OF_A_FOLD,
+    LEAST_GROUPS_HELD_OUT,
+    LEAST_HELD_OUT,
+    OUTSIDE,
+    SAME_SETTING,
+)
 from sealfit.closure.score_test import Candidate
-from sealfit.fit.joint.estimate import Fitted
-from sealfit.fit.joint.rows import LEVELS, Rows
+from sealfit.fit.joint import Fitted
+from sealfit.fit.joint.rows import LEVELS, POWER, Rows, point_rows, sliding_power
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 
 SHAPES = 3
 """Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3."""
 
 RANK = 1e-9  # Relative singular value below which a direction of a tangent is zero.
+
+
+# ---------------------------------------------------------------- in sample
 
 
 def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
@@ -250,3 +263,171 @@ def scatter_list(fitted: Fitted) -> list[dict]:
             }
         )
     return result
+
+
+# ---------------------------------------------------------------- held-out rows
+# Whole groups, calendar blocks or whole settings, and whether the other rows cover them.
+
+
+def heldout_level(rows: Rows) -> str:
+    """Return the level whose groups are held out: run, or file or stroke if there are fewer than six."""
+    for level in ("run", "file"):
+        if rows.groups.starts[level].size >= LEAST_GROUPS_HELD_OUT:
+            return foldable(rows, level)
+    return "stroke"
+
+
+def foldable(rows: Rows, level: str) -> str:
+    """Return a level, or the next finer one at which conditions keep some groups while others are held out.
+
+    A condition with one file and no aging law cannot be predicted without that file. Its strokes are held out
+    then, and the error is that of predicting the same files.
+    """
+    for finer in reversed(LEVELS[: LEVELS.index(level) + 1]):
+        start = rows.groups.starts[finer]
+        groups = np.bincount(rows.condition[start], minlength=len(rows.conditions))
+        lost = [c for c in np.flatnonzero(groups == 1) if _edge(rows, int(c))]
+        if len(lost) <= np.count_nonzero(groups) / 2:
+            return finer
+    return LEVELS[0]
+
+
+def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]:
+    """Yield masks of the rows held out, shape (n,), in whole groups.
+
+    The groups are spread so that each condition keeps most of its own. Day 0 and the last day always keep a
+    group, so that the aging law does not have to extrapolate.
+    """
+    start = rows.groups.starts[level]
+    count = min(count, start.size)
+    condition = rows.condition[start]
+    rng = np.random.default_rng(seed)
+    shuffled = rng.permutation(start.size)
+    order = shuffled[np.argsort(condition[shuffled], kind="stable")]
+    number = np.empty(start.size, dtype=int)
+    number[order] = np.arange(start.size) % count
+    yield from _masks(rows, level, number)
+
+
+def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]:
+    """Return masks of the rows held out, shape (n,): blocks of groups that are consecutive in the calendar.
+
+    Neighbours in time are correlated, and so are conditions tested one after the other. With single groups
+    held out, any smooth curve through the calendar would be confirmed. If a block contains a whole condition
+    that cannot be predicted without it, blocks are shortened, and a fold has several of them that are apart.
+    """
+    start = rows.groups.starts[level]
+    count = min(count, start.size)
+    place = np.empty(start.size, dtype=int)
+    place[np.argsort(rows.values(channel)[start], kind="stable")] = np.arange(start.size)
+    masks: list[np.ndarray] = []
+    for parts in BLOCKS_OF_A_FOLD:
+        masks = list(_masks(rows, level, place * min(count * parts, start.size) // start.size % count))
+        if np.any(masks, axis=0).mean() > LEAST_HELD_OUT:
+            break
+    return masks
+
+
+def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield masks of the rows held out, shape (n,), from each group's fold; edge conditions keep a group."""
+    start, code = rows.groups.starts[level], rows.codes(level)
+    condition = rows.condition[start]
+    for k in range(number.max() + 1):
+        out = _without_lost_edges(number == k, condition, rows)
+        if out.any():
+            yield out[code]
+
+
+def _without_lost_edges(out: np.ndarray, condition: np.ndarray, rows: Rows) -> np.ndarray:
+    """Return what is held out, without edge conditions that would lose all groups, shape of `out`."""
+    for c in np.unique(condition[out]):
+        if not (~out & (condition == c)).any() and _edge(rows, c):
+            out = out & (condition != c)
+    return out
+
+
+def _edge(rows: Rows, condition: int) -> bool:
+    if not rows.has_aging:
+        return True  # a condition of its own parameters cannot be predicted without its rows
+    days = rows.conditions["aging_days"]
+    series = rows.conditions["series"]
+    own = days[series == series.iloc[condition]]
+    return bool(days.iloc[condition] in (0.0, own.max()))
+
+
+def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.ndarray:
+    """Return which held-out rows are covered by the other rows, shape (n,); the rest are extrapolated.
+
+    Parameters
+    ----------
+    rows : Rows
+        All rows.
+    out : ndarray of bool, shape (n,)
+        Which are held out.
+    channels : iterable of str
+        Channels of the effects in the model.
+    """
+    inside = out.copy()
+    series = rows.conditions["series"].to_numpy()[rows.condition]
+    speed = np.abs(rows.speed)
+    for own in np.unique(series[out]):
+        here = series == own
+        seen = here & ~out
+        tested = np.unique(rows.condition[seen])
+        lawful = rows.has_aging and tested.size > 1
+        days = rows.days[seen | (~out & (rows.days == 0))]  # every series starts from unaged rubber
+        new = here & out & ~np.isin(rows.condition, tested)
+        if not lawful:
+            inside &= ~new
+        else:
+            inside &= ~(new & ((rows.days < days.min()) | (rows.days > days.max())))
+        if seen.any():
+            inside &= ~(here & out & _outside(speed, speed[seen]))
+    for name in channels:
+        values = rows.values(name)
+        if values.dtype.kind == "f":
+            inside &= ~_outside(values, values[~out])
+        else:
+            inside &= np.isin(values, np.unique(values[~out]))
+    return inside
+
+
+def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return which values lie outside the range of those seen, by more than values of one setting differ."""
+    low, high = float(seen.min()), float(seen.max())
+    slack = OUTSIDE * (high - low) + SAME_SETTING * max(abs(low), abs(high))
+    return (values < low - slack) | (values > high + slack)
+
+
+def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield masks of the rows held out, shape (n,): all rows at each inner setting of a channel in turn.
+
+    A free shape may fit every setting it has seen and still not predict those between them.
+    """
+    for setting in np.unique(values)[1:-1]:
+        out = _without_lost_edges(values == setting, rows.condition, rows)
+        if out.any():
+            yield out
+
+
+def between_speeds(rows: Rows) -> Rows:
+    """Return rows moved halfway, on a log scale, to the next higher tested speed of their series."""
+    speed = settings(level_values(np.abs(rows.speed), rows))
+    series = rows.conditions["series"].to_numpy()[rows.condition]
+    halfway = np.full(speed.size, np.nan)
+    for own in np.unique(series):
+        here = series == own
+        tested, place = np.unique(speed[here], return_inverse=True)
+        halfway[here] = np.r_[np.sqrt(tested[1:] * tested[:-1]), np.nan][place]
+    there = np.isfinite(halfway)
+    table = rows.table[there].assign(**{name: values[there] for name, values in rows.filled.items()})
+    table["speed_mm_s"] = np.sign(rows.speed[there]) * halfway[there]
+    if POWER in table:
+        table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
+    return point_rows(
+        table.reset_index(drop=True),
+        rows.condition[there],
+        rows.conditions,
+        has_load=rows.has_load,
+        has_aging=rows.has_aging,
+    )

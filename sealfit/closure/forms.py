@@ -26,7 +26,7 @@ from sealfit.closure.score_test import Candidate, ScoreTestResult, project
 from sealfit.closure.small_sample_test import SmallSampleTest
 from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
 from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_effect, natural
-from sealfit.fit.joint.estimate import Fitted, fit, reestimated
+from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Term, mean_derivatives, shape_of
 from sealfit.fit.joint.rows import Rows
 from sealfit.tables import CALENDAR

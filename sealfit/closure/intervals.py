@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 
 from sealfit.closure.criteria import FEW_UNITS, LARGEST_LEVERAGE, LEAST_SPARE_RUNS
 from sealfit.closure.small_sample_test import satterthwaite_df
-from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import LEVELS
 from sealfit.fit.joint.tangent import Tangent
 

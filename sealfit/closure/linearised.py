@@ -13,7 +13,7 @@ from sealfit.closure.criteria import IDENTIFIABLE, PAIR_PENALTY
 from sealfit.closure.score_test import Candidate, project
 from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
-from sealfit.fit.joint.estimate import Fitted, effective_df
+from sealfit.fit.joint import Fitted, effective_df
 from sealfit.fit.joint.model import Term, mean_derivatives
 from sealfit.fit.joint.prior import penalised, reml_smoothness, roughness_of
 from sealfit.fit.joint.rows import Rows

@@ -11,9 +11,8 @@ import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
 from sealfit.closure.criteria import DETERMINED, JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
-from sealfit.closure.error_sizes import level_table
+from sealfit.closure.error_sizes import covered, folds, heldout_level, level_table
 from sealfit.closure.forms import describe
-from sealfit.closure.heldout import covered, folds, heldout_level
 from sealfit.closure.intervals import mean_se
 from sealfit.closure.outlier_files import outlier_files
 from sealfit.closure.output import channel_table, curve_table, shape_points, shape_table, to_record
@@ -24,7 +23,7 @@ from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.engine.run_map import run_map
-from sealfit.fit.joint.estimate import Fitted, fit, fit_declared, fit_with_effects
+from sealfit.fit.joint import Fitted, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
 from sealfit.ingest.stored_parts import StoredTraces

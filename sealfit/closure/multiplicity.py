@@ -12,7 +12,7 @@ from sealfit.closure import small_sample_test
 from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES, UNEQUAL_RUNS
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of, score_statistic
 from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, slope_log_p
-from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint import Fitted
 
 # The signs of whole units are flipped at random many times. The largest T over all candidates gives the
 # p-value adjusted for the search (Westfall & Young 1993; sign flips of score contributions: Hemerik, Goeman &

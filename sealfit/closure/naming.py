@@ -32,7 +32,7 @@ from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.joint.estimate import Fitted, fit, reestimated
+from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening

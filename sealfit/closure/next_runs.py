@@ -17,11 +17,11 @@ from sealfit.closure.outlier_files import OutlierFile
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import Model, Term, evaluate, mean_derivatives
 from sealfit.fit.joint.rows import POWER, Rows, sliding_power
 from sealfit.fit.joint.search import bounds_of
-from sealfit.ingest.categorical import condition_columns
+from sealfit.ingest.columns import condition_columns
 
 # ---------------------------------------------------------------- aliases
 # Effects that are not distinguishable from the model with these runs.

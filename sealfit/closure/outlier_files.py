@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtr
 
-from sealfit.fit.joint.estimate import Fitted, fit, fit_declared, fitted_at
+from sealfit.fit.joint import Fitted, fit, fit_declared, fitted_at
 from sealfit.fit.joint.rows import SAME_SPEED, Rows
 
 # A file is tried if its residual in the fit to all files has a p-value below this, times the number of files.

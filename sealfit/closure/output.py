@@ -23,8 +23,8 @@ from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import SECOND, Effect
 from sealfit.effects.free import FREE, LEVELS, SMOOTH, WIDE, free_effect
+from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
-from sealfit.fit.joint.estimate import Fitted, fit
 from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
 from sealfit.fit.joint.rows import Rows, open_columns, point_rows
 from sealfit.fit.joint.tangent import Tangent

@@ -25,8 +25,8 @@ from sealfit.fit.joint.declared import SPEEDS_BETWEEN, Declared
 from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.joint.whitening import Component, Scatter
-from sealfit.ingest.categorical import add_keys
 from sealfit.ingest.cells import OVERLOAD
+from sealfit.ingest.columns import add_keys
 from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # Relative tolerance of the tested range.

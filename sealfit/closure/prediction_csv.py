@@ -12,9 +12,8 @@ from pathlib import Path
 import pandas as pd
 
 from sealfit.errors import RequestError
-from sealfit.store.lock import taken
 from sealfit.store.paths import existing_file
-from sealfit.store.staged_writes import sync
+from sealfit.store.staged_writes import sync, taken
 
 MISSING = ("", "nan", "NaN", "NA", "null")
 FORMULA = tuple("=+-@＝＋－＠")  # what a formula of a spreadsheet begins with

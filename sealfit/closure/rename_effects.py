@@ -20,7 +20,7 @@ from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import channel_candidates, search_pairs
-from sealfit.fit.joint.estimate import Fitted, fit
+from sealfit.fit.joint import Fitted, fit
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import LEVEL_NAMES, sensitivity, undetectable_variables
 from sealfit.config import Config
 from sealfit.effects.contract import Effect, fill_unit
-from sealfit.fit.joint.estimate import Fitted, effective_df, fit
+from sealfit.fit.joint import Fitted, effective_df, fit
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import Rows
 from sealfit.units import Units

@@ -11,7 +11,7 @@ import pandas as pd
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
 from sealfit.closure.naming import propose_ripples
 from sealfit.closure.ripples import Peak, find_ripple
-from sealfit.fit.joint.estimate import Fitted, fit
+from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.model import Model, passes
 from sealfit.fit.joint.rows import Rows
 from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time, stroke_index, strokes_of

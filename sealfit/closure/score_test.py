@@ -28,7 +28,7 @@ from sealfit.closure.small_sample_test import (
     few_specimens,
     specimens_agree,
 )
-from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import LEVELS
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 

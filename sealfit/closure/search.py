@@ -41,7 +41,7 @@ from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.small_sample_test import log_p_of
 from sealfit.effects.free import BENDS, evenly
 from sealfit.effects.sensors import DAY_AND_NIGHT, DAY_H
-from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import POWER, Rows, open_columns
 from sealfit.fit.joint.variance_components import orthonormal
 

@@ -28,7 +28,7 @@ from sealfit.closure.search import (
     search_pairs,
 )
 from sealfit.effects.contract import Effect
-from sealfit.fit.joint.estimate import Fitted, fit, fit_declared, fit_with_effects
+from sealfit.fit.joint import Fitted, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter

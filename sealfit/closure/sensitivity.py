@@ -46,7 +46,7 @@ from sealfit.closure.small_sample_test import (
     least_share,
     moderated,
 )
-from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import LEVELS
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening

@@ -27,7 +27,7 @@ from sealfit.closure.criteria import (
     LEAST_SPECIMENS,
     LEAST_UNITS_OF_SLOPES,
 )
-from sealfit.fit.joint.estimate import Fitted
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import orthonormal
 from sealfit.fit.joint.whitening import Whitening

@@ -18,8 +18,8 @@ from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
+from sealfit.fit.joint import Fitted, fit, fitted_at
 from sealfit.fit.joint.declared import declare
-from sealfit.fit.joint.estimate import Fitted, fit, fitted_at
 from sealfit.fit.joint.rows import POWER, Rows, make_rows, merge, thin
 
 # A campaign with no more strokes is searched in full. Of a larger one this many are drawn, by whole runs.

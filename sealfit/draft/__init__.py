@@ -1,1 +1,77 @@
-"""A rig config drafted from a folder of files: every guess with its evidence, every doubt with what to do."""
+"""From a folder of files to the draft of a rig config."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from sealfit.config import parse_config
+from sealfit.draft import run_keys, trace_keys
+from sealfit.draft.columns import columns_of, find_roles
+from sealfit.draft.config_text import Doubt, Guess, Notes, config_text
+from sealfit.draft.file_names import read_names
+from sealfit.draft.files_found import find_table, look, read_tables
+from sealfit.errors import RequestError
+
+SHOWN = (
+    "trace.columns.",
+    "trace.rate_Hz",
+    "condition",
+    "files.glob",
+    "files.name_pattern",
+    "files.runs_columns",
+    "strokes.",
+)
+"""Guesses that the summary repeats: the others are in the draft."""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A drafted config: its text, the guesses and the doubts; `motion` says in words how the rig moves."""
+
+    text: str
+    files: int
+    motion: str
+    guesses: tuple[Guess, ...]
+    doubts: tuple[Doubt, ...]
+
+
+def draft(folder: Path) -> Draft:
+    """Return the draft of a config that reads the trace files in a folder; errors as `look`."""
+    folder = Path(folder)
+    found = look(folder)
+    notes = Notes()
+    tables = read_tables(found)
+    roles = find_roles(columns_of(found.dialect, list(tables.values())))
+    if roles.time is None and roles.force is None:
+        tables = f"{len(found.traces)} files hold tables of numbers, such as {found.traces[0]}"
+        fix = "Give the folder that holds traces: time, displacement and force in columns."
+        raise RequestError(f"{tables}, but no time and no force.", file=folder, fix=fix)
+    units = trace_keys.settled_units(roles, notes)
+    speeds = trace_keys.motion_keys(roles, units, list(tables), notes)
+    table = find_table(folder, [*found.others, *found.otherwise], found.traces)
+    names = run_keys.improved(read_names(found.traces), speeds, found, notes)
+    source = run_keys.Source(run_keys.needs_no_load(names, roles), table)
+    header = trace_keys.header_keys(found, source.given, roles.load is not None, notes)
+    run_keys.source_keys(found, source, header, notes)
+    trace_keys.dialect_keys(found, notes)
+    trace_keys.column_keys(found, roles, units, len(tables), notes)
+    run_keys.condition_keys(source, header, notes)
+    text = config_text(folder.resolve().name or "rig", shlex.quote(str(folder)), notes)
+    # A draft that is no config is a fault of this module, and raises here.
+    parse_config(text, "the drafted config")
+    words = trace_keys.motion_words(roles)
+    return Draft(text, len(found.traces), words, tuple(notes.guesses), tuple(notes.doubts))
+
+
+def summary_lines(made: dict) -> list[str]:
+    """Return what `sealfit init` prints: what was found, what could not be told, the command to run next."""
+    count = f"{made['files']} trace file" + ("s" if made["files"] != 1 else "")
+    lines = [f"{count} in {made['folder']}; {made['motion']}"]
+    shown = [guess for guess in made["guesses"] if guess["key"].startswith(SHOWN)]
+    lines += [f"  {guess['key'].rpartition('.')[2]}: {guess['evidence']}" for guess in shown]
+    if made["doubts"]:
+        lines.append("could not be told:")
+        lines += [f"  - {doubt['reason']} {doubt['fix']}" for doubt in made["doubts"]]
+    return [*lines, f"draft: {made['config']}", f"next: {made['next']}"]

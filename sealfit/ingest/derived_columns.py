@@ -12,7 +12,8 @@ import numpy as np
 
 from sealfit.config import Config
 from sealfit.errors import KEPT, NOTED, CampaignError, ConfigError, Fault
-from sealfit.ingest.categorical import (
+from sealfit.ingest.cells import OVERLOAD
+from sealfit.ingest.columns import (
     UNAGED,
     Column,
     Columns,
@@ -24,7 +25,6 @@ from sealfit.ingest.categorical import (
     put,
     where,
 )
-from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.expression import evaluate, parse, require_columns
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number

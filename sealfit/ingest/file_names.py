@@ -14,7 +14,7 @@ import regex
 
 from sealfit.config import Files
 from sealfit.errors import ConfigError, shortened
-from sealfit.ingest.categorical import Columns, taken
+from sealfit.ingest.columns import Columns, taken
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import PATTERN_S, as_number, found_by
 from sealfit.units import Conversion

@@ -16,8 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from sealfit.config import Config
 from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, Fault, nearest, printable
-from sealfit.ingest.categorical import Columns, mapped
-from sealfit.ingest.columns import suggestion
+from sealfit.ingest.columns import Columns, mapped, suggestion
 from sealfit.ingest.files import as_number, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
 from sealfit.store.paths import RUNS as RUNS_CSV

@@ -16,7 +16,7 @@ import pyarrow as pa
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.averages import ALONG, FileStrokes, bin_table, mean_traces, read_strokes
-from sealfit.ingest.categorical import columns_of, condition_columns, keys_of
+from sealfit.ingest.columns import columns_of, condition_columns, keys_of
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.files import as_number
 from sealfit.store import parquet

@@ -10,9 +10,8 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import KEPT, CampaignError, Fault, nearest
-from sealfit.ingest.categorical import Columns, keys_of, known, where
 from sealfit.ingest.cells import LISTED
-from sealfit.ingest.columns import suggestion
+from sealfit.ingest.columns import Columns, keys_of, known, suggestion, where
 from sealfit.ingest.derived_columns import (
     NUMBERS,
     empty_cells,

@@ -20,9 +20,11 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault
-from sealfit.ingest.categorical import (
+from sealfit.ingest.columns import (
+    RESERVED,
     Column,
     Columns,
+    beside,
     columns_of,
     condition_columns,
     in_order,
@@ -30,10 +32,10 @@ from sealfit.ingest.categorical import (
     mapped,
     overlaid,
     put,
+    suggestion,
     taken,
     where,
 )
-from sealfit.ingest.columns import RESERVED, beside, suggestion
 from sealfit.ingest.derived_columns import (
     add_repeats,
     add_runs,

@@ -13,7 +13,7 @@ from sealfit.pipeline import report_tables
 from sealfit.report.figures import draw_all
 from sealfit.report.page import answered
 from sealfit.report.style import compose, look
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 
 class ShownFigure(Figure):

@@ -17,8 +17,8 @@ from sealfit.engine.run_map import cores
 from sealfit.errors import RequestError, SealfitError
 from sealfit.notebook import frames
 from sealfit.report import summary, summary_lines
+from sealfit.store import Store
 from sealfit.store.manifest import BATCH
-from sealfit.store.out_folder import Store
 from sealfit.store.paths import existing_out
 from sealfit.tables import SCHEMAS
 from sealfit.units import Units

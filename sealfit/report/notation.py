@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from sealfit.config import Config
-from sealfit.ingest.categorical import UNAGED
+from sealfit.ingest.columns import UNAGED
 from sealfit.tables import CALENDAR
 from sealfit.units import Units
 

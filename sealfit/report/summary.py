@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from sealfit.effects.contract import Effect
-    from sealfit.store.out_folder import Store
+    from sealfit.store import Store
 
 # `quantity` of rows about the fit itself
 NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift", "effect_shift")

@@ -1,10 +1,370 @@
-"""Campaigns with known truth.
+"""Campaigns with known truth: the folder as a rig would leave it, and the truth beside it.
 
-`load_spec` reads a SPEC, `simulate` writes the campaign, `true_force` knows the answer. The parts are in
-`sealfit.simulation`; this is the door for the command line and for notebooks.
+`load_spec` reads a SPEC, `simulate` writes the campaign, `true_force` knows the answer.
 """
 
-from sealfit.simulation.campaign import load_truth, simulate, true_force, truth_path
-from sealfit.simulation.spec import Spec, load_spec
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
+
+from sealfit.errors import ConfigError, OutError, RequestError
+from sealfit.simulation.model import CONDITIONS
+from sealfit.simulation.motion import (
+    Motion,
+    SteadyLaw,
+    finer,
+    law_of_condition,
+    move,
+    move_at,
+    steady_law,
+    with_presliding,
+)
+from sealfit.simulation.noise import (
+    TraceChannel,
+    add_channels,
+    displacement_noise_mm,
+    draw_defects,
+    draw_scatter,
+    quantised,
+    sample_noise_N,
+    spoil,
+    stream,
+    trace_channel,
+)
+from sealfit.simulation.spec import Spec, load_spec, plan_files
 
 __all__ = ["Spec", "load_spec", "load_truth", "simulate", "true_force", "truth_path"]
+
+# ---------------------------------------------------------------- truth
+# The truth of a campaign, `<campaign>.truth.json`, and the force that follows from it.
+
+SCHEMA = 1
+MADE_BY = "sealfit simulate"
+# Decimals of a mean force in N. They are far below any noise.
+DIGITS = 9
+OF_EFFECT = ("id", "channels", "acts_on", "operation", "form", "parameters")
+PER_FILE = (
+    "file", "run_id", "direction", "speed_mm_s", "mean_force_N", "gain", "offset_N", "outlier", "defect",
+)  # fmt: skip
+
+
+def truth_path(campaign: Path) -> Path:
+    """Return the path of the truth of a campaign, beside its folder."""
+    campaign = Path(campaign)
+    return campaign.with_name(campaign.name + ".truth.json")
+
+
+def load_truth(path: Path) -> dict:
+    """Return the truth document at `path`.
+
+    Raises
+    ------
+    RequestError
+        If the file is missing or was not written by `simulate`.
+    """
+    try:
+        document = json.loads(Path(path).read_text("utf-8"))
+    except OSError as error:
+        raise RequestError(
+            f"cannot be read ({error.strerror}).", file=path, fix="Simulate the campaign."
+        ) from error
+    except (ValueError, RecursionError) as error:
+        document = error
+    if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
+        raise RequestError(
+            "is not the truth of a simulated campaign.", file=path, fix="Simulate the campaign anew."
+        )
+    return document
+
+
+def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
+    """Return the noise-free force of steady sliding at arbitrary points, in N, shape (n,).
+
+    Parameters
+    ----------
+    truth : mapping
+        The document of `load_truth`.
+    points : DataFrame
+        `speed_mm_s` (signed), the condition columns that the design has, and the channels that its effects
+        read, in the names of sealfit's tables. `load_N` may be left out where the design has one load,
+        `direction` always.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Mean force of the population: average specimen, set-up and repeat.
+
+    Raises
+    ------
+    RequestError
+        If a column is missing or a cell is empty.
+    """
+    spec = Spec.model_validate(truth["spec"])
+    law = steady_law(spec)
+    if "direction" not in points and "speed_mm_s" in points:
+        points = points.assign(direction=np.sign(points["speed_mm_s"]))
+    if "load_N" not in points and len(spec.design.loads_N) == 1:
+        points = points.assign(load_N=spec.design.loads_N[0])
+    channels = {}
+    for name in ("speed_mm_s", *spec.design.columns, *(name for e in law.effects for name in e.channels)):
+        if name not in points:
+            raise RequestError(
+                "the points lack a column.", column=name, fix="Add it; the truth depends on it."
+            )
+        if empty := int(points[name].isna().sum()):
+            raise RequestError(f"the points have {empty} empty cells.", column=name, fix="Fill them.")
+        channels[name] = points[name].to_numpy()
+    return np.broadcast_to(law.force_N(channels), (len(points),)).astype(float)
+
+
+def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) -> dict:
+    """Return the truth of a campaign as plain values.
+
+    Parameters
+    ----------
+    spec : Spec
+        What was simulated.
+    files : DataFrame
+        One row per file and direction: `file`, `run_id`, `direction`, `speed_mm_s` (real, signed),
+        `mean_force_N` (noise-free, over the steady rows), `gain`, `offset_N`, `outlier`, `defect`, and the
+        condition columns.
+    effect_rms_N : ndarray, shape (effects,)
+        RMS over all steady rows of what each effect adds to the force.
+    """
+    physics = []
+    for row in files.drop_duplicates("condition").to_dict("records"):
+        given = {name: float(row[name]) for name in CONDITIONS if name in row}
+        physics.append({"condition": row["condition"], **given, **law_of_condition(spec.physics, given)})
+    means = files.groupby(["run_id", "direction"], sort=False)["mean_force_N"].mean()
+    runs = means.round(DIGITS).reset_index()
+    if spec.design.both_ways:
+        runs["run_id"] += runs["direction"].map({1: "+", -1: "-"})
+    return {
+        "schema": SCHEMA,
+        "made_by": MADE_BY,
+        "spec": spec.model_dump(mode="json"),
+        "physics": physics,
+        "effects": [
+            {**{name: getattr(e, name) for name in OF_EFFECT}, "rms_N": round(float(rms), DIGITS)}
+            for e, rms in zip(steady_law(spec).effects, effect_rms_N, strict=True)
+        ],
+        "noise": [kind.model_dump(mode="json") for kind in spec.noise],
+        "runs": runs.to_dict("records"),
+        "files": [
+            # pandas makes NaN of None
+            {**row, "defect": row["defect"] if isinstance(row["defect"], str) else None}
+            for row in files[list(PER_FILE)].round(DIGITS).to_dict("records")
+        ],
+    }
+
+
+# ---------------------------------------------------------------- campaign
+
+# Decimals of the displacement in mm: 10 nm, the resolution of a linear encoder.
+DISPLACEMENT_DECIMALS = 5
+# Keys and derived channels that ingest computes.
+NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]
+# Smallest speed at which effects are evaluated, as a share of the set speed. A law in log speed is not
+# defined at 0.
+CRAWL = 1e-3
+# Number of rows per file for the RMS of an effect. It gives two digits.
+RMS_ROWS = 64
+
+
+def simulate(spec: Spec, out: Path) -> None:
+    """Write the campaign folder `out` and, beside it, `<out>.truth.json`.
+
+    The same SPEC gives the same bytes. The folder is written completely or not at all.
+
+    Raises
+    ------
+    ConfigError
+        If an effect is not in the catalogue or is not finite somewhere on this design.
+    OutError
+        If `out` holds files that `simulate` did not write, or cannot be written.
+    """
+    out = Path(os.path.abspath(out))
+    _refuse_foreign(out)
+    part = out.with_name(f".{out.name}.part-{os.getpid()}")
+    try:
+        (part / "new" / "traces").mkdir(parents=True)
+        document = _write(spec, part / "new")
+        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        (part / "truth.json").write_bytes(text.encode("utf-8"))
+        if out.exists():
+            os.replace(out, part / "old")
+        os.replace(part / "new", out)
+        os.replace(part / "truth.json", truth_path(out))
+    except OSError as error:
+        fix = "Check the disk and the folder's permissions."
+        raise OutError(f"cannot be written ({error.strerror}).", file=out, fix=fix) from error
+    finally:
+        if (part / "old").exists() and not out.exists():
+            os.replace(part / "old", out)  # restore the last campaign after any interruption
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _refuse_foreign(out: Path) -> None:
+    """Raise unless `out` is missing, empty, or holds nothing but a campaign that `simulate` wrote."""
+    fix = "Give --out another name, or move what is there."
+    truth = truth_path(out)
+    listed: set[str] = set()
+    if truth.exists():
+        try:
+            listed = {"runs.csv", *(row["file"] for row in load_truth(truth)["files"])}
+        except (RequestError, KeyError, TypeError) as error:
+            raise OutError("was not written by simulate.", file=truth, fix=fix) from error
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise OutError("is a file, not a folder.", file=out, fix=fix)
+    for path in sorted(out.rglob("*")):
+        name = path.relative_to(out).as_posix()
+        if name not in listed and not (path.is_dir() and listed):
+            raise OutError(f"holds '{name}', which simulate did not write.", file=out, fix=fix)
+
+
+def _write(spec: Spec, folder: Path) -> dict:
+    law, seed = steady_law(spec), spec.seed
+    spec = spec.risen()
+    files = add_channels(plan_files(spec.design, stream(seed, "order")), spec.channels, seed)
+    scatter = draw_scatter(spec.noise, files, seed)
+    shifts = stream(seed, "start").standard_normal(len(files))
+    starts = spec.design.start_mm + spec.design.start_scatter_mm * shifts
+    defects = draw_defects(spec.noise, len(files), seed)
+    squares, known = np.zeros(len(law.effects)), []
+    for number, record in enumerate(files.to_dict("records")):
+        speed = record["speed_mm_s"] * scatter.speed[number]
+        motion = move(spec.design, speed, record["direction"], starts[number])
+        along = {
+            c.name: trace_channel(c, motion.time_s, stream(seed, "channel", c.name, number))
+            for c in spec.channels
+            if isinstance(c, TraceChannel)
+        }
+        channels = _channels(record, motion, along)
+        friction, added = _forces(spec, law, motion, channels, speed)
+        clean = scatter.gain[number] * friction + added + scatter.offset_N[number]
+        force = clean + sample_noise_N(spec.noise, clean, motion.time_s, speed, number, seed)
+        noise = displacement_noise_mm(spec.noise, len(force), number, seed)
+        columns = {
+            "time_s": motion.time_s,
+            "displacement_mm": np.round(motion.displacement_mm + noise, DISPLACEMENT_DECIMALS),
+            "force_N": np.round(quantised(spec.noise, force), spec.force_decimals),
+            **along,
+        }
+        if number in defects:
+            columns = spoil(columns, defects[number], stream(seed, "bad_data", number))
+        _write_trace(columns, folder / record["file"])
+        steady = _rows(channels, motion.steady)
+        true = np.broadcast_to(law.force_N(steady), steady["direction"].shape)
+        for sign in np.unique(steady["direction"])[::-1].tolist():
+            own = steady["direction"] == sign
+            known.append(
+                {
+                    **record,
+                    "direction": sign,
+                    "speed_mm_s": sign * speed,
+                    "mean_force_N": float(true[own].mean()),
+                    "gain": scatter.gain[number],
+                    "offset_N": scatter.offset_N[number],
+                    "outlier": bool(scatter.outlier[number]),
+                    "defect": defects.get(number),
+                }
+            )
+        few = slice(None, None, max(1, len(true) // RMS_ROWS))
+        sample, whole = _rows(steady, few), true[few]
+        squares += [np.mean((whole - law.without(k).force_N(sample)) ** 2) for k in range(len(law.effects))]
+    _write_runs(files, folder / "runs.csv")
+    return truth_document(spec, pd.DataFrame(known), np.sqrt(squares / len(files)))
+
+
+def _channels(record: dict, motion: Motion, along: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return a file's channels as sealfit's tables name them: shape (1,) for those of the file, else (n,)."""
+    return {
+        **{name: np.array([value]) for name, value in record.items()},
+        **along,
+        "time_s": motion.stroke_time_s,
+        "displacement_mm": motion.displacement_mm,
+        "distance_mm": motion.distance_mm,
+        "speed_mm_s": motion.speed_mm_s,
+        "direction": motion.direction,
+        "stroke": motion.stroke,
+    }
+
+
+def _rows(channels: dict[str, np.ndarray], rows: np.ndarray | slice) -> dict[str, np.ndarray]:
+    return {name: values[rows] if len(values) > 1 else values for name, values in channels.items()}
+
+
+def _forces(
+    spec: Spec, law: SteadyLaw, motion: Motion, channels: dict[str, np.ndarray], speed: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a trace's friction and the force that effects add to it, without noise, in N, (n,) each."""
+    parts = law.parts({**channels, **_begun(spec, motion, speed)})
+    limit, viscous, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
+    if not (np.isfinite(limit + viscous).all() and np.isfinite(added).all()):
+        raise ConfigError(
+            f"the effects give no number in {channels['file'][0]}.",
+            fix="Check their parameters and formulas.",
+        )
+    if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
+        rise = np.full(motion.time_s.size, spec.design.stiffness_mm)
+        return with_presliding(limit + viscous, motion, rise), added
+    return _dynamic(spec, law, motion, channels, speed) + viscous, added
+
+
+def _dynamic(
+    spec: Spec, law: SteadyLaw, motion: Motion, channels: dict[str, np.ndarray], speed: float
+) -> np.ndarray:
+    """Return the bristles' force in N, (n,), followed through the ramps in finer steps than the file's."""
+    time = finer(motion, spec.design, speed)
+    between = {
+        name: np.interp(time, motion.time_s, values) if len(values) == motion.time_s.size else values
+        for name, values in channels.items()
+    }
+    start = motion.displacement_mm[0] - (0.0 if motion.direction[0] > 0 else spec.design.stroke_mm)
+    fine = move_at(spec.design, speed, int(motion.direction[0]), start, time)
+    limit, _, _ = law.parts({**between, **_begun(spec, fine, speed)})
+    limit = np.broadcast_to(limit, time.shape)
+    rise = np.abs(limit) / spec.physics.sigma_0
+    force = with_presliding(limit, fine, rise, spec.physics.sigma_1 / spec.physics.sigma_0)
+    return force[np.searchsorted(time, motion.time_s)]
+
+
+def _begun(spec: Spec, motion: Motion, speed: float) -> dict[str, np.ndarray]:
+    """Return the channels by which a rest is the beginning of motion.
+
+    At rest the bristles keep the last direction: a crawl stands for it, at which the law gives the break-away
+    force. Within a bristle's length nothing has slid yet, nor at the clock's zero: a law in their logarithm
+    starts after.
+    """
+    return {
+        "speed_mm_s": motion.direction * np.maximum(np.abs(motion.speed_mm_s), CRAWL * speed),
+        "distance_mm": np.maximum(motion.distance_mm, spec.design.stiffness_mm),
+        "time_s": np.maximum(motion.stroke_time_s, motion.time_s[1]),
+    }
+
+
+def _write_trace(columns: dict[str, np.ndarray], path: Path) -> None:
+    buffer = io.BytesIO()
+    buffer.write((",".join(columns) + "\n").encode("utf-8"))
+    # Adding zero turns -0.0, which no rig writes, into 0.0; NaN becomes an empty cell.
+    table = pa.table({name: pa.array(values + 0.0, from_pandas=True) for name, values in columns.items()})
+    pyarrow.csv.write_csv(table, buffer, pyarrow.csv.WriteOptions(include_header=False, quoting_style="none"))
+    path.write_bytes(buffer.getbuffer())
+
+
+def _write_runs(files: pd.DataFrame, path: Path) -> None:
+    listed = files.drop(columns=[name for name in NOT_IN_RUNS if name in files])
+    # Twelve digits: enough for any cell here, and 0.1 + 0.2 is written 0.3.
+    path.write_bytes(listed.to_csv(index=False, lineterminator="\n", float_format="%.12g").encode("utf-8"))

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from sealfit.physics.aging_laws import aging_law
-from sealfit.physics.stribeck import stribeck_decay
+from sealfit.physics.lugre import stribeck_decay
 from sealfit.simulation.model import CONDITIONS, BoundEffect, Physics, declared_parameters, resolve_effects
 from sealfit.simulation.spec import STEADY_LENGTHS, Design, Spec
 

@@ -17,9 +17,8 @@ from sealfit.config import Strict, explain
 from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import parse
-from sealfit.simulation.channels import Channel
 from sealfit.simulation.model import CONDITIONS, EffectEntry, Physics, resolve_effects
-from sealfit.simulation.noise import Noise
+from sealfit.simulation.noise import Channel, Noise
 
 # ---------------------------------------------------------------- design
 

@@ -1,0 +1,370 @@
+"""The OUT folder: its tables, and whether each step is current or stale."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sealfit import __version__
+from sealfit.config import Config, Files
+from sealfit.errors import ConfigError, OutError, RequestError, StaleError, quoted
+from sealfit.store import manifest, staged_writes
+from sealfit.store.manifest import STATE, ConfigCopy, Fingerprint, Properties, State, fingerprint, to_json
+from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
+from sealfit.store.staged_writes import PARQUET, PROVENANCE, Staged, disk, file_size, held, undisturbed
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from sealfit.ingest.stored_parts import StoredTraces
+
+
+class Store:
+    """One OUT folder with the campaign and the config it belongs to.
+
+    `kept` is the state as stored in it. `effects` is the folder of the user's own effects that the command
+    line names; the config has it, and no other.
+    """
+
+    def __init__(self, out: Path, state: State, kept: State | None, effects: Path | None):
+        self.out, self.state, self._kept, self.effects = out, state, kept, effects
+        config = state.config.parse()
+        self._names_effects = config.loop.effects_folder is not None
+        own = {"effects_folder": None if effects is None else str(effects)}
+        self.config: Config = config.model_copy(update={"loop": config.loop.model_copy(update=own)})
+        self.warnings: list[str] = []
+        self._checksums: dict[str, str | None] = {}  # of files that this process has read
+        self._keys: dict[str, str] | None = None  # of every step for the present campaign
+        self._opened: tuple | None = None  # status of state.json when it was opened for reading
+        self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
+        if state.campaign.is_dir():
+            files = self.config.files if state.properties is None else Files()
+            self._changed = manifest.changes(state.campaign, state.inputs, files)
+        else:
+            missing = f"the campaign folder {state.campaign} is missing"
+            self.warnings.append(f"{missing}, so changes cannot be detected.")
+        self.marks = state.inputs | self._changed  # the present files of the campaign
+
+    # ------------------------------------------------------------ opening
+    @classmethod
+    def open(cls, out: Path, effects: Path | None = None) -> Store:
+        """Return the results in `out`, for reading; `effects` is the folder that --effects-folder names.
+
+        Raises
+        ------
+        OutError
+            If `out` holds no results of sealfit.
+        ConfigError
+            If `effects` may not be run, as `own_effects_folder`.
+        """
+        opened = _status_of(out)  # before it is read
+        state = State.read(out)
+        if state is not None and state.moving is not None:
+            with held(out):  # which finishes it
+                return cls.open(out, effects)
+        if state is None:
+            what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
+            fix = f"Make them with: sealfit run CAMPAIGN --out {quoted(out)}"
+            raise OutError(what, file=out, fix=fix)
+        effects = own_effects_folder(effects, None, out, state.campaign)
+        config = state.config.now()
+        hashes = effects_seen(effects, state.own_effects, state.config, config)
+        store = cls(out, replace(state, config=config, own_effects=hashes), state, effects)
+        store._opened = opened
+        return store
+
+    @classmethod
+    @contextlib.contextmanager
+    def writing(
+        cls,
+        out: Path,
+        campaign: Path | None = None,
+        source: ConfigCopy | None = None,
+        effects: Path | None = None,
+        properties: Properties | None = None,
+    ) -> Iterator[Store]:
+        """Hold `out` as its only writer and give the store; without `campaign`, one that already has results.
+
+        `source` is the config that the command line names, `effects` the folder that --effects-folder names,
+        `properties` what is asked of a table of properties in `campaign`.
+
+        Raises
+        ------
+        OutError
+            If `out` is a file, a folder that sealfit did not make, the results of another campaign, in use by
+            another process, or cannot be written.
+        """
+        if campaign is None or source is None:
+            cls.open(out, effects)  # raises if there are no results
+        with held(out):
+            if campaign is None or source is None:
+                store = cls.open(out, effects)
+                store._opened = None
+            else:
+                folder = own_effects_folder(effects, source, out, campaign)
+                store = cls._of_campaign(out, campaign.resolve(), source, folder, properties)
+            store._keep_what_moved()
+            yield store
+
+    @classmethod
+    def _of_campaign(
+        cls,
+        out: Path,
+        campaign: Path,
+        source: ConfigCopy,
+        effects: Path | None,
+        properties: Properties | None,
+    ) -> Store:
+        kept = State.read(out)
+        hashes = {} if effects is None else effect_hashes(effects)
+        table = properties.table if properties else None
+        former = kept.properties.table if kept and kept.properties else None
+        if kept is None or (not kept.steps and (kept.campaign != campaign or former != table)):
+            return cls(out, State(campaign, source, properties, own_effects=hashes), kept, effects)
+        if former != table:
+            what = f"the campaign {kept.campaign}" if former is None else f"the table {former}"
+            raise OutError(f"holds the results of {what}.", file=out, fix="Choose another --out.")
+        inputs, moved = kept.inputs, kept.campaign != campaign
+        if moved:
+            inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
+            if any(mark.sha256 != kept.inputs[name].sha256 for name, mark in inputs.items()):
+                what = f"belongs to the campaign {kept.campaign}, and {campaign} holds other data."
+                raise OutError(what, file=out, fix="Choose another --out.")
+        state = State(campaign, source, properties, inputs, hashes, kept.steps)
+        store = cls(out, state, kept, effects)
+        if moved:
+            same = f"{campaign} holds the same data and takes over."
+            store.warnings.append(f"{out} was made from {kept.campaign}; {same}")
+        return store
+
+    def _keep_what_moved(self) -> None:
+        """Store a new path of the campaign, new times of unchanged files, and an equivalent config."""
+        kept = self._kept
+        if kept is None:
+            return
+        known = self.state.inputs
+        same = {n: mark for n, mark in self._changed.items() if _same_content(mark, known.get(n))}
+        if same:
+            self.state = replace(self.state, inputs=known | same)
+        source = self.state.config if _same_config(kept.config, self.state.config) else kept.config
+        tidy = replace(self.state, config=source, own_effects=kept.own_effects)
+        if tidy != kept:
+            staged = Staged(self.out, self.config.units, "state")
+            try:
+                staged.text(STATE, to_json(tidy.as_dict(), indent=None))
+                with disk(self.out):
+                    staged.replace(STATE, STATE)
+            finally:
+                staged.clear()
+
+    @property
+    def kept_effects(self) -> dict[str, str | None]:
+        """Hashes of the user's own effects used for the results, by file name."""
+        return self._kept.own_effects if self._kept is not None else {}
+
+    # ------------------------------------------------------------ current or stale
+    def why_stale(self, step: str) -> str:
+        """Return the reason why `step` is out of date, or "" if it is current."""
+        if self._keys is None:
+            self._keys = self._step_keys(self.marks)
+        for name in self.up_to(step):
+            done = self.state.steps.get(name)
+            if done is None:
+                return f"{name} has not been done"
+            if done.key != self._keys[name]:
+                return f"{name} is stale: {self._what_changed(name, done)}"
+            for file, size in done.files.items():
+                if file_size(f"{self.out}/{file}") != size or self._damaged(file, done):
+                    return f"{name} is stale: its {file} is missing or was changed"
+        return ""
+
+    def _step_keys(self, inputs: Mapping[str, Fingerprint]) -> dict[str, str]:
+        return manifest.step_keys(inputs, self.config, self.state.own_effects, self.state.properties)
+
+    def up_to(self, step: str) -> tuple[str, ...]:
+        """Return the steps up to `step`, in order; RequestError if these results have no such step."""
+        order = self.state.order
+        if step not in order:
+            laws = f"the aging laws of {self.state.properties.table}, which has no traces"
+            fix = f"Its steps are {' and '.join(order)}; sealfit lifetime asks its laws."
+            raise RequestError(f"{self.out} holds {laws}: there is no {step}.", fix=fix)
+        return order[: order.index(step) + 1]
+
+    def _damaged(self, file: str, done: manifest.Done) -> bool:
+        """Whether a file is not what its step wrote; it is read once by this process."""
+        if file not in done.checksums:
+            return False
+        if file not in self._checksums:
+            self._checksums[file] = fingerprint(self.out / file).sha256
+        return self._checksums[file] != done.checksums[file]
+
+    def _what_changed(self, step: str, done: manifest.Done) -> str:
+        if done.version != __version__:
+            return f"it was made by sealfit {done.version}, this is {__version__}"
+        known = self.state.inputs
+        changed = sorted(n for n, mark in self._changed.items() if not _same_content(mark, known.get(n)))
+        if changed:
+            more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+            return f"inputs changed ({', '.join(changed[:3])}{more})"
+        if self._kept is not None and self._kept.properties != self.state.properties:
+            return "other columns are asked for"
+        own = what_differs(self.kept_effects, self.state.own_effects)
+        if own and step == "close-loop":
+            return own
+        return f"the config ({self.state.config.name}) changed"
+
+    def require(self, step: str) -> None:
+        """Raise StaleError, naming the command to run, unless `step` and all before it are current."""
+        for name in self.up_to(step):
+            why = self.why_stale(name)
+            if why:
+                raise StaleError(f"{why}.", file=self.out, fix=f"Run: {self.command(name)}")
+
+    def require_effects(self) -> None:
+        """Raise RequestError if the loop needs the user's own effects and no folder of them is given."""
+        if self.effects is None and (self._names_effects or self.state.own_effects):
+            raise needed("the loop is closed with", self.state.own_effects)
+
+    def command(self, step: str) -> str:
+        """Return the command line that does `step`."""
+        out = quoted(self.out)
+        if step != self.state.order[0]:
+            own = self.effects or ("FOLDER" if self._names_effects or self.state.own_effects else None)
+            option = f" {OPTION} {quoted(own)}" if own and step == "close-loop" else ""
+            return f"sealfit {step} {out}{option}"
+        config = f" --config {quoted(self.state.config.path)}" if self.state.config.path else ""
+        if (asked := self.state.properties) is not None:
+            names = "".join(f" --property {quoted(name)}" for name in asked.names)
+            batch = f" --batch {quoted(asked.batch)}" if asked.batch != manifest.BATCH else ""
+            table = quoted(self.state.campaign / asked.table)
+            return f"sealfit fit-aging --values {table} --out {out}{config}{names}{batch}"
+        return f"sealfit ingest {quoted(self.state.campaign)} --out {out}{config}"
+
+    # ------------------------------------------------------------ reading
+    def read(self, table: str, columns: list[str] | None = None, **which: object) -> pd.DataFrame:
+        """Return a table, or those columns of it; `which` as `parquet.read`."""
+        from sealfit.store import parquet
+
+        try:
+            return parquet.read(self._parts_of(table) or self.out / f"{table}{PARQUET}", columns, **which)
+        finally:
+            self._require_unchanged()
+
+    def _require_unchanged(self) -> None:
+        """Raise OutError if another process has written since this one opened OUT for reading.
+
+        State.json changes before any other file does, so what was read until now is of one state.
+        """
+        if self._opened is not None and _status_of(self.out) != self._opened:
+            raise OutError("was written while it was read.", file=self.out, fix="Run the command again.")
+
+    def _parts_of(self, table: str) -> list[Path]:
+        files = (file for done in self.state.steps.values() for file in done.files)
+        return [self.out / file for file in files if file.startswith(f"{table}{PARQUET}/")]
+
+    def traces(self) -> list[StoredTraces]:
+        """Return where table `traces` lies, in groups of whole conditions."""
+        from sealfit.ingest.stored_parts import ARROW, PARTS, by_conditions
+        from sealfit.store import parquet
+
+        conditions = {}
+        for path in self._parts_of("traces"):
+            strokes = parquet.read_ipc((self.out / PARTS / path.name).with_suffix(ARROW))
+            conditions[path] = strokes["condition"].drop_null().unique().to_pylist()
+        return by_conditions(conditions)
+
+    def read_json(self, name: str) -> dict:
+        """Return `<name>.json`; OutError if it is none."""
+        path = self.out / f"{name}.json"
+        try:
+            return json.loads(path.read_text("utf-8"))
+        except (ValueError, RecursionError) as error:
+            fix = f"Run: sealfit close-loop {quoted(self.out)} --force"
+            raise OutError("is not what sealfit wrote.", file=path, fix=fix) from error
+        finally:
+            self._require_unchanged()
+
+    def seen_config(self, step: str) -> Config:
+        """Return the config as `step` uses it."""
+        return manifest.seen_config(step, self.config)
+
+    # ------------------------------------------------------------ writing
+    @contextlib.contextmanager
+    def step(self, name: str) -> Iterator[Staged]:
+        """Give a place for the files of step `name`; all are moved when the block ends without an error.
+
+        Raises
+        ------
+        OutError
+            If the disk is full or refuses; OUT then holds what it held before.
+        """
+        began = time.monotonic()
+        staged = Staged(self.out, self.config.units, name)
+        try:
+            yield staged
+            self._commit(name, staged, time.monotonic() - began)
+        finally:
+            staged.clear()
+
+    def _commit(self, name: str, staged: Staged, seconds: float) -> None:
+        inputs = self.state.inputs if staged.inputs is None else staged.inputs
+        # Copied, as the files below are those of no step.
+        files, checksums, steps = dict(staged.files), dict(staged.checksums), self.state.steps
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        key = self._step_keys(inputs)[name]
+        done = manifest.Done(key, __version__, now, round(seconds, 3), files, checksums)
+        earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
+        ended = replace(self.state, inputs=inputs, steps={**earlier, name: done})
+        left_over = self._left_over(steps[name].files if name in steps else {}, files)
+        begun = replace(ended, moving=manifest.Moving(staged.name, tuple(sorted(left_over))))
+        staged.text(staged_writes.BEGUN, to_json(begun.as_dict(), indent=None))
+        staged.text(staged_writes.ENDED, to_json(ended.as_dict(), indent=None))
+        staged.text(PROVENANCE, to_json(manifest.provenance(ended), indent=None))
+        # Until state.json is replaced, OUT is what it was. After that the step is done, and whoever opens OUT
+        # next moves the files if this process does not come to it.
+        with undisturbed(), disk(self.out):
+            staged.sync()
+            staged.replace(staged_writes.BEGUN, STATE)
+            staged.committed = True
+            staged_writes.sync(self.out)
+            staged_writes.finish(self.out, begun)
+            self.state = ended
+        self._checksums |= done.checksums
+        if staged.inputs is not None:
+            self.marks, self._changed, self._keys = inputs, {}, None
+
+    def _left_over(self, old: Mapping[str, int], files: Mapping[str, int]) -> set[str]:
+        """Return the files of an earlier time of the step that are not its any more.
+
+        In the folder of a table nothing else may lie, whoever left it there: readers take all of it.
+        """
+        folders = {file.split("/")[0] for file in files if "/" in file and not file.startswith("plots/")}
+        lying = {f"{folder}/{path.name}" for folder in folders for path in (self.out / folder).glob("*")}
+        return (old.keys() | lying) - files.keys()
+
+
+def _status_of(out: Path) -> tuple | None:
+    """Return what tells a state.json from any other; None without one."""
+    try:
+        status = os.stat(out / STATE)
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def _same_content(mark: Fingerprint, known: Fingerprint | None) -> bool:
+    return known is not None and mark.sha256 == known.sha256
+
+
+def _same_config(kept: ConfigCopy, config: ConfigCopy) -> bool:
+    try:
+        return kept.parse() == config.parse()
+    except ConfigError:
+        return False

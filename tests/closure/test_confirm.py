@@ -16,10 +16,10 @@ from sealfit.closure.confirm import (
     vague_between_speeds,
     varies_within,
 )
-from sealfit.closure.heldout import between_speeds, blocks
+from sealfit.closure.error_sizes import between_speeds, blocks
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 

@@ -18,7 +18,7 @@ from sealfit.closure.small_sample_test import (
     specimens_agree,
 )
 from sealfit.config import Config
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
 FEW_SPEEDS = (1.0, 4.0, 16.0, 64.0)

@@ -9,7 +9,7 @@ from sealfit.closure.linearised import Proposal
 from sealfit.closure.loop import _all_refused, _found_in_folds
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 

@@ -15,7 +15,7 @@ from sealfit.ingest.quality import NO_VALUE, incomplete_columns
 from sealfit.pipeline import STEPS, run
 from sealfit.report.summary_lines import lines
 from sealfit.simulation import Spec, simulate
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from sealfit.closure.intervals import Sandwich, mean_half_width, sandwiches, t_q
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.config import Config
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.tangent import Tangent
 

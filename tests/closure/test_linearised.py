@@ -6,7 +6,7 @@ from sealfit.closure.forms import MOST_PLACES, grid_of
 from sealfit.closure.linearised import Linearised, middles
 from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 

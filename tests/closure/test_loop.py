@@ -14,7 +14,7 @@ from sealfit.closure.predict import predict
 from sealfit.closure.result import BeforeAfter
 from sealfit.config import Config
 from sealfit.errors import RequestError
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 from sealfit.tables import RESIDUALS_AFTER, SCHEMAS
 

@@ -8,7 +8,7 @@ from sealfit.closure.channels import find_channels
 from sealfit.closure.loop import close_loop
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search, search_masked_pairs, search_pairs
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
 FOUR = (1.0, 4.0, 16.0, 64.0)

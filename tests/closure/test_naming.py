@@ -14,7 +14,7 @@ from sealfit.closure.ripple_selection import numbered
 from sealfit.closure.ripples import Peak
 from sealfit.effects import EFFECTS
 from sealfit.effects.free import SURFACE, free_effect
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import Groups, make_rows
 from sealfit.fit.joint.tangent import Tangent

@@ -11,7 +11,7 @@ from sealfit.closure.outlier_files import OutlierFile
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Parameter
-from sealfit.fit.joint.estimate import fit_declared, fitted_at
+from sealfit.fit.joint import fit_declared, fitted_at
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 

@@ -11,7 +11,7 @@ from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.search import mixed_columns, search, search_pairs
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
 COLUMNS = {

@@ -9,7 +9,7 @@ from sealfit.closure.output import GROUPS, POINTS, channel_table, curve_table, s
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.search import start_model

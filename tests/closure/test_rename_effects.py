@@ -14,7 +14,7 @@ from sealfit.closure.search import search
 from sealfit.closure.selection import select_effects
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit, fit_declared
+from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 

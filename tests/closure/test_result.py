@@ -27,7 +27,7 @@ from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit_declared, fitted_at
+from sealfit.fit.joint import fit_declared, fitted_at
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 from sealfit.units import Units

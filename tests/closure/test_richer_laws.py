@@ -5,7 +5,7 @@ from bins_helpers import make_bins
 from sealfit.closure.channels import find_channels
 from sealfit.closure.forms import richer_laws
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
 DAYS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)

@@ -16,7 +16,7 @@ from sealfit.closure.naming import propose
 from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
 CHANNELS = {

@@ -14,7 +14,7 @@ from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import _by_numbers, sensitivity, undetectable_variables
 from sealfit.config import Config
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
 SMALL = {"temperatures": (60.0,), "days": (1.0, 4.0), "bins": 6, "noise_N": 0.1, "setup": 0.003}

@@ -7,7 +7,7 @@ from sealfit.closure.channels import find_channels
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.closure.small_sample_test import ClusterTests, Root, log_p_of, mean_ratio, small_root
-from sealfit.fit.joint.estimate import fit_declared
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.tangent import Tangent
 

@@ -21,8 +21,8 @@ from sealfit.closure.subsampling import (
 )
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
+from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.declared import declare
-from sealfit.fit.joint.estimate import fit, fit_declared
 from sealfit.fit.joint.model import evaluate
 from sealfit.fit.joint.rows import make_rows
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from sealfit.config import parse_config
+from sealfit.draft import draft
 from sealfit.draft.columns import plateau_speeds, stroke_count
 from sealfit.draft.dialect import sniff, sniffed_delimiter
-from sealfit.draft.draft import draft
 from sealfit.draft.vocabulary import AFTER, UNITS, column_role, name_and_unit, setting
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import as_utf8

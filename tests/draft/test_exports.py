@@ -11,8 +11,8 @@ import numpy.testing as npt
 import pytest
 
 from sealfit.config import parse_config
+from sealfit.draft import draft
 from sealfit.draft.dialect import started_in
-from sealfit.draft.draft import draft
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_trace

@@ -13,7 +13,7 @@ import pytest
 
 from sealfit import cli
 from sealfit.config import load_config, parse_config
-from sealfit.draft.draft import draft
+from sealfit.draft import draft
 from sealfit.errors import RequestError
 from sealfit.ingest import workbooks
 from sealfit.ingest.campaign import ingest_campaign

@@ -9,10 +9,10 @@ from scipy import sparse
 from scipy.optimize import least_squares
 
 from sealfit.config import Config
+from sealfit.fit.aging import aging_curves, between_scatter, fit_series
 from sealfit.fit.aging.law import Values, fit_law, solve_law
 from sealfit.fit.aging.law_table import CurveInterval, Estimate, _judge, curve_errors, curve_intervals
-from sealfit.fit.aging.series import aging_curves, between_scatter, fit_series
-from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady import fit_conditions
 from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT
 

@@ -4,7 +4,7 @@ import pytest
 
 from sealfit.config import Config
 from sealfit.fit.joint.rows import merge_directions
-from sealfit.fit.steady.fit import fit_conditions
+from sealfit.fit.steady import fit_conditions
 from sealfit.fit.steady.uncertainty import run_means
 
 

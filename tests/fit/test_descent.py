@@ -8,8 +8,7 @@ from scipy.optimize import lsq_linear
 
 import sealfit.fit.joint.search as joint_search
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint import search
-from sealfit.fit.joint.estimate import fitted_at
+from sealfit.fit.joint import fitted_at, search
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.search import (

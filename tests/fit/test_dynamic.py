@@ -8,18 +8,18 @@ import pandas.testing as pdt
 import pytest
 
 from sealfit.config import load_config
+from sealfit.fit import whole_steady_fit
+from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.dynamic.bristle_model import Curve, Stroke
-from sealfit.fit.dynamic.fit import fit_dynamic
 from sealfit.fit.dynamic.presliding import fit_stiffness
 from sealfit.fit.dynamic.starts import starts_of, strokes_along
-from sealfit.fit.steady.fit import fit_conditions
-from sealfit.fit.stored_tables import whole_steady_fit
+from sealfit.fit.steady import fit_conditions
 from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.physics import LuGre, lugre_force
 from sealfit.pipeline import STEPS, run
 from sealfit.simulation import Spec, simulate
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 MODEL = {"mu_s": 0.9, "mu_c": 0.6, "v_s": 5.0, "sigma_2": 0.05, "sigma_0": 100.0, "sigma_1": 0.5}
 LOAD = 49.03

@@ -7,8 +7,8 @@ import pytest
 
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
+from sealfit.fit.joint import _searched, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.declared import declare, speed_clusters
-from sealfit.fit.joint.estimate import _searched, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
 from sealfit.fit.joint.rows import make_rows, thin
 from sealfit.fit.joint.search import start_model
@@ -330,7 +330,7 @@ def test_a_search_on_few_rows_is_not_believed_against_all_rows(found, searched, 
     def on_few_rows(model, *given):
         return model.at(np.where(model.nonlinear, model.vector(), model.vector() * (1 + found)))
 
-    monkeypatch.setattr("sealfit.fit.joint.estimate.search_nonlinear", on_few_rows)
+    monkeypatch.setattr("sealfit.fit.joint.search_nonlinear", on_few_rows)
     rows = rows_of(bins=6, repeats=1, noise_N=1.0)
     before = fit_declared(rows)
     term = Term(EFFECTS["linear"], ("distance_mm",), "mu", "multiply", {"x_ref": 0.0})

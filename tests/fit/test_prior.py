@@ -10,7 +10,7 @@ import pytest
 from sealfit.closure.channels import Channel
 from sealfit.closure.forms import free_term
 from sealfit.effects.free import natural, roughness
-from sealfit.fit.joint.estimate import effective_df, fit, fit_declared
+from sealfit.fit.joint import effective_df, fit, fit_declared
 from sealfit.fit.joint.model import shape_of
 from sealfit.fit.joint.prior import penalised, reml_smoothness
 from sealfit.fit.joint.rows import make_rows

@@ -7,10 +7,10 @@ from scipy.optimize import least_squares
 from steady_tables import MU_C, MU_S
 
 from sealfit.config import Config, Quantity
+from sealfit.fit import steady
 from sealfit.fit.aging.all_series import aged_values, joint_laws
 from sealfit.fit.aging.joint_law import fit_joint_law
-from sealfit.fit.steady import fit
-from sealfit.fit.steady.fit import fit_conditions, solve_conditions
+from sealfit.fit.steady import fit_conditions, solve_conditions
 from sealfit.fit.steady.shared_curve import shared_levels
 from sealfit.fit.steady.uncertainty import run_means
 from sealfit.physics import aging_law, stribeck_force
@@ -49,7 +49,7 @@ def run_table(table):
 def test_intervals_do_not_depend_on_which_conditions_are_done_together(campaign, monkeypatch):
     table, config = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,)), Config()
     one = fit_conditions(table, config)
-    monkeypatch.setattr(fit, "BLOCK", 10)
+    monkeypatch.setattr(steady, "BLOCK", 10)
     pdt.assert_frame_equal(fit_conditions(table, config), one)
 
 

@@ -6,7 +6,7 @@ from scipy.optimize import curve_fit
 
 from sealfit.config import Config, Quantity, Sensor
 from sealfit.errors import FitError
-from sealfit.fit.steady.fit import fit_conditions, parameter_units
+from sealfit.fit.steady import fit_conditions, parameter_units
 from sealfit.fit.steady.uncertainty import more_likely, run_means, speed_levels, unit_variance
 from sealfit.tables import STEADY_FIT
 from sealfit.units import Units

@@ -3,9 +3,9 @@ import pytest
 from steady_tables import steady_rows
 
 from sealfit.config import Config
-from sealfit.fit.aging.series import fit_series
-from sealfit.fit.steady.fit import fit_conditions
-from sealfit.fit.stored_tables import stored, whole_steady_fit
+from sealfit.fit import stored, whole_steady_fit
+from sealfit.fit.aging import fit_series
+from sealfit.fit.steady import fit_conditions
 from sealfit.store import parquet
 from sealfit.tables import SCHEMAS
 from sealfit.units import Units

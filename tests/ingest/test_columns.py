@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 
-from sealfit.ingest.categorical import columns_of, in_order, overlaid, put, taken, where
+from sealfit.ingest.columns import columns_of, in_order, overlaid, put, taken, where
 
 
 def test_the_last_source_that_says_something_is_believed():

@@ -15,7 +15,7 @@ from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.partitions import MOST, PART_FILES, plan_parts
 from sealfit.pipeline import ingest
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 SAMPLED = ("traces", "traces_mean", "bins")
 SMALL = ("inputs", "runs", "quality", "steady")

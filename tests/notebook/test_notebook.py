@@ -21,7 +21,7 @@ from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.errors import OutError, RequestError, StaleError
 from sealfit.notebook.plots import Plots
 from sealfit.report.summary_lines import lifetime_lines
-from sealfit.store.out_folder import Store
+from sealfit.store import Store
 
 TUTORIAL = DOCS / "tutorial.ipynb"
 CONDITION = "temperature_C=60, compression_ratio_pct=80, aging_days=4"

@@ -30,7 +30,7 @@ from report.made_tables import (
 
 from sealfit.config import Config
 from sealfit.fit.aging.all_series import joint_laws
-from sealfit.ingest.categorical import add_keys
+from sealfit.ingest.columns import add_keys
 from sealfit.report.page import FITS
 
 NAMES = (

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 from report.made_tables import law, table
 
-from sealfit.ingest.categorical import add_keys
+from sealfit.ingest.columns import add_keys
 
 SIGMA_0, SIGMA_1 = 100.0, 0.5
 PEAK = 0.08

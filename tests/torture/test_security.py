@@ -25,12 +25,12 @@ from trace_helpers import HEADER, ROWS, campaign, config, csv_of
 import sealfit
 from sealfit import cli, commands
 from sealfit.closure.prediction_csv import ANSWERS, read_points, write_answers
-from sealfit.draft.draft import draft
+from sealfit.draft import draft
 from sealfit.errors import CampaignError, ConfigError, OutError, SealfitError
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.pipeline import run
 from sealfit.simulation import load_spec, simulate
-from sealfit.store.lock import LOCK
+from sealfit.store.staged_writes import LOCK
 
 SOURCE = Path(sealfit.__file__).parent
 DAYS = 'condition = ["aging_days"]\n'

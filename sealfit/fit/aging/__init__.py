@@ -1,0 +1,300 @@
+"""The aging law (Eq. 15) of mu_s and mu_c per series, fitted to the steady fits of the conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pandas as pd
+from scipy.sparse import csr_array, diags_array
+
+from sealfit.config import Config
+from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
+from sealfit.fit.aging.law_table import (
+    DAYS_FOR_LAW,
+    Curve,
+    Estimate,
+    OneQuantity,
+    covariance_rows,
+    curve_errors,
+    curve_intervals,
+    law_rows,
+    statistics_rows,
+    t_of_95,
+    without_law,
+)
+from sealfit.fit.steady.condition import FULL
+from sealfit.physics import aging_law
+from sealfit.tables import AGING_CURVES, AGING_FIT
+
+PAIRS = (("mu_s", "mu_c"), ("F_s", "F_c"))
+# Number of the curve of values that no law is fitted to.
+WITHOUT_LAW = -2
+# Smallest relative standard deviation of a steady value.
+SMALLEST = 1e-6
+# Number of points of a curve.
+CURVE_POINTS = 61
+
+
+def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
+    r"""Fit the aging law to every series, mu_0 shared by all series of a rubber.
+
+    .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b), \quad c = -a \ln b
+
+    All series and both quantities of a rubber are fitted together by generalised least squares. The
+    covariance is that of mu_s and mu_c in the steady fits plus the scatter between specimens, estimated from
+    the residuals.
+
+    Parameters
+    ----------
+    steady_fit : DataFrame
+        Table `steady_fit` with the column `aging_days`; only identified values are used.
+    config : Config
+        Names the condition columns.
+
+    Returns
+    -------
+    DataFrame
+        Table `aging_fit`: per series and quantity mu_0, a, b, c; "statistics" and "covariance" rows, whose
+        `parameter` starts with the quantity ("mu_s:mu_0,mu_s:ln b"). Empty without `aging_days` in the
+        condition or without aged rubber.
+
+    Notes
+    -----
+    Intervals of a, b and c are profile-likelihood intervals, that of mu_0 is from the curvature, with
+    Student's t. The degrees of freedom are values minus parameters of the quantity, as specimens are the unit
+    of evidence. `u_sys` is the change of the fit if the sensor's error changes all steady values together.
+    """
+    open_columns = [name for name in config.series_columns if name in steady_fit.columns]
+    columns = [*AGING_FIT.names(), *open_columns]
+    has_aging = config.aging and "aging_days" in steady_fit.columns
+    rubbers = steady_fit.groupby("rubber", sort=True) if has_aging else ()
+    rows = [{"rubber": rubber, **row} for rubber, own in rubbers for row in _fit_rubber(own)]
+    if not rows:
+        return pd.DataFrame({name: steady_fit[name].iloc[:0] for name in columns})
+    keys = steady_fit.groupby("series", sort=True)[open_columns].first().reset_index()
+    return pd.DataFrame(rows).merge(keys, on="series", how="left", validate="many_to_one")[columns]
+
+
+# ---------------------------------------------------------------- one rubber
+def _fit_rubber(own: pd.DataFrame) -> list[dict]:
+    found = own[(own["quantity"] == "steady") & own["identified"].to_numpy(bool) & own["value"].notna()]
+    pair = next((pair for pair in PAIRS if found["parameter"].isin(pair).any()), None)
+    if pair is None:
+        return []
+    found = found[found["parameter"].isin(pair) & found["aging_days"].notna()]
+    found = _of_one_meaning(found, own, pair)
+    found = found.assign(quantity=found["parameter"]).sort_values(["condition", "quantity"], kind="stable")
+    aged = own[own["aging_days"].to_numpy(float) > 0]
+    quantities = [name for name in pair if (found["quantity"] == name).any()]
+    unit = str(found["unit"].iloc[0])
+    curves = curves_of(found, list(dict.fromkeys(aged["series"])), quantities, unit)
+    fitted = [name for name in quantities if any(c.place >= 0 and c.quantity == name for c in curves)]
+    if not fitted:
+        return [row for curve in curves for row in without_law(curve)]
+    number = numbers_of(found, curves)
+    used, number = found[number > WITHOUT_LAW], number[number > WITHOUT_LAW]
+    values = Values(
+        used["aging_days"].to_numpy(float),
+        used["value"].to_numpy(float),
+        np.array([fitted.index(name) for name in used["quantity"]], int),
+        number,
+        steady_covariance(used, values_of(own, "covariance")),
+    )
+    known = values_of(own, "sensor_shift")
+    moved = [known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)]
+    return list(rubber_rows(values, curves, fitted, np.nan_to_num(np.array(moved, float))))
+
+
+def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
+    """Return the values without mu_c of conditions with too few speeds, if others have a Stribeck curve.
+
+    The "mu_c" of two or three slow speeds includes mu_s: it is a different quantity.
+    """
+    with_curve = set(found.loc[found["parameter"] == pair[0], "condition"])
+    if not with_curve:
+        return found
+    speeds = own[(own["quantity"] == "statistics") & (own["parameter"] == "n_speeds")]
+    few = set(speeds.loc[speeds["value"] < FULL, "condition"]) - with_curve
+    return found[~((found["parameter"] == pair[1]) & found["condition"].isin(few))]
+
+
+def curves_of(found: pd.DataFrame, series: list[str], quantities: list[str], unit: str) -> list[Curve]:
+    """Return the curves of some series and quantities; those with enough days are numbered.
+
+    `found` are the values, with their `series`, `quantity` and `aging_days`.
+    """
+    unaged = set(found.loc[found["aging_days"] == 0, "quantity"])
+    aged = found[found["aging_days"] > 0]
+    tested = dict(
+        aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False).unique()
+    )
+    curves, place = [], 0
+    for name in series:
+        for quantity in quantities:
+            days = np.sort(tested.get((name, quantity), np.zeros(0)))
+            enough = days.size + (quantity in unaged) >= DAYS_FOR_LAW
+            curves.append(Curve(name, quantity, place if enough else -1, days, quantity in unaged, unit))
+            place += enough
+    return curves
+
+
+def numbers_of(found: pd.DataFrame, curves: list[Curve]) -> np.ndarray:
+    """Return the number of each value's curve, shape (n,); -1 for unaged rubber, `WITHOUT_LAW` for none."""
+    place = {(c.series, c.quantity): c.place for c in curves if c.place >= 0}
+    keys = zip(found["series"], found["quantity"], strict=True)
+    own = np.array([place.get(key, WITHOUT_LAW) for key in keys], int)
+    has_law = found["quantity"].isin({quantity for _, quantity in place}).to_numpy()
+    return np.where((found["aging_days"] == 0).to_numpy() & has_law, -1, own)
+
+
+def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], float]:
+    """Return the values of table `steady_fit` with a `quantity`, by condition and parameter."""
+    rows = steady_fit[steady_fit["quantity"] == quantity]
+    return dict(
+        zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"].tolist(), strict=True)
+    )
+
+
+def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> csr_array:
+    """Return the covariance of steady values, shape (n, n); it is 0 between conditions.
+
+    `used` has the values: `condition`, `quantity` (mu_s, ...) and `value`. `known` are the covariances,
+    `values_of(steady_fit, "covariance")`.
+    """
+    quantity, n = used["quantity"].to_numpy(object), len(used)
+    pairs, found = [], []
+    for condition, places in used.groupby("condition", sort=False).indices.items():
+        for i, j in product(places.tolist(), repeat=2):
+            names = sorted((quantity[i], quantity[j]), reverse=True)  # mu_s before mu_c
+            value = known.get((condition, f"{names[0]},{names[1]}"), np.nan)
+            pairs.append((i, j))
+            found.append(value if np.isfinite(value) else 0.0)
+    covariance = csr_array((found, np.reshape(pairs, (-1, 2)).T), shape=(n, n))
+    return covariance + diags_array((SMALLEST * used["value"].to_numpy(float)) ** 2 + 1e-300)
+
+
+def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Values:
+    """Return values with specimen scatter in the covariance, correlated in a condition as the residuals."""
+    scale = values.scale(model)
+    relative = (values.value - model) / scale
+    added = np.array(taus)[values.origin] * scale
+    near = values.covariance.tocoo()
+    link = values.origin[near.row] != values.origin[near.col]
+    row, column, covariance = near.row[link], near.col[link], near.data[link]
+    correlation = 0.0
+    if row.size and min(taus) > 0:
+        cross = (relative[row] * relative[column] - covariance / (scale[row] * scale[column])).mean()
+        correlation = float(np.clip(cross / np.prod(taus), -0.9, 0.9))  # below 1, so that it is invertible
+    both = csr_array((correlation * added[row] * added[column], (row, column)), shape=near.shape)
+    return replace(values, covariance=values.covariance + diags_array(added**2) + both)
+
+
+def between_scatter(values: Values) -> tuple[float, LawFit]:
+    """Return the relative scatter of a quantity's values beyond their covariance, and the fit without it.
+
+    The variance of every value is increased by (scatter times the law or `size`)^2; the estimate is Paule and
+    Mandel's.
+    """
+    plain = fit_law(values)
+    if plain.df <= 0 or plain.chi2 <= plain.df:
+        return 0.0, plain
+    scale, last = values.scale(plain.model), plain
+
+    def chi2(tau: float) -> float:
+        nonlocal last
+        covariance = values.covariance + diags_array((tau * scale) ** 2)
+        last = fit_law(replace(values, covariance=covariance), last.x)
+        return last.chi2
+
+    return paule_mandel(chi2, plain.df, (plain.model - values.value) / scale), plain
+
+
+# ---------------------------------------------------------------- table
+def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndarray) -> Iterator[dict]:
+    """Yield the rows of table `aging_fit` of one rubber.
+
+    `fitted` are the quantities with a law, in the order of `values.origin`; `curves` are all, those without a
+    law too. `moved`, shape (n,), is the change of the values if the sensor reads one standard uncertainty too
+    high.
+    """
+    quantities = {}
+    model = np.empty(values.value.size)
+    for q, name in enumerate(fitted):
+        part = np.flatnonzero(values.origin == q)
+        tau, alone = between_scatter(values.part(part))
+        series = len({c.series for c in curves if c.place >= 0 and c.quantity == name})
+        quantities[name] = OneQuantity(alone, part, tau, series)
+        model[part] = alone.model
+    joint = fit_law(_with_specimens(values, [one.tau for one in quantities.values()], model))
+    intervals = curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))
+    covariance, shift = curve_errors(joint, moved)
+    x = joint.x[values.places_of_curve]
+    for curve in curves:
+        if curve.place < 0:
+            yield from without_law(curve)
+            continue
+        one = quantities[curve.quantity]
+        found = Estimate(x[curve.place], covariance[curve.place], shift[curve.place])
+        yield from law_rows(curve, found, intervals[curve.place], one.level_df)
+        yield from statistics_rows(curve, joint, one)
+        yield from covariance_rows(curve, found.covariance)
+
+
+# ---------------------------------------------------------------- curves
+def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.DataFrame:
+    """Return the law of every series and quantity along aging time, with its 95 % band.
+
+    Parameters
+    ----------
+    aging_fit : DataFrame
+        Table `aging_fit`.
+    days : ndarray, shape (n,), optional
+        Aging times in days; default from 0 to the last tested day, denser near 0.
+
+    Returns
+    -------
+    DataFrame
+        Table `aging_curves`; the band is that of the population mean, from the covariance of mu_0, a and ln
+        b.
+    """
+    tables = []
+    for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
+        keys = zip(own["quantity"], own["parameter"], strict=True)
+        known = dict(zip(keys, own["value"].tolist(), strict=True))
+        for quantity in [quantity for quantity, parameter in known if parameter == "mu_0"]:
+            curve = pd.DataFrame(_curve(known, quantity, days), columns=AGING_CURVES.names())
+            tables.append(curve.assign(series=series, quantity=quantity))
+    return pd.concat([curve for curve in tables if len(curve)] or [_no_curve()], ignore_index=True)
+
+
+def _no_curve() -> pd.DataFrame:
+    texts = dict.fromkeys(("series", "quantity"), "str")
+    return pd.DataFrame(columns=AGING_CURVES.names(), dtype=float).astype(texts)
+
+
+def _curve(
+    known: dict[tuple[str, str], float], quantity: str, days: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """Return the curve of one quantity, empty without a law; `known` are values by quantity and parameter."""
+    mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
+    if np.isnan([mu_0, a, b]).any():
+        return {}
+    names = [f"{quantity}:{name}" for name in ("mu_0", "a", "ln b")]
+    covariance = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            value = known["covariance", f"{names[j]},{names[i]}"]
+            covariance[i, j] = covariance[j, i] = value if np.isfinite(value) else 0.0
+    df = known["statistics", f"{quantity}:error_df"]
+    t = t_of_95(df)
+    if days is None:
+        days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
+    days = np.asarray(days, float)
+    ratio = days / b
+    slope = np.stack([np.ones_like(days), -np.log1p(ratio), a * ratio / (1 + ratio)], axis=1)
+    half = t * np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", slope, covariance, slope), 0.0))
+    value = aging_law(days, mu_0=mu_0, a=a, b=b)
+    return {"aging_days": days, "value": value, "lo95": value - half, "hi95": value + half}

@@ -11,7 +11,7 @@ from sealfit.config import Config
 from sealfit.errors import FitError, RequestError
 from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw, fit_laws, left_out, rivals_of
 from sealfit.fit.aging.law import Values, fit_law, law_model
-from sealfit.fit.steady.fit import FORCES, parameter_units
+from sealfit.fit.steady import FORCES, parameter_units
 from sealfit.fit.steady.shared_curve import Levels, shared_levels
 from sealfit.physics.aging_laws import LOSSES
 from sealfit.tables import AGING_LAWS, MASTER_CURVE

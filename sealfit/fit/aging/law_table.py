@@ -12,7 +12,7 @@ from scipy.special import chdtrc, fdtrc, ndtri, stdtrit
 
 from sealfit.fit.aging.law import PROFILED, Groups, LawFit
 from sealfit.fit.least_squares import CHUNK, covariance_of, levenberg_marquardt
-from sealfit.fit.steady.fit import table_row
+from sealfit.fit.steady import table_row
 
 # Tolerance of the ends of intervals in ln b: 0.1 % of b.
 CLOSE = 1e-3

@@ -21,11 +21,11 @@ from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from sealfit.config import Config
+from sealfit.fit.aging import SMALLEST, WITHOUT_LAW, aging_curves, curves_of, numbers_of, rubber_rows
 from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, law_tables, laws_of, rubber_of
 from sealfit.fit.aging.joint_law import Aged, JointLaw
 from sealfit.fit.aging.law import Values
 from sealfit.fit.aging.law_table import without_law
-from sealfit.fit.aging.series import SMALLEST, WITHOUT_LAW, aging_curves, curves_of, numbers_of, rubber_rows
 from sealfit.tables import AGING_FIT
 
 # Largest ratio of the variance between batches to that between specimens that is searched.

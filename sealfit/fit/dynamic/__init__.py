@@ -1,0 +1,338 @@
+"""The model's dynamic part per condition: sigma_0 and sigma_1 from pre-sliding, and the break-away force."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+
+from sealfit.config import Config
+from sealfit.engine.run_map import run_map
+from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke, mean_over
+from sealfit.fit.dynamic.presliding import Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
+from sealfit.fit.dynamic.starts import Along, Part, Start, starts_of, strokes_along, whole_strokes
+from sealfit.fit.joint.rows import nesting_run
+from sealfit.fit.steady import condition_keys, parameter_units, table_row
+from sealfit.ingest.stored_parts import StoredTraces
+from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
+
+# Reasons why sigma_0 or sigma_1 is not determined.
+NO_START = (
+    "no stroke begins at rest or at a reversal within its rows: the rise of the force is not in these traces"
+)
+ALONG = (
+    "the sliding force of some strokes lies along the motion: check the offset between the directions, "
+    "and the sign"
+)
+TOO_FAST = "the force rises within a few samples: sample faster, or start more slowly"
+MISSED = "the rise of the force differs from the model's: the residual is {share:.0%} of the sliding force"
+NO_CURVE = "the Stribeck curve is not known: its effect along the ramp cannot be distinguished from damping"
+ONE_START = "one start alone: no scatter is known; measure repeats"
+WIDE = "the starts disagree: only that it lies between {low:.3g} and {high:.3g} {unit} is known"
+
+
+def bristle_rows(
+    found: Stiffness | None, curve: Curve, config: Config, *, braked: bool = True
+) -> Iterator[dict]:
+    """Yield rows of table `dynamic_fit` for one condition: sigma_0, sigma_1 and statistics of the fit.
+
+    `found` is None if no stroke has a recorded start; `braked` is whether the sliding force of every stroke
+    opposes its motion.
+    """
+    units = dynamic_units(config)
+    if found is None or not found.seen:
+        reason = TOO_FAST if found is not None else NO_START if braked else ALONG
+        for name in ("sigma_0", "sigma_1"):
+            yield table_row(
+                quantity="dynamic", parameter=name, unit=units[name], identified=False, reason=reason
+            )
+        return
+    yield _stiffness_row(found, curve, units["sigma_0"], config)
+    yield _damping_row(found, curve, units["sigma_1"])
+    rise = curve.coulomb_N / found.sigma_0
+    for name, value, unit in (
+        ("rise", rise, config.units.unit("displacement")),
+        ("samples_in_rise", found.within, ""),
+        ("files", found.files, ""),
+        ("rmse", found.rmse_N, config.units.unit("force")),
+    ):
+        yield table_row(quantity="statistics", parameter=name, value=value, unit=unit)
+
+
+def _stiffness_row(found: Stiffness, curve: Curve, unit: str, config: Config) -> dict:
+    value = found.sigma_0
+    row = {"quantity": "dynamic", "parameter": "sigma_0", "unit": unit, "value": value}
+    if found.files < 2:
+        return table_row(**row, identified=False, reason=ONE_START)
+    half = found.log_half_width()
+    low, high = (value * np.exp(np.clip(sign * half, -50, 50)) for sign in (-1.0, 1.0))
+    row |= {"se": value * np.sqrt(found.covariance[0, 0]), "lo95": low, "hi95": high}
+    row["u_sys"] = value * config.sensor.u / abs(curve.coulomb_N)
+    remark = MISSED.format(share=found.rmse_N / curve.coulomb_N) if found.misses(curve.coulomb_N) else ""
+    reason = remark if found.stiffness_known else WIDE.format(low=low, high=high, unit=unit)
+    return table_row(**row, identified=found.stiffness_known, reason=reason)
+
+
+def _damping_row(found: Stiffness, curve: Curve, unit: str) -> dict:
+    row = {"quantity": "dynamic", "parameter": "sigma_1", "unit": unit, "value": found.sigma_1}
+    if found.files < 2 or not found.stiffness_known:
+        why = ONE_START if found.files < 2 else "sigma_0 is not determined"
+        return table_row(**row, identified=False, reason=why)
+    if not curve.known:
+        return table_row(**row, identified=False, reason=NO_CURVE)
+    half = found.damping_half_width()
+    low, high = max(found.sigma_1 - half, 0.0), found.sigma_1 + half
+    row |= {"lo95": low, "hi95": high, "se": found.damping_se}
+    if low > 0.0:
+        return table_row(**row)
+    reason = f"no damping of the bristles is seen: at most {high:.2g} {unit}"
+    return table_row(**row, identified=False, reason=reason)
+
+
+def dynamic_units(config: Config) -> Mapping[str, str]:
+    """Return the units of sigma_0 and sigma_1 under the config's units."""
+    units = config.units
+    return {
+        "sigma_0": f"{units.unit('force')}/{units.unit('displacement')}",
+        "sigma_1": parameter_units(units, has_load=True)["sigma_2"],
+    }
+
+
+# ---------------------------------------------------------------- dynamic
+# Columns of table `traces` that are read.
+OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]
+
+
+@dataclass(frozen=True)
+class Dynamic:
+    """Tables `dynamic_fit`, with the condition columns, and `dynamic_curves`."""
+
+    fit: pd.DataFrame
+    curves: pd.DataFrame
+
+
+def fit_dynamic(
+    traces: pd.DataFrame | Sequence[StoredTraces],
+    steady: pd.DataFrame,
+    steady_fit: pd.DataFrame,
+    config: Config,
+    *,
+    workers: int = 1,
+) -> Dynamic:
+    """Fit sigma_0 and sigma_1 of Eqs. 1 to 7 to the pre-sliding part of every condition's strokes.
+
+    Parameters
+    ----------
+    traces : DataFrame or sequence of StoredTraces
+        Table `traces`, or its stored partitions, which are read one at a time.
+    steady : DataFrame
+        Table `steady` or `steady_after`; rows with `used` false are left out.
+    steady_fit : DataFrame
+        Its table `steady_fit` with the Stribeck curve of each condition; a curve that is not identified is
+        flat.
+    config : Config
+        Names the condition columns, the units and the sensor's accuracy.
+    workers : int
+        Number of processes.
+
+    Returns
+    -------
+    Dynamic
+        In its fit `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed and
+        direction: the force, and its ratio to the sliding force), "largest" (likewise: ratio of the largest
+        force in the strokes to the sliding force) or "statistics". Its curves are the mean starts, measured
+        and fitted.
+
+    Notes
+    -----
+    The unit of evidence is the file for the length of the rise and the run for the level of the force; it is
+    the stroke if there is only one file or run. Intervals of sigma_0 are symmetric in its logarithm. `u_sys`
+    assumes one unknown error of |force| for all samples.
+    """
+    steady = steady[steady["used"].astype(bool) & steady["condition"].notna()].reset_index(drop=True)
+    asked = _asked(traces, steady, steady_fit)
+    found = run_map(partial(_fit_some, config=config), asked, workers=workers)
+    rows, curves, broken, largest = (_together(tables) for tables in zip(*found, strict=True))
+    tables = [
+        rows,
+        largest_rows(largest, config) if len(largest) else largest,
+        break_away_rows(broken, _widened(steady_fit), config) if len(broken) else broken,
+    ]
+    keys = condition_keys(steady, config)
+    table = pd.concat([part for part in tables if len(part)], ignore_index=True)
+    table = table.merge(keys, on="condition", how="left", validate="many_to_one").assign(model="before")
+    fixed = DYNAMIC_FIT.names()
+    table = table.reindex(columns=[*fixed, *(name for name in keys.columns if name not in fixed)])
+    return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
+
+
+# The traces of some conditions, and their rows of `steady` and `steady_fit`.
+Asked = tuple[pd.DataFrame | StoredTraces, pd.DataFrame, pd.DataFrame]
+
+
+def _asked(
+    traces: pd.DataFrame | Sequence[StoredTraces], steady: pd.DataFrame, steady_fit: pd.DataFrame
+) -> list[Asked]:
+    """Return the conditions to fit, in partitions that are read together."""
+    if isinstance(traces, pd.DataFrame):
+        return [(traces, steady, steady_fit)]
+    piece = {condition: k for k, part in enumerate(traces) for condition in part.conditions}
+    rows = [dict(iter(table.groupby(table["condition"].map(piece)))) for table in (steady, steady_fit)]
+    return [
+        (part, rows[0][k], rows[1].get(k, steady_fit.iloc[:0]))
+        for k, part in enumerate(traces)
+        if k in rows[0]
+    ]
+
+
+def _together(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return tables of conditions as one, in order of the conditions."""
+    parts = [table for table in tables if len(table)]
+    if not parts:
+        return pd.DataFrame()
+    return pd.concat(parts).sort_values("condition", kind="stable", ignore_index=True)
+
+
+def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
+    """Return the rows of the fit, the mean starts, the break-aways and the largest forces of conditions."""
+    traces, steady, steady_fit = asked
+    if not isinstance(traces, pd.DataFrame):
+        traces = traces.read(OF_TRACES, coded=["file"])
+    groups = steady.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False)
+    numbers = {"group": groups.ngroup(), "file_number": pd.factorize(steady["file"])[0]}
+    table = steady.assign(size_N=steady["force_N"] * steady["direction"], **numbers).reset_index(drop=True)
+    along = _less_effects(strokes_along(traces, table), table)
+    starts = {start.row: start for start in starts_of(along)}
+    wholes = {whole.row: whole for whole in whole_strokes(along)}
+    begun = steady.iloc[list(starts)]
+    table.loc[list(starts), "run_number"] = pd.factorize(nesting_run(begun))[0]
+    fitted = _fitted(steady_fit)
+    tables = [[], [], [], []]
+    for name, own in table.sort_values("group", kind="stable").groupby("condition", sort=True):
+        start, whole = (
+            [parts[row] for row in own.index.tolist() if row in parts] for parts in (starts, wholes)
+        )
+        curve = _curve(name, fitted, own)
+        of_starts = own.loc[[one.row for one in start]]
+        braked = bool((of_starts["size_N"] > 0).all())  # as the model needs
+        found = fit_stiffness(_evidence(start, of_starts, curve), curve) if braked else None
+        models = found.forces_N if found is not None and found.seen else None
+        made = [pd.DataFrame(bristle_rows(found, curve, config, braked=braked))]
+        grouped = _Grouped(start, table) if start else None
+        made += [grouped.curves(models), grouped.peaks()] if grouped else [pd.DataFrame(), pd.DataFrame()]
+        made.append(_Grouped(whole, table).peaks() if whole else pd.DataFrame())
+        for kept, one in zip(tables, made, strict=True):
+            kept.append(one.assign(condition=name))
+    return [_together(parts) for parts in tables]
+
+
+def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Along]:
+    """Return strokes minus the effects' force at their start, if table `steady` has it."""
+    if "effects_start_N" not in steady:
+        return strokes
+    size = (steady["effects_start_N"] * steady["direction"]).tolist()
+    return [replace(stroke, force_N=stroke.force_N - size[stroke.row]) for stroke in strokes]
+
+
+class _Grouped:
+    """Parts of strokes of one condition, in groups of one commanded speed and direction."""
+
+    def __init__(self, parts: Sequence[Part], table: pd.DataFrame) -> None:
+        own = table.loc[[part.row for part in parts]]
+        group = np.unique(own["group"], return_inverse=True)[1]
+        self.cells, self.file = Cells(parts, group), own["file_number"].to_numpy()
+        self.at = own[["speed_set_mm_s", "direction"]].iloc[self.cells.groups.start].reset_index(drop=True)
+
+    def peaks(self) -> pd.DataFrame:
+        """Return the result of `peaks` as a table, with speed and direction."""
+        found = peaks(self.cells, self.file)
+        at = self.at.iloc[found.pop("group")].reset_index(drop=True)
+        return at.assign(**found)
+
+    def curves(self, models: Sequence[np.ndarray] | None) -> pd.DataFrame:
+        """Return the mean starts, measured and, if there is a fit, modelled, as table `dynamic_curves`."""
+        force, error, n = mean_over(self.cells, self.cells.force_N)
+        model = mean_over(self.cells, self.cells.means(models))[0] if models else np.full(n.shape, np.nan)
+        table = {
+            "distance_mm": self.cells.middle_mm,
+            "force_N": force,
+            "force_se_N": error,
+            "n": n,
+            "model_N": model,
+        }
+        group, cell = np.nonzero(n > 0)
+        at = self.at.iloc[group].reset_index(drop=True)
+        return at.assign(**{name: values[group, cell] for name, values in table.items()})
+
+
+def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
+    """Return the reduced chi-square of all conditions' run means under the repeats' scatter, and its df."""
+    rows = steady_fit[steady_fit["quantity"] == "statistics"]
+    table = rows[rows["parameter"].isin(["chi2", "df"])].pivot(
+        index="condition", columns="parameter", values="value"
+    )
+    table = table.reindex(columns=["chi2", "df"]).dropna()
+    df = float(table["df"].sum())
+    return (float(table["chi2"].sum()) / df, df) if df > 0 else (1.0, 1.0)
+
+
+def _evidence(starts: Sequence[Start], steady: pd.DataFrame, curve: Curve) -> list[Stroke]:
+    """Return the starts of a condition with their units of evidence and their ratio to the curve.
+
+    The ratio is that of the loads, or of the sliding forces if the curve is not determined. `steady` has the
+    row of each start.
+    """
+    size = steady["load_N" if curve.known else "size_N"].to_numpy(float)
+    known = size[~np.isnan(size)]
+    ratio = size / (curve.coulomb_N if not curve.known else known.mean() if known.size else 1.0)
+    ratio = np.where(np.isnan(ratio), 1.0, ratio).tolist()
+    units = (_numbered(steady[name].to_numpy(int)).tolist() for name in ("file_number", "run_number"))
+    return [
+        Stroke(file, run, part, s.distance_mm, s.speed_mm_s, s.force_N)
+        for file, run, part, s in zip(*units, ratio, starts, strict=True)
+    ]
+
+
+def _numbered(numbers: np.ndarray) -> np.ndarray:
+    """Return the number of each stroke's file or run; that of the stroke if there is only one."""
+    return numbers if (numbers != numbers[:1]).any() else np.arange(len(numbers))
+
+
+# Values of table `steady_fit` by condition, quantity and parameter.
+Known = Mapping[tuple[str, str, str], float]
+
+
+def _fitted(steady_fit: pd.DataFrame) -> Known:
+    """Return the values of table `steady_fit`, of parameters only identified ones."""
+    rows = steady_fit[steady_fit["identified"].to_numpy(bool) | (steady_fit["quantity"] != "steady")]
+    keys = zip(rows["condition"], rows["quantity"], rows["parameter"], strict=True)
+    return dict(zip(keys, rows["value"].tolist(), strict=True))
+
+
+def _curve(condition: str, fitted: Known, steady: pd.DataFrame) -> Curve:
+    """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified."""
+    load = steady["load_N"].mean(skipna=False)
+    sigma_2 = max(float(fitted.get((condition, "steady", "sigma_2"), 0.0)), 0.0)
+    for static, coulomb, factor in (("mu_s", "mu_c", load), ("F_s", "F_c", 1.0)):
+        known = [fitted.get((condition, "steady", name)) for name in (static, coulomb, "v_s")]
+        if None not in known:
+            unit = np.array([factor, factor, 1.0, 1.0])
+            covariance = _covariance(condition, fitted, (static, coulomb, "v_s", "sigma_2"))
+            df = int(fitted.get((condition, "statistics", "df"), 1))
+            parameters = unit * [*known, sigma_2]
+            return Curve(*parameters.tolist(), covariance * np.outer(unit, unit), df)
+    flat = float(np.median(steady["size_N"] - sigma_2 * steady["speed_mm_s"].abs()))
+    return Curve(flat, flat, np.inf, sigma_2)
+
+
+def _covariance(condition: str, fitted: Known, names: Sequence[str]) -> np.ndarray:
+    """Return the covariance of a steady fit's parameters, shape (p, p), 0 if unknown."""
+    covariance = np.zeros((len(names), len(names)))
+    for i, j in np.ndindex(covariance.shape):
+        value = fitted.get((condition, "covariance", f"{names[i]},{names[j]}"), np.nan)
+        if np.isfinite(value):
+            covariance[i, j] = covariance[j, i] = value
+    return covariance

@@ -1,0 +1,299 @@
+"""The steady distributed LuGre model (Eq. 14) fitted per condition; which parameters the speeds determine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from scipy.special import stdtrit
+
+from sealfit.config import Config
+from sealfit.effects.contract import fill_unit
+from sealfit.fit.joint.rows import merge_directions
+from sealfit.fit.steady.condition import (
+    FULL,
+    Condition,
+    bound,
+    drop_flat_curve,
+    judge,
+    make_condition,
+    scatter_of_runs,
+    solve,
+)
+from sealfit.fit.steady.stribeck import NAMES, linearised
+from sealfit.fit.steady.uncertainty import (
+    UnitVariance,
+    more_likely,
+    proportional_weights,
+    run_means,
+    run_weights,
+    unit_variance,
+)
+from sealfit.ingest.columns import condition_columns
+from sealfit.ingest.scatter import Scatter, repeat_scatter
+from sealfit.tables import STEADY_FIT
+from sealfit.units import Units
+
+# Level of the test for lack of fit.
+SIGNIFICANT = 0.05
+# Number of conditions whose intervals are computed together. It bounds the memory.
+BLOCK = 250
+# Numeric columns of a fit table.
+NUMBERS = ("value", "se", "lo95", "hi95", "u_sys")
+# Names of the coefficients if the load is unknown.
+FORCES = {"mu_s": "F_s", "mu_c": "F_c"}
+
+
+def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+    r"""Fit Eq. 14 to every condition, and mark the parameters that its speeds determine.
+
+    .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
+
+    Run means of both directions are fitted together, weighted by the pooled scatter of repeats. mu_s, mu_c
+    and sigma_2 are not negative; mu_s < mu_c is allowed and reported. Without load the forces F_s and F_c are
+    fitted.
+
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+    config : Config
+        Names the condition columns, the units and the sensor's accuracy.
+
+    Returns
+    -------
+    DataFrame
+        Table `steady_fit` plus the condition columns. `quantity` is "steady" (one row per parameter),
+        "statistics", "covariance" (`parameter` "mu_s,mu_c": type A, for the aging fit), "sensor_shift"
+        (change of the parameter if the sensor reads every |force| one standard uncertainty too high; `u_sys`
+        is its magnitude) or, if effects were subtracted from the forces, "effect_shift" (`parameter`
+        "mu_s:1": change along each principal direction of the effects' uncertainty; it is included in the
+        covariance and the intervals, and common to all conditions).
+
+    Raises
+    ------
+    FitError
+        If there is no row to fit.
+
+    Notes
+    -----
+    Intervals are profile-likelihood intervals with Student's t. `u_sys` assumes one unknown error of |force|
+    for all samples, which no averaging reduces. A zero offset of the sensor has opposite signs in the two
+    directions and changes the parameters by no more; the loop tests for it.
+    """
+    conditions, scatter, variance = solve_conditions(steady)
+    keys = condition_keys(steady, config)
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(conditions), BLOCK)]
+    found = [_table_rows(conditions[block], variance.at(block), scatter, config) for block in blocks]
+    table = pd.concat(found, ignore_index=True).merge(
+        keys, on="condition", how="left", validate="many_to_one"
+    )
+    fixed = STEADY_FIT.names()
+    return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
+
+
+def solve_conditions(
+    steady: pd.DataFrame, fitted: pd.DataFrame | None = None
+) -> tuple[list[Condition], Scatter, UnitVariance]:
+    """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
+
+    A Stribeck curve that does not differ significantly from a straight line is dropped. With repeats, which
+    determine the weights, the estimates of `fitted`, the table `steady_fit` of these rows, are used, and
+    nothing is fitted again.
+
+    Raises
+    ------
+    FitError
+        If there is no row to fit.
+    """
+    runs = run_means(steady)
+    scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
+    runs = runs.assign(weight=run_weights(runs, scatter))
+    if fitted is not None and scatter.df > 0:
+        rows = fitted[(fitted["quantity"] == "steady") & fitted["value"].notna()]
+        known = rows.groupby("condition")["value"].agg(np.array)  # in the order of NAMES
+        conditions = [make_condition(name, own) for name, own in runs.groupby("condition", sort=True)]
+        for condition in conditions:
+            condition.take(known[condition.name])
+        return conditions, scatter, _unit_variance(conditions, scatter)
+    conditions = _solved(runs)
+    if not scatter.df > 0:
+        conditions = _more_likely_weights(conditions)
+    first = _unit_variance(conditions, scatter)
+    for condition, value, df in zip(conditions, first.value, first.df, strict=True):
+        if condition.model == FULL:
+            drop_flat_curve(condition, value, df)
+    return conditions, scatter, _unit_variance(conditions, scatter)
+
+
+def _solved(runs: pd.DataFrame) -> list[Condition]:
+    conditions = [make_condition(name, rows) for name, rows in runs.groupby("condition", sort=True)]
+    solve(conditions)
+    return conditions
+
+
+def _more_likely_weights(even: list[Condition]) -> list[Condition]:
+    """Return conditions fitted with equal weights or scatter proportional to friction, the more likely ones.
+
+    Without repeats the residuals have to determine how the scatter depends on the force.
+    """
+    sizes = np.cumsum([len(c.runs) for c in even])[:-1]
+    weight = proportional_weights(np.concatenate([c.model_force() for c in even]))
+    other = [
+        replace(c, runs=c.runs.assign(weight=w)) for c, w in zip(even, np.split(weight, sizes), strict=True)
+    ]
+    solve(other)
+    chi2 = [sum(c.chi2 for c in conditions) for conditions in (even, other)]
+    chosen = more_likely(chi2, [np.ones(weight.size), weight], sum(c.df for c in even))
+    return (even, other)[chosen]
+
+
+def _unit_variance(conditions: list[Condition], scatter: Scatter) -> UnitVariance:
+    return unit_variance(*scatter_of_runs(conditions), scatter.df)
+
+
+def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+    """One row per condition: series, rubber and condition columns; null where unaged rubber has several."""
+    names = [
+        c for c in dict.fromkeys(["series", "rubber", *condition_columns(config)]) if c in steady.columns
+    ]
+    grouped = steady[steady["condition"].notna()].groupby("condition", sort=True)
+    first, several = grouped[names].first(), grouped[names].nunique() > 1
+    return first.mask(several).reset_index()
+
+
+# ---------------------------------------------------------------- table
+def _table_rows(
+    conditions: list[Condition], variance: UnitVariance, scatter: Scatter, config: Config
+) -> pd.DataFrame:
+    """Return the rows of table `steady_fit` for some conditions; this computes their intervals."""
+    bound(conditions, variance.rise())
+    rows = [
+        {"condition": c.name, **row}
+        for k, c in enumerate(conditions)
+        for row in _rows(c, variance.at(k), scatter, config)
+    ]
+    return pd.DataFrame(rows)
+
+
+def _rows(condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config) -> Iterator[dict]:
+    unit_of = parameter_units(config.units, condition.has_load)
+    fitted = condition.jacobian(), condition.arrays[-1], condition.values, condition.names
+    covariance, shift = linearised(*fitted)
+    _, effects = linearised(*fitted, condition.shifts)
+    covariance = covariance * variance.value + effects @ effects.T
+    # What is smaller is rounding.
+    shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)
+    judged = judge(condition)
+    spelled = {name: name if condition.has_load else FORCES.get(name, name) for name in NAMES}
+    for name in NAMES:
+        row = dict(zip(("identified", "reason"), judged[name], strict=True))
+        if name in condition.names:
+            j = condition.names.index(name)
+            low, high = (None, None) if condition.low is None else (condition.low[j], condition.high[j])
+            open_below = name == "v_s" and low == 0.0
+            if effects.any() and low is not None:
+                reach = stdtrit(variance.df, 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
+                low, high = _widened(condition.values[j], low, high, reach)
+            # At its limit: not known with error zero.
+            stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0
+            row |= {"value": condition.values[j], "se": None if stuck else np.sqrt(covariance[j, j])}
+            row |= {"lo95": None if open_below else low, "hi95": high, "u_sys": abs(shift[j])}
+        yield table_row(quantity="steady", parameter=spelled[name], unit=unit_of[name], **row)
+    yield from _statistics(condition, variance, scatter, config)
+    for i, one in enumerate(condition.names if np.isfinite(variance.value) else ()):
+        for j, other in enumerate(condition.names[: i + 1]):
+            yield table_row(
+                quantity="covariance",
+                parameter=f"{spelled[other]},{spelled[one]}",
+                value=covariance[i, j],
+                unit=_product(unit_of[other], unit_of[one]),
+                identified=judged[one][0] and judged[other][0],
+            )
+    for j, name in enumerate(condition.names):
+        row = {"unit": unit_of[name], "identified": judged[name][0]}
+        yield table_row(quantity="sensor_shift", parameter=spelled[name], value=shift[j], **row)
+        for number, moved in enumerate(effects[j], start=1):
+            parameter = f"{spelled[name]}:{number}"
+            yield table_row(quantity="effect_shift", parameter=parameter, value=moved, **row)
+
+
+def _widened(value: float, low: float, high: float, reach: float) -> tuple[float, float]:
+    """Return the ends of an interval with a half-width added in quadrature on each side, not below 0."""
+    return max(value - float(np.hypot(value - low, reach)), 0.0), value + float(np.hypot(high - value, reach))
+
+
+def _statistics(
+    condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config
+) -> Iterator[dict]:
+    repeated, force_unit = scatter.df > 0, config.units.unit("force")
+    no_repeats = "" if repeated else "no run was repeated: there is no pure error to compare with."
+    ratio = condition.chi2 / condition.df if condition.df else None
+    lack = no_repeats
+    if repeated and condition.df == 0:
+        lack = "as many parameters as runs: the fit cannot disagree with them."
+    elif repeated and variance.p < SIGNIFICANT:
+        lack = (
+            "lack of fit: the runs disagree with the model by more than their repeats scatter (set-up "
+            "scatter between runs, or something the model lacks); "
+            f"intervals are widened {np.sqrt(variance.value):.2g} times."
+        )
+    offset = condition.offset()
+    if offset:
+        lack += f" The two directions differ: offset of {offset:.3g} {force_unit}, in no declared model."
+    if condition.left_out:
+        lack += f" {condition.left_out} runs without load were left out of the fit."
+    own = no_repeats or ("own" if variance.own else "pooled")
+    speeds = max(len(values) for values in condition.levels.values())
+    residual = condition.arrays[2] - condition.model_force()
+    for name, value, unit, reason in (
+        ("chi2", condition.chi2 if repeated else None, "", no_repeats),
+        ("df", condition.df, "", ""),
+        ("reduced_chi2", ratio if repeated else None, "", no_repeats),
+        ("lack_of_fit_F", variance.f, "", no_repeats),
+        ("lack_of_fit_p", variance.p, "", lack.strip()),
+        ("birge_ratio", np.sqrt(variance.value) if repeated else None, "", own),
+        ("error_df", variance.df, "", "degrees of freedom of the intervals' Student t"),
+        ("flat_p", condition.flat_p, "", "chance of this much Stribeck curve where mu_s = mu_c"),
+        ("rmse_N", np.sqrt(np.mean(residual**2)), force_unit, ""),
+        ("n_runs", len(condition.runs), "", ""),
+        ("n_files", condition.runs["files"].sum(), "", ""),
+        ("n_speeds", speeds, "", "levels within one direction"),
+    ):
+        yield table_row(quantity="statistics", parameter=name, value=value, unit=unit, reason=reason)
+
+
+def parameter_units(units: Units, has_load: bool) -> dict[str, str]:
+    """Return the units of mu_s, mu_c (or F_s, F_c), v_s and sigma_2 that follow from the config's units."""
+    force, speed, load = units.unit("force"), units.unit("speed"), units.unit("load")
+    mu = force if not has_load else "" if force == load else fill_unit("{y}/{x}", load, force)
+    per_speed = fill_unit("{y}/{x}", speed, force)
+    sigma_2 = f"{force} s/{speed.removesuffix('/s')}" if speed.endswith("/s") else per_speed
+    return {"mu_s": mu, "mu_c": mu, "v_s": speed, "sigma_2": sigma_2}
+
+
+def _product(one: str, other: str) -> str:
+    if one == other:
+        return f"({one})^2" if one else ""
+    return " ".join(f"({unit})" for unit in (one, other) if unit)
+
+
+def table_row(
+    *, quantity: str, parameter: str, unit: str, identified: bool = True, reason: str = "", **numbers
+) -> dict:
+    """Return one row of a fit table; None and infinite ends become null.
+
+    `numbers` are any of value, se, lo95, hi95 and u_sys.
+    """
+    known = {name: value for name, value in numbers.items() if value is not None and np.isfinite(value)}
+    return {
+        "model": "before",
+        "quantity": quantity,
+        "parameter": parameter,
+        **{name: float(known.get(name, np.nan)) for name in NUMBERS},
+        "unit": unit,
+        "identified": bool(identified),
+        "reason": reason,
+    }

@@ -23,12 +23,12 @@ from scipy.optimize import minimize_scalar
 from scipy.sparse import block_diag, csr_array
 from scipy.special import fdtrc
 
-from sealfit.fit.aging.series import PAIRS, steady_covariance, values_of
+from sealfit.fit.aging import PAIRS, steady_covariance, values_of
 from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.search import pairs_and_shared
 from sealfit.fit.least_squares import covariance_of, even_grid
+from sealfit.fit.steady import FORCES, solve_conditions
 from sealfit.fit.steady.condition import FULL, Condition
-from sealfit.fit.steady.fit import FORCES, solve_conditions
 from sealfit.fit.steady.stribeck import search_limits
 from sealfit.fit.steady.uncertainty import UnitVariance, shifts_of
 from sealfit.tables import STEADY_FIT

@@ -234,7 +234,7 @@ def curve_lines(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 
 
 def _steady_curves(fit: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
-    from sealfit.physics.stribeck import stribeck_force
+    from sealfit.physics.lugre import stribeck_force
 
     columns = ["condition", "direction", "load", "speed", "before", "after", "lo", "hi"]
     found = []
