@@ -26,12 +26,11 @@ from steady_tables import MU_C, MU_S, steady_rows
 from sealfit.config import Config, load_config
 from sealfit.engine import one_thread
 from sealfit.fit.aging import fit_series
-from sealfit.fit.aging.all_series import aged_values
+from sealfit.fit.aging.all_series import aged_values, shared_levels
 from sealfit.fit.aging.joint_law import GAS_CONSTANT, JointLaw, fit_joint_law, fit_laws, rivals_of
 from sealfit.fit.aging.lifetime import DAYS_PER_YEAR, Goal, lifetime, over_laws, resampled, temperature_for
 from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.steady import fit_conditions
-from sealfit.fit.steady.shared_curve import shared_levels
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.simulation import Spec, simulate
 

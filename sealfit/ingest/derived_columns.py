@@ -238,7 +238,7 @@ SAME_SPEED = 0.05
 
 
 def condition_keys(columns: Columns, files: int, config: Config) -> list[str]:
-    """Return the condition of each of so many files in words, as `categorical.add_keys` spells it.
+    """Return the condition of each of so many files in words, as `columns.add_keys` spells it.
 
     Examples
     --------

@@ -1,8 +1,16 @@
 """Equations as pure array functions; they know nothing of tables."""
 
 from sealfit.physics.aging_laws import aging_constant, aging_law, aging_law_as_printed
-from sealfit.physics.lugre import Bristles, LuGre, bristle_limit, lugre_force, stribeck_decay, stribeck_force
-from sealfit.physics.pressure import PRESSURES, Contact
+from sealfit.physics.lugre import (
+    PRESSURES,
+    Bristles,
+    Contact,
+    LuGre,
+    bristle_limit,
+    lugre_force,
+    stribeck_decay,
+    stribeck_force,
+)
 
 __all__ = [
     "PRESSURES",

@@ -18,14 +18,13 @@ from sealfit.closure.after import (
 from sealfit.closure.intervals import t_quantile
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.aging.all_series import law_of
+from sealfit.fit.aging.all_series import law_of, shared_levels
 from sealfit.fit.aging.lifetime import Goal, lifetime
 from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.model import Term, evaluate
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.steady import fit_conditions
-from sealfit.fit.steady.shared_curve import shared_levels
 from sealfit.fit.steady.uncertainty import shifts_of
 from sealfit.tables import AFTER, AGING_FIT, STEADY_FIT
 

@@ -5,7 +5,7 @@ from scipy.integrate import quad
 
 from sealfit.errors import ParameterError
 from sealfit.physics import PRESSURES, Contact
-from sealfit.physics.pressure import exponential, parabolic, sine, uniform
+from sealfit.physics.lugre import exponential, parabolic, sine, uniform
 
 
 @pytest.mark.parametrize("pressure", PRESSURES.values(), ids=PRESSURES)

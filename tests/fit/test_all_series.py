@@ -8,10 +8,9 @@ from steady_tables import MU_C, MU_S
 
 from sealfit.config import Config, Quantity
 from sealfit.fit import steady
-from sealfit.fit.aging.all_series import aged_values, joint_laws
+from sealfit.fit.aging.all_series import aged_values, joint_laws, shared_levels
 from sealfit.fit.aging.joint_law import fit_joint_law
 from sealfit.fit.steady import fit_conditions, solve_conditions
-from sealfit.fit.steady.shared_curve import shared_levels
 from sealfit.fit.steady.uncertainty import run_means
 from sealfit.physics import aging_law, stribeck_force
 
