@@ -12,7 +12,7 @@ import numpy as np
 
 from sealfit.config import AGING_CONDITION, TraceFormat
 from sealfit.draft.dialect import MIN_ROWS, STRAYS, Dialect, sniff
-from sealfit.draft.name_parts import shape_of, tokens
+from sealfit.draft.file_names import shape_of, tokens
 from sealfit.draft.vocabulary import UNAGED, Unit, name_and_unit, setting
 from sealfit.errors import BadFile, RequestError
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line

@@ -14,9 +14,8 @@ from sealfit.config import AGING_CONDITION, Files
 from sealfit.draft.columns import Roles
 from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import CLOCK, Dialect
-from sealfit.draft.file_names import HEIGHT_FROM
+from sealfit.draft.file_names import HEIGHT_FROM, Names, Part, signed_speed
 from sealfit.draft.files_found import Found, RunsTable
-from sealfit.draft.name_parts import Names, Part, signed_speed
 from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import channels_of, name_parts
 from sealfit.ingest.files import as_number
