@@ -16,7 +16,7 @@ import numpy as np
 from effect_kinds import FORMULA_OF
 
 from sealfit.closure.channels import flip_level, unit_of
-from sealfit.closure.intervals import robust_covariance
+from sealfit.closure.errors_and_intervals import robust_covariance
 from sealfit.closure.result import channels_of, effect_level
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter

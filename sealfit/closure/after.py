@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.intervals import degrees_of_freedom, t_quantile
+from sealfit.closure.errors_and_intervals import degrees_of_freedom, t_quantile
 from sealfit.config import Config
 from sealfit.fit.aging import CURVE_POINTS, aging_curves, fit_series
 from sealfit.fit.aging.all_series import joint_laws

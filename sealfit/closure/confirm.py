@@ -25,9 +25,9 @@ from sealfit.closure.criteria import (
     WEAK_P,
     WITHIN_P,
 )
-from sealfit.closure.error_sizes import between_speeds, blocks, covered, foldable, folds, whole_settings
+from sealfit.closure.errors_and_intervals import mean_se
 from sealfit.closure.forms import describe
-from sealfit.closure.intervals import mean_se
+from sealfit.closure.left_out import between_speeds, blocks, covered, foldable, folds, whole_settings
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
 from sealfit.closure.ripples import agreement, pass_shifts

@@ -19,7 +19,7 @@ from sealfit.closure.criteria import (
     SPANS,
     UNITS_PER_KNOT,
 )
-from sealfit.closure.intervals import t_quantile
+from sealfit.closure.errors_and_intervals import t_quantile
 from sealfit.closure.linearised import Proposal, middles
 from sealfit.closure.ripples import Peak, common_wavelength, pass_shifts
 from sealfit.closure.score_test import Candidate, ScoreTestResult, project

@@ -11,10 +11,9 @@ import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
 from sealfit.closure.criteria import DETERMINED, JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
-from sealfit.closure.error_sizes import covered, folds, heldout_level, level_table
+from sealfit.closure.errors_and_intervals import level_table, mean_se
 from sealfit.closure.forms import describe
-from sealfit.closure.intervals import mean_se
-from sealfit.closure.outlier_files import outlier_files
+from sealfit.closure.left_out import covered, folds, heldout_level, outlier_files
 from sealfit.closure.output import channel_table, curve_table, shape_points, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
 from sealfit.closure.ripple_selection import numbered, steady_samples

@@ -26,8 +26,8 @@ from sealfit.closure.criteria import (
     SAME_EFFECT,
     SCATTER_FALL,
 )
+from sealfit.closure.errors_and_intervals import robust_covariance
 from sealfit.closure.forms import periodic_terms, terms_of
-from sealfit.closure.intervals import robust_covariance
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate

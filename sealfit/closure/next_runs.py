@@ -13,7 +13,7 @@ from sealfit.closure.channels import ALONG_STROKES, too_short
 from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import describe, grid_of, reference
-from sealfit.closure.outlier_files import OutlierFile
+from sealfit.closure.left_out import OutlierFile
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects.contract import CHANNEL, Effect

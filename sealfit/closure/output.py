@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import Channel, unit_of
-from sealfit.closure.forms import free_term
-from sealfit.closure.intervals import (
+from sealfit.closure.errors_and_intervals import (
     degrees_of_freedom,
     mean_half_width,
     mean_se,
@@ -17,6 +16,7 @@ from sealfit.closure.intervals import (
     sandwiches,
     t_quantile,
 )
+from sealfit.closure.forms import free_term
 from sealfit.closure.result import parameter_unit
 from sealfit.closure.selection import Selection
 from sealfit.config import Config

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.criteria import NEAR_TESTED_SPEED
-from sealfit.closure.intervals import Sandwich, mean_half_width, t_quantile
+from sealfit.closure.errors_and_intervals import Sandwich, mean_half_width, t_quantile
 from sealfit.closure.output import from_record
 from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.config import Config

@@ -20,11 +20,16 @@ from sealfit.closure.criteria import (
     SAME_ERROR,
     UNSTEADY,
 )
-from sealfit.closure.error_sizes import errors, lack_of_fit, noise_floor, scatter_list
+from sealfit.closure.errors_and_intervals import (
+    effect_intervals,
+    errors,
+    lack_of_fit,
+    noise_floor,
+    scatter_list,
+)
 from sealfit.closure.forms import describe, free_term
-from sealfit.closure.intervals import effect_intervals
+from sealfit.closure.left_out import OutlierFile
 from sealfit.closure.next_runs import next_runs
-from sealfit.closure.outlier_files import OutlierFile
 from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import search

@@ -15,7 +15,7 @@ from sealfit.closure.after import (
     reference_of,
     without_effects,
 )
-from sealfit.closure.intervals import t_quantile
+from sealfit.closure.errors_and_intervals import t_quantile
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.aging.all_series import law_of, shared_levels

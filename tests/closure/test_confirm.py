@@ -16,7 +16,7 @@ from sealfit.closure.confirm import (
     vague_between_speeds,
     varies_within,
 )
-from sealfit.closure.error_sizes import between_speeds, blocks
+from sealfit.closure.left_out import between_speeds, blocks
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit, fit_declared

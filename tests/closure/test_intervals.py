@@ -2,7 +2,7 @@ import numpy as np
 from bins_helpers import make_bins, make_traces
 
 from sealfit.closure.criteria import FEW_UNITS
-from sealfit.closure.intervals import Sandwich, mean_half_width, sandwiches, t_quantile
+from sealfit.closure.errors_and_intervals import Sandwich, mean_half_width, sandwiches, t_quantile
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.config import Config

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
+from sealfit.closure.left_out import OutlierFile
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.next_runs import LONGER_STROKES, _is_tested, find_aliases, largest_difference, next_runs
-from sealfit.closure.outlier_files import OutlierFile
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Parameter

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.outlier_files import outlier_files
+from sealfit.closure.left_out import outlier_files
 from sealfit.fit.joint.rows import make_rows
 
 

@@ -1,25 +1,22 @@
-"""Sizes of errors, noise floor and lack of fit, and the rows that are held out to measure predictions."""
+"""Errors of the model, noise floor and lack of fit; intervals of its parameters and forces."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.polynomial import Legendre
-from scipy.special import fdtrc
+from scipy.special import fdtrc, stdtrit
 
-from sealfit.closure.channels import level_values, settings
-from sealfit.closure.criteria import (
-    BLOCKS_OF_A_FOLD,
-    LEAST_GROUPS_HELD_OUT,
-    LEAST_HELD_OUT,
-    OUTSIDE,
-    SAME_SETTING,
-)
+from sealfit.closure.criteria import FEW_UNITS, LARGEST_LEVERAGE, LEAST_SPARE_RUNS
 from sealfit.closure.score_test import Candidate
+from sealfit.closure.small_sample_test import satterthwaite_df
 from sealfit.fit.joint import Fitted
-from sealfit.fit.joint.rows import LEVELS, POWER, Rows, point_rows, sliding_power
+from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 
 SHAPES = 3
@@ -27,8 +24,14 @@ SHAPES = 3
 
 RANK = 1e-9  # Relative singular value below which a direction of a tangent is zero.
 
+Interval = tuple[float, float, float]
+"""Value and both ends of its 95 % interval."""
 
-# ---------------------------------------------------------------- in sample
+PHASES = {"A": "phi", "B": "phi_2"}
+"""Amplitudes of sines, and the phase of each."""
+
+
+# ---------------------------------------------------------------- errors
 
 
 def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
@@ -265,169 +268,146 @@ def scatter_list(fitted: Fitted) -> list[dict]:
     return result
 
 
-# ---------------------------------------------------------------- held-out rows
-# Whole groups, calendar blocks or whole settings, and whether the other rows cover them.
+# ---------------------------------------------------------------- intervals
 
 
-def heldout_level(rows: Rows) -> str:
-    """Return the level whose groups are held out: run, or file or stroke if there are fewer than six."""
-    for level in ("run", "file"):
-        if rows.groups.starts[level].size >= LEAST_GROUPS_HELD_OUT:
-            return foldable(rows, level)
-    return "stroke"
+class Sandwich(NamedTuple):
+    """Sandwich covariance of the parameters from whole groups of a level."""
+
+    covariance: np.ndarray  # (p, p)
+    information: Sequence[tuple[np.ndarray, np.ndarray]]
+    """Parameters each group depends on, shape (k,), and their information, (k, k); empty with many groups."""
 
 
-def foldable(rows: Rows, level: str) -> str:
-    """Return a level, or the next finer one at which conditions keep some groups while others are held out.
+def degrees_of_freedom(fitted: Fitted) -> float:
+    """Return the degrees of freedom of the coarsest level that scatters.
 
-    A condition with one file and no aging law cannot be predicted without that file. Its strokes are held out
-    then, and the error is that of predicting the same files.
+    This is the number of its units less the parameters they estimate; 0 if the model has as many parameters
+    as there are runs, because the scatter of runs is then not estimable.
     """
-    for finer in reversed(LEVELS[: LEVELS.index(level) + 1]):
-        start = rows.groups.starts[finer]
-        groups = np.bincount(rows.condition[start], minlength=len(rows.conditions))
-        lost = [c for c in np.flatnonzero(groups == 1) if _edge(rows, int(c))]
-        if len(lost) <= np.count_nonzero(groups) / 2:
-            return finer
-    return LEVELS[0]
+    groups = fitted.rows.groups
+    white = fitted.whitening(fitted.friction[:, None])[:, 0]
+    white = white / np.sqrt(groups.sums(white**2, "run"))[groups.codes["run"]]
+    taken = float((fitted.basis.sums(groups, "run", white).values ** 2).sum())
+    if groups.starts["run"].size - taken < LEAST_SPARE_RUNS:
+        return 0.0
+    active = [c.level for c in fitted.scatter.components if c.variance > 0]
+    level = active[-1] if active else "file"
+    units = fitted.rows.groups.starts[LEVELS[max(LEVELS.index(level), 1)]].size
+    between = len(
+        {(p.quantity, p.owner) for p in fitted.model.declared.parameters if p.quantity in ("mu_0c", "a_c")}
+    )
+    return float(max(units - (between if level == "specimen" else fitted.basis.shape[1]), 1))
 
 
-def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,), in whole groups.
+def t_quantile(df: float) -> float:
+    """Return the two-sided 95 % quantile of Student's t; NaN for 0 degrees of freedom."""
+    return float(stdtrit(df, 0.975))
 
-    The groups are spread so that each condition keeps most of its own. Day 0 and the last day always keep a
-    group, so that the aging law does not have to extrapolate.
+
+def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
+    """Return the sandwich covariance from whole groups of a level (CR2), shape (p, p)."""
+    scores = fitted.white_jacobian.sums(fitted.rows.groups, level, fitted.unit_residual(level))
+    return fitted.covariance @ scores.gram() @ fitted.covariance
+
+
+def sandwiches(fitted: Fitted) -> list[Sandwich]:
+    """Return the sandwich covariances of specimens, runs and files, down to the first level with many groups.
+
+    Specimens and runs may differ in parameters that have no variance component, such as v_s.
     """
-    start = rows.groups.starts[level]
-    count = min(count, start.size)
-    condition = rows.condition[start]
-    rng = np.random.default_rng(seed)
-    shuffled = rng.permutation(start.size)
-    order = shuffled[np.argsort(condition[shuffled], kind="stable")]
-    number = np.empty(start.size, dtype=int)
-    number[order] = np.arange(start.size) % count
-    yield from _masks(rows, level, number)
-
-
-def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]:
-    """Return masks of the rows held out, shape (n,): blocks of groups that are consecutive in the calendar.
-
-    Neighbours in time are correlated, and so are conditions tested one after the other. With single groups
-    held out, any smooth curve through the calendar would be confirmed. If a block contains a whole condition
-    that cannot be predicted without it, blocks are shortened, and a fold has several of them that are apart.
-    """
-    start = rows.groups.starts[level]
-    count = min(count, start.size)
-    place = np.empty(start.size, dtype=int)
-    place[np.argsort(rows.values(channel)[start], kind="stable")] = np.arange(start.size)
-    masks: list[np.ndarray] = []
-    for parts in BLOCKS_OF_A_FOLD:
-        masks = list(_masks(rows, level, place * min(count * parts, start.size) // start.size % count))
-        if np.any(masks, axis=0).mean() > LEAST_HELD_OUT:
+    found, rows, white = [], fitted.rows, fitted.white_jacobian
+    for level in reversed(LEVELS[1:]):
+        starts = rows.groups.starts[level]
+        if starts.size < 2:
+            continue
+        information = []
+        if starts.size < FEW_UNITS:
+            for first, last in itertools.pairwise([*starts, white.shape[0]]):
+                layout = replace(white.layout, block=white.layout.block[first:last])
+                gram = Tangent(layout, white.values[first:last]).gram()
+                numbers = np.flatnonzero(np.diag(gram))
+                information.append((numbers, gram[np.ix_(numbers, numbers)]))
+        found.append(Sandwich(robust_covariance(fitted, level), information))
+        if starts.size >= FEW_UNITS:
             break
-    return masks
+    return found
 
 
-def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,), from each group's fold; edge conditions keep a group."""
-    start, code = rows.groups.starts[level], rows.codes(level)
-    condition = rows.condition[start]
-    for k in range(number.max() + 1):
-        out = _without_lost_edges(number == k, condition, rows)
-        if out.any():
-            yield out[code]
+def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Interval]:
+    """Return {parameter: (value, lo95, hi95)} of one effect.
+
+    The larger of two standard errors is used: by the variance components, and by the sandwich of the units of
+    the effect's level. An effect that scatters between units would otherwise get too short an interval.
+    """
+    term = fitted.model.terms[number]
+    held = term.fixed.get("held", {})
+    place = fitted.model.term_slice(number)
+    variance = np.diag(robust_covariance(fitted, level))[place]
+    if not held:  # the variance components describe coarser shapes than a wave
+        variance = np.maximum(variance, np.diag(fitted.covariance)[place])
+    units = fitted.rows.groups.starts[level].size
+    reach = t_quantile(max(units - variance.size - 1, 2)) * np.sqrt(variance)
+    values = fitted.model.values[number]
+    result = {}
+    for p, r in zip(term.effect.parameters, reach, strict=True):
+        low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))
+        result[p.name] = (values[p.name], float(low), float(high))
+    return normalised_waves(result)
 
 
-def _without_lost_edges(out: np.ndarray, condition: np.ndarray, rows: Rows) -> np.ndarray:
-    """Return what is held out, without edge conditions that would lose all groups, shape of `out`."""
-    for c in np.unique(condition[out]):
-        if not (~out & (condition == c)).any() and _edge(rows, c):
-            out = out & (condition != c)
-    return out
+def normalised_waves(intervals: dict[str, Interval]) -> dict[str, Interval]:
+    """Return intervals with the amplitude of every sine positive and its phase in (-pi, pi].
+
+    An amplitude -A is the same as A with the phase shifted by pi.
+    """
+    made = dict(intervals)
+    for amplitude, phase in PHASES.items():
+        if amplitude not in made or phase not in made:
+            continue
+        value, low, high = made[amplitude]
+        turn = np.pi if value < 0 else 0.0
+        if value < 0:
+            made[amplitude] = (-value, -high, -low)
+        value, low, high = made[phase]
+        turn += 2 * np.pi * np.floor((np.pi - value - turn) / (2 * np.pi))
+        made[phase] = (value + turn, low + turn, high + turn)
+    return made
 
 
-def _edge(rows: Rows, condition: int) -> bool:
-    if not rows.has_aging:
-        return True  # a condition of its own parameters cannot be predicted without its rows
-    days = rows.conditions["aging_days"]
-    series = rows.conditions["series"]
-    own = days[series == series.iloc[condition]]
-    return bool(days.iloc[condition] in (0.0, own.max()))
+def mean_se(tangent: Tangent, covariance: np.ndarray) -> np.ndarray:
+    """Return the standard error of the model's force from its tangent, (n, p), and covariance -> (n,)."""
+    return np.sqrt(np.maximum(tangent.squares(covariance), 0.0))
 
 
-def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.ndarray:
-    """Return which held-out rows are covered by the other rows, shape (n,); the rest are extrapolated.
+def mean_half_width(
+    tangent: Tangent, covariance: np.ndarray, df: float, others: Sequence[Sandwich]
+) -> np.ndarray:
+    """Return half the 95 % interval of the model's force, shape (n,): the largest of several.
+
+    One uses the variance components. The others are sandwiches of whole groups, each with Satterthwaite's
+    degrees of freedom at this point. They are not used where one group alone determines the force.
 
     Parameters
     ----------
-    rows : Rows
-        All rows.
-    out : ndarray of bool, shape (n,)
-        Which are held out.
-    channels : iterable of str
-        Channels of the effects in the model.
+    tangent : Tangent, shape (n, p)
+        Tangent of the model at the points.
+    covariance : ndarray, shape (p, p)
+        Covariance by the variance components.
+    df : float
+        Its degrees of freedom.
+    others : sequence of Sandwich
+        Sandwich covariances of whole groups.
     """
-    inside = out.copy()
-    series = rows.conditions["series"].to_numpy()[rows.condition]
-    speed = np.abs(rows.speed)
-    for own in np.unique(series[out]):
-        here = series == own
-        seen = here & ~out
-        tested = np.unique(rows.condition[seen])
-        lawful = rows.has_aging and tested.size > 1
-        days = rows.days[seen | (~out & (rows.days == 0))]  # every series starts from unaged rubber
-        new = here & out & ~np.isin(rows.condition, tested)
-        if not lawful:
-            inside &= ~new
-        else:
-            inside &= ~(new & ((rows.days < days.min()) | (rows.days > days.max())))
-        if seen.any():
-            inside &= ~(here & out & _outside(speed, speed[seen]))
-    for name in channels:
-        values = rows.values(name)
-        if values.dtype.kind == "f":
-            inside &= ~_outside(values, values[~out])
-        else:
-            inside &= np.isin(values, np.unique(values[~out]))
-    return inside
-
-
-def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return which values lie outside the range of those seen, by more than values of one setting differ."""
-    low, high = float(seen.min()), float(seen.max())
-    slack = OUTSIDE * (high - low) + SAME_SETTING * max(abs(low), abs(high))
-    return (values < low - slack) | (values > high + slack)
-
-
-def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,): all rows at each inner setting of a channel in turn.
-
-    A free shape may fit every setting it has seen and still not predict those between them.
-    """
-    for setting in np.unique(values)[1:-1]:
-        out = _without_lost_edges(values == setting, rows.condition, rows)
-        if out.any():
-            yield out
-
-
-def between_speeds(rows: Rows) -> Rows:
-    """Return rows moved halfway, on a log scale, to the next higher tested speed of their series."""
-    speed = settings(level_values(np.abs(rows.speed), rows))
-    series = rows.conditions["series"].to_numpy()[rows.condition]
-    halfway = np.full(speed.size, np.nan)
-    for own in np.unique(series):
-        here = series == own
-        tested, place = np.unique(speed[here], return_inverse=True)
-        halfway[here] = np.r_[np.sqrt(tested[1:] * tested[:-1]), np.nan][place]
-    there = np.isfinite(halfway)
-    table = rows.table[there].assign(**{name: values[there] for name, values in rows.filled.items()})
-    table["speed_mm_s"] = np.sign(rows.speed[there]) * halfway[there]
-    if POWER in table:
-        table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
-    return point_rows(
-        table.reset_index(drop=True),
-        rows.condition[there],
-        rows.conditions,
-        has_load=rows.has_load,
-        has_aging=rows.has_aging,
-    )
+    half = t_quantile(df) * mean_se(tangent, covariance)
+    for covariance_of_groups, information in others:
+        reach = np.full(half.shape, t_quantile(df))
+        if len(information):
+            parts = [tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information]
+            share = np.maximum(parts, 0.0)
+            share /= np.maximum(share.sum(axis=0), 1e-300)
+            reach = np.where(
+                share.max(axis=0) > LARGEST_LEVERAGE, 0.0, stdtrit(satterthwaite_df(share), 0.975)
+            )
+        half = np.maximum(half, reach * mean_se(tangent, covariance_of_groups))
+    return half

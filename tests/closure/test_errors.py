@@ -1,7 +1,7 @@
 import numpy as np
 from bins_helpers import make_bins
 
-from sealfit.closure.error_sizes import lack_of_fit
+from sealfit.closure.errors_and_intervals import lack_of_fit
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 

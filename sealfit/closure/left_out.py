@@ -1,0 +1,298 @@
+"""Rows left out of a fit: files that went wrong as a whole, and those held out to measure predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import stdtr
+
+from sealfit.closure.channels import level_values, settings
+from sealfit.closure.criteria import (
+    BLOCKS_OF_A_FOLD,
+    LEAST_GROUPS_HELD_OUT,
+    LEAST_HELD_OUT,
+    OUTSIDE,
+    SAME_SETTING,
+)
+from sealfit.fit.joint import Fitted, fit, fit_declared, fitted_at
+from sealfit.fit.joint.rows import LEVELS, POWER, SAME_SPEED, Rows, point_rows, sliding_power
+
+# A file is tried if its residual in the fit to all files has a p-value below this, times the number of files.
+SCREEN_P = 0.05
+# Files that are tried, those with the largest residuals.
+MOST_SUSPECTS = 3
+# Largest p-value of an outlier, times the number of files. With 0.01, 5 of 73 worlds drawn at random lost a
+# sound file: their scatter was not normal.
+OUTLIER_P = 1e-3
+# Largest p-value beside the files of the same speed. Where these scatter more than others, or differ from the
+# model like the file, it is no outlier.
+SAME_SPEED_P = 0.01
+# Fewest files of the same speed from which their scatter is estimated.
+LEAST_OF_SPEED = 3
+# Least share of the force by which an outlier is off.
+OUTLIER_SHARE = 0.05
+# Largest share of the files that may be outliers. If there are more, they are not exceptions.
+MOST_OUTLIERS = 0.1
+# Least degrees of freedom of the files. With fewer, all files together do not predict another one.
+LEAST_DF = 4
+# Rows of each stroke in the fits. The mean of a file needs no more.
+ROWS = 8
+
+# ---------------------------------------------------------------- outlying files
+# Files whose mean force is far off what all other files predict.
+
+
+class OutlierFile(NamedTuple):
+    """A file that went wrong as a whole."""
+
+    file: str
+    deviation: float  # its mean force over that predicted, less 1
+    p_value: float  # times the number of files
+    conditions: dict  # the columns of its first row
+
+
+def outlier_files(rows: Rows) -> list[OutlierFile]:
+    """Return the files whose mean force is far off what all other files predict, the farthest first.
+
+    Model and scatter are fitted without the file, so that it does not hide itself. It is an outlier if the
+    gain that would explain it is significant beside the scatter of the others. These are then judged without
+    it. In linear regression the test is that of the deletion residual (Cook & Weisberg 1982, *Residuals and
+    Influence in Regression*, section 2.2.2).
+    """
+    rows = rows.sparse(ROWS)
+    fitted, found = fit_declared(rows), []
+    for _ in range(int(MOST_OUTLIERS * rows.groups.starts["file"].size)):
+        tried = [_without(fitted, number) for number in _suspects(fitted)]
+        one, kept = min(tried, key=lambda pair: pair[0].p_value, default=(None, fitted))
+        if one is None or one.p_value > OUTLIER_P or abs(one.deviation) < OUTLIER_SHARE:
+            break
+        found.append(one)
+        fitted = kept
+    return sorted(found, key=lambda one: -abs(one.deviation))
+
+
+def _df(fitted: Fitted) -> int:
+    """Return the degrees of freedom of the files, one of them left out."""
+    return fitted.rows.groups.starts["file"].size - 1 - fitted.basis.shape[1]
+
+
+def _suspects(fitted: Fitted) -> list[int]:
+    """Return the numbers of the files with the largest mean residuals, where these may be outliers.
+
+    A residual over a standard deviation that was estimated without it has Student's distribution; here that
+    of all files is known, which contains it.
+    """
+    groups, df = fitted.rows.groups, _df(fitted)
+    if df < LEAST_DF:
+        return []
+    along = fitted.unit_residual("file") * np.sign(fitted.rows.speed)
+    square = groups.sums(along, "file") ** 2 / np.bincount(groups.codes["file"])
+    alone = square * df / np.maximum(df + 1 - square, 1e-9)
+    suspect = 2 * stdtr(df, -np.sqrt(alone)) * square.size < SCREEN_P
+    return [int(k) for k in np.argsort(-square)[:MOST_SUSPECTS] if suspect[k]]
+
+
+def _without(fitted: Fitted, number: int) -> tuple[OutlierFile, Fitted]:
+    """Return the test of one file, and the fit to the others.
+
+    The file's gain is a further parameter of the model, with the estimates and the scatter of the others.
+    """
+    rows, own = fitted.rows, fitted.rows.codes("file") == number
+    kept = fit(fitted.model, rows.subset(~own), fitted.scatter, turns=2)
+    at = fitted_at(kept.model, rows, kept.scatter)
+    column = at.basis.project_out(at.whitening(np.where(own, at.friction, 0.0)[:, None])[:, 0])
+    size = max(float(np.linalg.norm(column)), 1e-9)  # 0 if only this file determines a parameter
+    deviation = float(column @ at.white_residual) / size**2
+    p_value = 2 * stdtr(_df(at), -abs(deviation) * size) * rows.groups.starts["file"].size
+    if _like_others_of_its_speed(at, number):
+        p_value = 1.0
+    first = rows.table.iloc[rows.groups.starts["file"][number]]
+    return OutlierFile(str(first["record"]), deviation, float(min(p_value, 1.0)), dict(first)), kept
+
+
+def _like_others_of_its_speed(fitted: Fitted, number: int) -> bool:
+    """Whether a file's relative residual is within those of the other files of its speed (t test)."""
+    groups = fitted.rows.groups
+    relative = groups.sums(fitted.friction * fitted.residual, "file") / groups.sums(
+        fitted.friction**2, "file"
+    )
+    speed = groups.means(np.abs(fitted.rows.speed), "file")
+    ratio = speed / speed[number]
+    same = np.maximum(ratio, 1 / ratio) < SAME_SPEED
+    same[number] = False
+    others = relative[same]
+    if others.size < LEAST_OF_SPEED:
+        return False
+    sd = float(np.std(others, ddof=1)) * np.sqrt(1 + 1 / others.size)
+    t = abs(relative[number] - others.mean()) / max(sd, 1e-300)
+    return 2 * stdtr(others.size - 1, -t) > SAME_SPEED_P
+
+
+# ---------------------------------------------------------------- held-out rows
+# Whole groups, calendar blocks or whole settings, and whether the other rows cover them.
+
+
+def heldout_level(rows: Rows) -> str:
+    """Return the level whose groups are held out: run, or file or stroke if there are fewer than six."""
+    for level in ("run", "file"):
+        if rows.groups.starts[level].size >= LEAST_GROUPS_HELD_OUT:
+            return foldable(rows, level)
+    return "stroke"
+
+
+def foldable(rows: Rows, level: str) -> str:
+    """Return a level, or the next finer one at which conditions keep some groups while others are held out.
+
+    A condition with one file and no aging law cannot be predicted without that file. Its strokes are held out
+    then, and the error is that of predicting the same files.
+    """
+    for finer in reversed(LEVELS[: LEVELS.index(level) + 1]):
+        start = rows.groups.starts[finer]
+        groups = np.bincount(rows.condition[start], minlength=len(rows.conditions))
+        lost = [c for c in np.flatnonzero(groups == 1) if _edge(rows, int(c))]
+        if len(lost) <= np.count_nonzero(groups) / 2:
+            return finer
+    return LEVELS[0]
+
+
+def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]:
+    """Yield masks of the rows held out, shape (n,), in whole groups.
+
+    The groups are spread so that each condition keeps most of its own. Day 0 and the last day always keep a
+    group, so that the aging law does not have to extrapolate.
+    """
+    start = rows.groups.starts[level]
+    count = min(count, start.size)
+    condition = rows.condition[start]
+    rng = np.random.default_rng(seed)
+    shuffled = rng.permutation(start.size)
+    order = shuffled[np.argsort(condition[shuffled], kind="stable")]
+    number = np.empty(start.size, dtype=int)
+    number[order] = np.arange(start.size) % count
+    yield from _masks(rows, level, number)
+
+
+def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]:
+    """Return masks of the rows held out, shape (n,): blocks of groups that are consecutive in the calendar.
+
+    Neighbours in time are correlated, and so are conditions tested one after the other. With single groups
+    held out, any smooth curve through the calendar would be confirmed. If a block contains a whole condition
+    that cannot be predicted without it, blocks are shortened, and a fold has several of them that are apart.
+    """
+    start = rows.groups.starts[level]
+    count = min(count, start.size)
+    place = np.empty(start.size, dtype=int)
+    place[np.argsort(rows.values(channel)[start], kind="stable")] = np.arange(start.size)
+    masks: list[np.ndarray] = []
+    for parts in BLOCKS_OF_A_FOLD:
+        masks = list(_masks(rows, level, place * min(count * parts, start.size) // start.size % count))
+        if np.any(masks, axis=0).mean() > LEAST_HELD_OUT:
+            break
+    return masks
+
+
+def _masks(rows: Rows, level: str, number: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield masks of the rows held out, shape (n,), from each group's fold; edge conditions keep a group."""
+    start, code = rows.groups.starts[level], rows.codes(level)
+    condition = rows.condition[start]
+    for k in range(number.max() + 1):
+        out = _without_lost_edges(number == k, condition, rows)
+        if out.any():
+            yield out[code]
+
+
+def _without_lost_edges(out: np.ndarray, condition: np.ndarray, rows: Rows) -> np.ndarray:
+    """Return what is held out, without edge conditions that would lose all groups, shape of `out`."""
+    for c in np.unique(condition[out]):
+        if not (~out & (condition == c)).any() and _edge(rows, c):
+            out = out & (condition != c)
+    return out
+
+
+def _edge(rows: Rows, condition: int) -> bool:
+    if not rows.has_aging:
+        return True  # a condition of its own parameters cannot be predicted without its rows
+    days = rows.conditions["aging_days"]
+    series = rows.conditions["series"]
+    own = days[series == series.iloc[condition]]
+    return bool(days.iloc[condition] in (0.0, own.max()))
+
+
+def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.ndarray:
+    """Return which held-out rows are covered by the other rows, shape (n,); the rest are extrapolated.
+
+    Parameters
+    ----------
+    rows : Rows
+        All rows.
+    out : ndarray of bool, shape (n,)
+        Which are held out.
+    channels : iterable of str
+        Channels of the effects in the model.
+    """
+    inside = out.copy()
+    series = rows.conditions["series"].to_numpy()[rows.condition]
+    speed = np.abs(rows.speed)
+    for own in np.unique(series[out]):
+        here = series == own
+        seen = here & ~out
+        tested = np.unique(rows.condition[seen])
+        lawful = rows.has_aging and tested.size > 1
+        days = rows.days[seen | (~out & (rows.days == 0))]  # every series starts from unaged rubber
+        new = here & out & ~np.isin(rows.condition, tested)
+        if not lawful:
+            inside &= ~new
+        else:
+            inside &= ~(new & ((rows.days < days.min()) | (rows.days > days.max())))
+        if seen.any():
+            inside &= ~(here & out & _outside(speed, speed[seen]))
+    for name in channels:
+        values = rows.values(name)
+        if values.dtype.kind == "f":
+            inside &= ~_outside(values, values[~out])
+        else:
+            inside &= np.isin(values, np.unique(values[~out]))
+    return inside
+
+
+def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return which values lie outside the range of those seen, by more than values of one setting differ."""
+    low, high = float(seen.min()), float(seen.max())
+    slack = OUTSIDE * (high - low) + SAME_SETTING * max(abs(low), abs(high))
+    return (values < low - slack) | (values > high + slack)
+
+
+def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield masks of the rows held out, shape (n,): all rows at each inner setting of a channel in turn.
+
+    A free shape may fit every setting it has seen and still not predict those between them.
+    """
+    for setting in np.unique(values)[1:-1]:
+        out = _without_lost_edges(values == setting, rows.condition, rows)
+        if out.any():
+            yield out
+
+
+def between_speeds(rows: Rows) -> Rows:
+    """Return rows moved halfway, on a log scale, to the next higher tested speed of their series."""
+    speed = settings(level_values(np.abs(rows.speed), rows))
+    series = rows.conditions["series"].to_numpy()[rows.condition]
+    halfway = np.full(speed.size, np.nan)
+    for own in np.unique(series):
+        here = series == own
+        tested, place = np.unique(speed[here], return_inverse=True)
+        halfway[here] = np.r_[np.sqrt(tested[1:] * tested[:-1]), np.nan][place]
+    there = np.isfinite(halfway)
+    table = rows.table[there].assign(**{name: values[there] for name, values in rows.filled.items()})
+    table["speed_mm_s"] = np.sign(rows.speed[there]) * halfway[there]
+    if POWER in table:
+        table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
+    return point_rows(
+        table.reset_index(drop=True),
+        rows.condition[there],
+        rows.conditions,
+        has_load=rows.has_load,
+        has_aging=rows.has_aging,
+    )
