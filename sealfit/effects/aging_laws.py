@@ -224,6 +224,11 @@ AGING_DELAY = Effect(
 )
 
 
+# Search grid of the day at which a logarithm of the aging time sets in.
+ONSETS = (0.01, 0.1, 1.0, 10.0, 100.0)
+ONSET = Parameter("t_0", "{x}", 1.0, (1e-4, 1e5), "aging time at which the change sets in", search=ONSETS)
+
+
 def stribeck_speed_aging_shape(inputs, *, A, t_0):
     r"""Stribeck speed that changes with age: the declared model has one v_s for all days of a series.
 
@@ -255,14 +260,7 @@ STRIBECK_SPEED_AGING = Effect(
             "relative change of v_s per factor e of the aging time",
             linear=True,
         ),
-        Parameter(
-            "t_0",
-            "{x}",
-            1.0,
-            (1e-4, 1e5),
-            "aging time at which the change sets in",
-            search=(0.01, 0.1, 1.0, 10.0, 100.0),
-        ),
+        ONSET,
     ),
     shape=stribeck_speed_aging_shape,
     source="Form: ours, after the law of the coefficients: Wu et al. 2020, Polymers 12(1), 102, "
@@ -298,14 +296,7 @@ VISCOSITY_AGING = Effect(
         Parameter(
             "A", "{y}", 0.01, AMPLITUDE, "change of sigma_2 per factor e of the aging time", linear=True
         ),
-        Parameter(
-            "t_0",
-            "{x}",
-            1.0,
-            (1e-4, 1e5),
-            "aging time at which the change sets in",
-            search=(0.01, 0.1, 1.0, 10.0, 100.0),
-        ),
+        ONSET,
     ),
     shape=viscosity_aging_shape,
     source="Form: ours, after the law of the coefficients: Wu et al. 2020, Polymers 12(1), 102, "

@@ -12,6 +12,8 @@ from sealfit.effects.contract import (
     AMPLITUDE,
     ANYWHERE,
     CHANNEL,
+    PHASE,
+    PHASES,
     SECOND,
     Effect,
     Parameter,
@@ -335,9 +337,7 @@ SINUSOID = closed_form(
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude", linear=True),
         Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
-        Parameter(
-            "phi", "rad", 0.0, (-4 * np.pi, 4 * np.pi), "phase at 0", search=tuple(np.arange(4) * np.pi / 4)
-        ),
+        Parameter("phi", "rad", 0.0, PHASE, "phase at 0", search=PHASES),
     ),
     shape=sinusoid_shape,
     source="Form: ours. The first Fourier term of anything periodic.",
@@ -345,10 +345,6 @@ SINUSOID = closed_form(
     worked=({"x": 0.02}, {"A": 4.0, "lambda_": 0.04, "phi": np.pi / 6}, -2.0),
     periodic=True,
 )
-
-
-# Bounds of a phase in rad: two turns in each direction, so that a search can pass a full turn.
-TURN = 4 * np.pi
 
 
 def sinusoid_harmonics_shape(inputs, *, A, B, lambda_, phi, phi_2):
@@ -374,15 +370,8 @@ SINUSOID_HARMONICS = closed_form(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude once per period", linear=True),
         Parameter("B", "{y}", 0.05, AMPLITUDE, "amplitude twice per period", linear=True),
         Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
-        Parameter("phi", "rad", 0.0, (-TURN, TURN), "phase at 0", search=tuple(np.arange(4) * np.pi / 4)),
-        Parameter(
-            "phi_2",
-            "rad",
-            0.0,
-            (-TURN, TURN),
-            "phase of the harmonic at 0",
-            search=tuple(np.arange(4) * np.pi / 4),
-        ),
+        Parameter("phi", "rad", 0.0, PHASE, "phase at 0", search=PHASES),
+        Parameter("phi_2", "rad", 0.0, PHASE, "phase of the harmonic at 0", search=PHASES),
     ),
     shape=sinusoid_harmonics_shape,
     source="Form: ours. The first two Fourier terms of anything periodic.",

@@ -22,6 +22,10 @@ SECOND = "z"
 READS_ANY = ((CHANNEL,), (CHANNEL, "direction"), (CHANNEL, SECOND))
 # Bounds of an amplitude with units. They are far beyond the numbers of any rig.
 AMPLITUDE = (-1e9, 1e9)
+# Bounds of a phase in rad: two turns in each direction, so that a search can pass a full turn.
+PHASE = (-4 * np.pi, 4 * np.pi)
+# Search grid of a phase: half a turn, as amplitudes have a sign.
+PHASES = tuple(np.arange(4) * np.pi / 4)
 
 Target = Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"]
 Operation = Literal["add", "multiply"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, CHANNEL, Effect, Parameter, deviation
+from sealfit.effects.contract import AMPLITUDE, CHANNEL, PHASE, PHASES, Effect, Parameter, deviation
 from sealfit.effects.free import sine_attenuation
 
 
@@ -40,14 +40,7 @@ RIPPLE = Effect(
             "wavelength: pitch of the screw, or its whole fraction",
             search="span",
         ),
-        Parameter(
-            "phi",
-            "rad",
-            0.0,
-            (-4 * np.pi, 4 * np.pi),
-            "phase at position 0",
-            search=tuple(np.arange(4) * np.pi / 4),
-        ),
+        Parameter("phi", "rad", 0.0, PHASE, "phase at position 0", search=PHASES),
     ),
     shape=ripple_shape,
     source="Form: ours. A cyclic error of a screw is periodic in its angle; "

@@ -6,6 +6,13 @@ import numpy as np
 
 from sealfit.effects.contract import AMPLITUDE, ROOM, Effect, Parameter, not_negative, positive, reference
 
+# Search grids: repeats, strokes and rests over which a contact changes, and Stribeck exponents.
+REPEATS = (0.3, 0.6, 1.0, 2.0, 4.0, 8.0)
+STROKES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+RESTS = (0.01, 0.1, 1.0, 10.0, 100.0, 1e3)
+EXPONENTS = (0.4, 0.6, 0.8, 1.0, 1.4, 3.0, 4.0, 6.0)
+
+
 # ---------------------------------------------------------------- history
 # Conditioning, running-in and rest.
 
@@ -36,14 +43,7 @@ CONDITIONING = Effect(
     acts_on=(("mu", "multiply"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
     parameters=(
         Parameter("A", "{y}", -0.05, (-0.95, 10.0), "relative change once conditioned", linear=True),
-        Parameter(
-            "n_0",
-            "",
-            1.0,
-            (0.1, 1e3),
-            "repeats that conditioning takes",
-            search=(0.3, 0.6, 1.0, 2.0, 4.0, 8.0),
-        ),
+        Parameter("n_0", "", 1.0, (0.1, 1e3), "repeats that conditioning takes", search=REPEATS),
     ),
     shape=conditioning_shape,
     source="Mullins 1969, Rubber Chem. Technol. 42(1), 339-362, doi:10.5254/1.3539210; review: "
@@ -79,14 +79,7 @@ RUN_IN = Effect(
     acts_on=(("mu", "multiply"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
     parameters=(
         Parameter("A", "{y}", -0.05, (-0.95, 10.0), "relative change once run in", linear=True),
-        Parameter(
-            "n_0",
-            "",
-            3.0,
-            (0.1, 1e5),
-            "strokes that run-in takes",
-            search=(0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0),
-        ),
+        Parameter("n_0", "", 3.0, (0.1, 1e5), "strokes that run-in takes", search=STROKES),
     ),
     shape=run_in_shape,
     source="Blau 2005, Tribology International 38(11-12), 1007-1012, doi:10.1016/j.triboint.2005.07.020. "
@@ -120,14 +113,7 @@ REST_STRENGTHENING = Effect(
     acts_on=(("mu_s", "multiply"), ("mu", "multiply"), ("mu_c", "multiply")),
     parameters=(
         Parameter("A", "{y}", 0.02, (-0.5, 5.0), "relative growth per factor e of the rest", linear=True),
-        Parameter(
-            "t_0",
-            "{x}",
-            1.0,
-            (1e-4, 1e6),
-            "rest below which nothing shows",
-            search=(0.01, 0.1, 1.0, 10.0, 100.0, 1e3),
-        ),
+        Parameter("t_0", "{x}", 1.0, (1e-4, 1e6), "rest below which nothing shows", search=RESTS),
     ),
     shape=rest_strengthening_shape,
     source="Dieterich 1972, J. Geophys. Res. 77(20), 3690-3697; review: "
@@ -209,15 +195,7 @@ STRIBECK_EXPONENT = Effect(
     parameters=(
         Parameter("A", "{y}", 0.3, (-10.0, 10.0), "drop of friction across the Stribeck curve", linear=True),
         Parameter("v_s", "{x}", 5.0, (1e-6, 1e6), "Stribeck speed", search="ratio"),
-        Parameter(
-            "n",
-            "",
-            1.0,
-            (0.2, 10.0),
-            "Stribeck exponent",
-            search=(0.4, 0.6, 0.8, 1.0, 1.4, 3.0, 4.0, 6.0),
-            vanishes_at=2.0,
-        ),
+        Parameter("n", "", 1.0, (0.2, 10.0), "Stribeck exponent", search=EXPONENTS, vanishes_at=2.0),
     ),
     shape=stribeck_exponent_shape,
     source="Exponents from 1/2 upwards: Bo & Pavelescu 1982, Wear 82(3), 277-289; review: "
