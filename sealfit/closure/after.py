@@ -19,7 +19,7 @@ from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.model import Model, Term, evaluate
-from sealfit.fit.joint.rows import POWER, Rows, point_rows
+from sealfit.fit.joint.rows import POWER, Rows
 from sealfit.fit.steady import FORCES, fit_conditions, parameter_units, table_row
 from sealfit.fit.steady.uncertainty import SHIFT
 from sealfit.ingest.stored_parts import StoredTraces
@@ -324,14 +324,7 @@ class _Law:
         table = table.assign(
             aging_days=days, speed_mm_s=v_s * (SLOW if self.end == "s" else FAST), load_N=load
         )
-        code = np.full(days.size, condition)
-        at = point_rows(
-            table.drop(columns=[POWER], errors="ignore"),
-            code,
-            rows.conditions,
-            has_load=rows.has_load,
-            has_aging=rows.has_aging,
-        )
+        at = rows.points(table.drop(columns=[POWER], errors="ignore"), np.full(days.size, condition))
         force, tangent = evaluate(replace(model, theta=theta), replace(at, days=days))
         own = (after.model.term_slice(after.model.terms.index(term)) for term in model.terms)
         kept = [np.arange(after.model.size)[place] for place in own]

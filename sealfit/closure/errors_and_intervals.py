@@ -18,6 +18,7 @@ from sealfit.closure.small_sample_test import satterthwaite_df
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
+from sealfit.tables import LEVELS as TABLE_OF_LEVELS
 
 SHAPES = 3
 """Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3."""
@@ -211,16 +212,8 @@ def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.D
             parts[level], df[level] = variance, known[0].df
     total = sum(parts.values()) or 1.0
     records = [
-        {
-            "stage": stage,
-            "level": level,
-            "channel": None,
-            "sd_N": np.sqrt(v),
-            "share": v / total,
-            "df": df[level],
-            "p_value": None,
-        }
-        for level, v in parts.items()
+        (stage, level, None, np.sqrt(variance), variance / total, df[level], None)
+        for level, variance in parts.items()
     ]
     best: dict[tuple, Candidate] = {}
     for candidate in candidates:
@@ -231,18 +224,9 @@ def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.D
     white = float(fitted.white_residual @ fitted.white_residual)
     for name, candidate in best.items():
         share = candidate.chi2 / max(white, 1e-300)
-        records.append(
-            {
-                "stage": stage,
-                "level": candidate.unit,
-                "channel": name,
-                "sd_N": sd * np.sqrt(share),
-                "share": share,
-                "df": float(candidate.test_result.df),
-                "p_value": candidate.p_value,
-            }
-        )
-    return pd.DataFrame(records)
+        found = (sd * np.sqrt(share), share, float(candidate.test_result.df), candidate.p_value)
+        records.append((stage, candidate.unit, name, *found))
+    return pd.DataFrame(records, columns=TABLE_OF_LEVELS.names())
 
 
 def scatter_list(fitted: Fitted) -> list[dict]:
@@ -257,14 +241,8 @@ def scatter_list(fitted: Fitted) -> list[dict]:
         variance = float(fitted.rows.weight @ fitted.scatter.level_variance(level, force))
         if variance <= 0:
             continue
-        result.append(
-            {
-                "level": level,
-                "sd_rel": float(np.sqrt(variance / mean_square)),
-                "sd_N": float(np.sqrt(variance)),
-                "df": known[0].df,
-            }
-        )
+        sds = {"sd_rel": float(np.sqrt(variance / mean_square)), "sd_N": float(np.sqrt(variance))}
+        result.append({"level": level, **sds, "df": known[0].df})
     return result
 
 

@@ -17,7 +17,7 @@ from sealfit.closure.criteria import (
     SAME_SETTING,
 )
 from sealfit.fit.joint import Fitted, fit, fit_declared, fitted_at
-from sealfit.fit.joint.rows import LEVELS, POWER, SAME_SPEED, Rows, point_rows, sliding_power
+from sealfit.fit.joint.rows import LEVELS, POWER, SAME_SPEED, Rows, sliding_power
 
 # A file is tried if its residual in the fit to all files has a p-value below this, times the number of files.
 SCREEN_P = 0.05
@@ -289,10 +289,4 @@ def between_speeds(rows: Rows) -> Rows:
     table["speed_mm_s"] = np.sign(rows.speed[there]) * halfway[there]
     if POWER in table:
         table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
-    return point_rows(
-        table.reset_index(drop=True),
-        rows.condition[there],
-        rows.conditions,
-        has_load=rows.has_load,
-        has_aging=rows.has_aging,
-    )
+    return rows.points(table, rows.condition[there])

@@ -26,7 +26,7 @@ from sealfit.effects.free import FREE, LEVELS, SMOOTH, WIDE, free_effect
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
 from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
-from sealfit.fit.joint.rows import Rows, open_columns, point_rows
+from sealfit.fit.joint.rows import Rows, open_columns
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.store.paths import needed
 from sealfit.tables import CHANNELS, CURVES, SHAPE_POINTS, SHAPES
@@ -214,7 +214,7 @@ def _farthest(run: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> str:
 
 def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
     """Return each effect's shape along its channel with a 95 % band, and the corresponding free shape."""
-    records: list[dict] = []
+    shapes = []
     reach = t_quantile(degrees_of_freedom(after))
     for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
         place = after.model.term_slice(number)
@@ -229,22 +229,10 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
         se = mean_se(Tangent.dense(tangent), covariance)
         free = _free_shape(after, number, x)
         unit = parameter_unit("{y}", term, config.units)
-        for k in range(value.size):
-            records.append(
-                {
-                    "effect": number,
-                    "id": term.effect.id,
-                    "channel": term.channels[0],
-                    "x": x[k] if labels is None else None,
-                    "label": None if labels is None else labels[k],
-                    "value": value[k],
-                    "lo95": value[k] - reach * se[k],
-                    "hi95": value[k] + reach * se[k],
-                    "free": None if free is None else free[k],
-                    "unit": unit,
-                }
-            )
-    return pd.DataFrame(records, columns=SHAPES.names())
+        drawn = {"effect": number, "id": term.effect.id, "channel": term.channels[0], "x": x}
+        drawn |= {"label": labels, "value": value, "lo95": value - reach * se, "hi95": value + reach * se}
+        shapes.append(pd.DataFrame({**drawn, "free": np.nan if free is None else free, "unit": unit}))
+    return pd.concat(shapes, ignore_index=True) if shapes else pd.DataFrame(columns=SHAPES.names())
 
 
 def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
@@ -358,18 +346,12 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     ]
     along = [np.geomspace(own.min(), own.max(), count) for own, count in zip(speeds, counts, strict=True)]
     points = points.assign(speed_mm_s=points["direction"].to_numpy() * np.concatenate(along), file="")
-    points = points.reset_index(drop=True)
-    codes = np.repeat(rows.condition[first], counts)
-    at = point_rows(points, codes, rows.conditions, has_load=rows.has_load, has_aging=rows.has_aging)
+    at = rows.points(points, np.repeat(rows.condition[first], counts))
     mean, tangent = evaluate(after.model, at)
     reach = mean_half_width(tangent, after.covariance, degrees_of_freedom(after), sandwiches(after))
-    points = points.assign(
-        force_before_N=evaluate(before.model, at, jacobian=False)[0],
-        force_after_N=mean,
-        force_after_lo95_N=mean - reach,
-        force_after_hi95_N=mean + reach,
-    )
-    return points[CURVES.names()]
+    forces = {"force_before_N": evaluate(before.model, at, jacobian=False)[0], "force_after_N": mean}
+    ends = {"force_after_lo95_N": mean - reach, "force_after_hi95_N": mean + reach}
+    return at.table.assign(**forces, **ends)[CURVES.names()]
 
 
 def _averaged(column: pd.Series, groups: list[np.ndarray]) -> list:

@@ -21,7 +21,7 @@ from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.errors import RequestError
-from sealfit.fit.joint.declared import SPEEDS_BETWEEN, Declared
+from sealfit.fit.joint.declared import SPEEDS_BETWEEN
 from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.joint.whitening import Component, Scatter
@@ -31,6 +31,7 @@ from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # Relative tolerance of the tested range.
 FORCES = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
+NO_INTERVAL = "no interval: as many parameters in the model as runs; test repeats or more speeds"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
 
@@ -62,44 +63,24 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     good = np.array([not note for note in notes]) & (code >= 0)
     answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in FORCES})
     if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
-        for k in np.flatnonzero(good):
-            notes[k].append(TESTED_ONLY)
+        _note(notes, good, TESTED_ONLY)
     if model["df"] == 0:
-        for k in np.flatnonzero(good):
-            notes[k].append(
-                "no interval: as many parameters in the model as runs; test repeats or more speeds"
-            )
+        _note(notes, good, NO_INTERVAL)
     extrapolated = _outside(table, conditions, code, model, notes, after)
     if good.any():
-        at = point_rows(
-            table[good].reset_index(drop=True),
-            code[good],
-            conditions,
-            has_load=model["has_load"],
-            has_aging=model["has_aging"],
-        )
+        own = {"has_load": model["has_load"], "has_aging": model["has_aging"]}
+        at = point_rows(table[good].reset_index(drop=True), code[good], conditions, **own)
         mean, tangent = evaluate(after, at)
         reach = t_quantile(model["df"])
-        others = [
-            Sandwich(
-                np.array(own["covariance"]),
-                [(np.array(k), np.array(block)) for k, block in own["information"]],
-            )
-            for own in model["sandwiches"]
-        ]
+        others = []
+        for own in model["sandwiches"]:
+            information = [(np.array(k), np.array(block)) for k, block in own["information"]]
+            others.append(Sandwich(np.array(own["covariance"]), information))
         half = mean_half_width(tangent, np.array(model["covariance"]), model["df"], others)
         half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, mean))
         spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
-        answer.loc[good, FORCES] = np.column_stack(
-            [
-                evaluate(before, at, jacobian=False)[0],
-                mean,
-                mean - half,
-                mean + half,
-                mean - spread,
-                mean + spread,
-            ]
-        )
+        forces = (evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half)
+        answer.loc[good, FORCES] = np.column_stack([*forces, mean - spread, mean + spread])
     bad = answer["force_after_N"].isna().to_numpy()
     return points.reset_index(drop=True).assign(
         **{name: answer[name] for name in FORCES},
@@ -199,14 +180,8 @@ def _conditions(
             for quantity in index:
                 index[quantity].append(int(declared.index[quantity][lawful[0]]))
         code[k] = known[name]
-    wider = Declared(
-        declared.parameters,
-        {q: np.array(v, dtype=int) for q, v in index.items()},
-        tuple(names),
-        declared.has_load,
-        declared.stribeck,
-        declared.law,
-    )
+    numbers = {q: np.array(v, dtype=int) for q, v in index.items()}
+    wider = replace(declared, index=numbers, conditions=tuple(names))
     full = pd.concat([conditions, pd.DataFrame(added)], ignore_index=True) if added else conditions
     return replace(before, declared=wider), replace(after, declared=wider), full, code
 
@@ -214,22 +189,24 @@ def _conditions(
 def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -> None:
     """Add a note to every point with an invalid cell."""
     speed = table["speed_mm_s"].to_numpy(dtype=float)
-    for k in np.flatnonzero(~(np.abs(speed) < OVERLOAD) | (speed == 0)):
-        notes[k].append("speed_mm_s must be a signed number other than 0 (the model holds in sliding)")
+    slides = (np.abs(speed) < OVERLOAD) & (speed != 0)
+    _note(notes, ~slides, "speed_mm_s must be a signed number other than 0 (the model holds in sliding)")
     if model["has_load"]:
         load = table["load_N"].to_numpy(dtype=float)
-        for k in np.flatnonzero(~(load > 0) | (load >= OVERLOAD)):
-            notes[k].append("load_N must be a positive number")
+        _note(notes, ~((load > 0) & (load < OVERLOAD)), "load_N must be a positive number")
     for name in dict.fromkeys(n for term in after.terms for n in term.channels):
         tested = model["ranges"].get(name)
         if _is_range(tested):
             table[name] = pd.to_numeric(table[name], errors="coerce").astype(float)
-            for k in np.flatnonzero(~(np.abs(table[name].to_numpy()) < OVERLOAD)):
-                notes[k].append(f"{name} must be a number")
+            _note(notes, ~(np.abs(table[name].to_numpy()) < OVERLOAD), f"{name} must be a number")
         elif isinstance(tested, list):
             table[name] = table[name].astype(object).where(table[name].notna(), NO_VALUE).astype(str)
-            for k in np.flatnonzero(~table[name].isin(tested).to_numpy()):
-                notes[k].append(f"{name} must be one of {', '.join(tested)}")
+            _note(notes, ~table[name].isin(tested).to_numpy(), f"{name} must be one of {', '.join(tested)}")
+
+
+def _note(notes: list[list[str]], points: np.ndarray, text: str) -> None:
+    for k in np.flatnonzero(points):
+        notes[k].append(text)
 
 
 def _outside(

@@ -325,13 +325,8 @@ def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> di
     left = selection.left
     if left is None and selection.worse:
         item, rows = selection.worse[-1], selection.after.rows
-        names = " ".join(channels_of(item.term, rows))
-        return {
-            "rmse_N": above,
-            "level": effect_level(item.term, rows),
-            "channel": names,
-            "p_value": item.p_value,
-        }
+        found = {"level": effect_level(item.term, rows), "channel": " ".join(channels_of(item.term, rows))}
+        return {"rmse_N": above, **found, "p_value": item.p_value}
     if left is None and selection.added:
         last = [
             c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P
@@ -357,14 +352,8 @@ def _unsteady_offset(selection: Selection) -> Candidate | None:
     """
     fitted = selection.after
     rows = fitted.rows
-    amplitude = max(
-        (
-            abs(v["A"])
-            for t, v in zip(fitted.model.terms, fitted.model.values, strict=True)
-            if t.effect.id == OFFSET
-        ),
-        default=0.0,
-    )
+    effects = zip(fitted.model.terms, fitted.model.values, strict=True)
+    amplitude = max((abs(v["A"]) for term, v in effects if term.effect.id == OFFSET), default=0.0)
     variance = sum(c.variance for c in fitted.scatter.components if c.kind == "offset" and c.level == "run")
     categories = [c for c in selection.channels.values() if not c.numeric and not c.grouping]
     if amplitude == 0 or np.sqrt(variance) < UNSTEADY * amplitude or not categories:

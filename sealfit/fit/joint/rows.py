@@ -223,6 +223,11 @@ class Rows:
         step = -(-np.bincount(code) // most)[code]  # rounded up
         return self.subset(place % step == step // 2)
 
+    def points(self, table: pd.DataFrame, condition: np.ndarray) -> Rows:
+        """Return points at the conditions of these rows, for a prediction; arguments as `point_rows`."""
+        known = {"has_load": self.has_load, "has_aging": self.has_aging}
+        return point_rows(table.reset_index(drop=True), condition, self.conditions, **known)
+
     def subset(self, mask: np.ndarray) -> Rows:
         """Return the rows where `mask`, shape (n,), is true; conditions keep the numbers that models need."""
         arrays = ("order", "force", "speed", "pace", "load", "days", "condition")
