@@ -18,15 +18,9 @@ from sealfit.store.staged_writes import sync, taken
 MISSING = ("", "nan", "NaN", "NA", "null")
 FORMULA = tuple("=+-@＝＋－＠")  # what a formula of a spreadsheet begins with
 ANSWERS = (
-    "force_before_N",
-    "force_after_N",
-    "force_after_lo95_N",
-    "force_after_hi95_N",
-    "meas_lo95_N",
-    "meas_hi95_N",
-    "extrapolated",
-    "note",
-)
+    "force_before_N", "force_after_N", "force_after_lo95_N", "force_after_hi95_N", "meas_lo95_N",
+    "meas_hi95_N", "extrapolated", "note",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

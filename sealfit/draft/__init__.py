@@ -15,14 +15,9 @@ from sealfit.draft.files_found import find_table, look, read_tables
 from sealfit.errors import RequestError
 
 SHOWN = (
-    "trace.columns.",
-    "trace.rate_Hz",
-    "condition",
-    "files.glob",
-    "files.name_pattern",
-    "files.runs_columns",
+    "trace.columns.", "trace.rate_Hz", "condition", "files.glob", "files.name_pattern", "files.runs_columns",
     "strokes.",
-)
+)  # fmt: skip
 """Guesses that the summary repeats: the others are in the draft."""
 
 

@@ -33,21 +33,10 @@ TARGETS = ("force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b")
 
 # Targets of a closed form or free shape, most likely first.
 ANYWHERE: tuple[tuple[Target, Operation], ...] = (
-    ("mu", "multiply"),
-    ("force", "add"),
-    ("force", "multiply"),
-    ("mu_s", "multiply"),
-    ("mu_c", "multiply"),
-    ("v_s", "multiply"),
-    ("sigma_2", "add"),
-    ("sigma_2", "multiply"),
-    ("a", "multiply"),
-    ("b", "multiply"),
-    ("mu_0", "multiply"),
-    ("mu", "add"),
-    ("mu_s", "add"),
-    ("mu_c", "add"),
-)
+    ("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply"),
+    ("v_s", "multiply"), ("sigma_2", "add"), ("sigma_2", "multiply"), ("a", "multiply"), ("b", "multiply"),
+    ("mu_0", "multiply"), ("mu", "add"), ("mu_s", "add"), ("mu_c", "add"),
+)  # fmt: skip
 # Targets of the climate of the room.
 ROOM = ANYWHERE[:5]
 

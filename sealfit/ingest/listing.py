@@ -23,16 +23,9 @@ from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.store.paths import runs_tables
 
 KNOWN = (
-    "run_id",
-    "repeat",
-    "specimen_id",
-    "temperature_C",
-    "compression_ratio_pct",
-    "aging_days",
-    "load_N",
-    "speed_mm_s",
-    "started_at",
-)
+    "run_id", "repeat", "specimen_id", "temperature_C", "compression_ratio_pct", "aging_days", "load_N",
+    "speed_mm_s", "started_at",
+)  # fmt: skip
 
 
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}

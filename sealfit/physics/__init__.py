@@ -13,15 +13,6 @@ from sealfit.physics.lugre import (
 )
 
 __all__ = [
-    "PRESSURES",
-    "Bristles",
-    "Contact",
-    "LuGre",
-    "aging_constant",
-    "aging_law",
-    "aging_law_as_printed",
-    "bristle_limit",
-    "lugre_force",
-    "stribeck_decay",
-    "stribeck_force",
-]
+    "PRESSURES", "Bristles", "Contact", "LuGre", "aging_constant", "aging_law", "aging_law_as_printed",
+    "bristle_limit", "lugre_force", "stribeck_decay", "stribeck_force",
+]  # fmt: skip

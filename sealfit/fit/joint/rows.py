@@ -116,22 +116,9 @@ SAME_LOAD = 1.05
 """Ratio of the largest to the smallest load up to which it is one setting."""
 
 NOT_CHANNELS = {
-    "file",
-    "record",
-    "run_id",
-    "bin",
-    "stroke_id",
-    "n",
-    "force_N",
-    "force_sd_N",
-    "presliding_N",
-    "speed_bin_mm_s",
-    "specimen_id",
-    "condition",
-    "series",
-    "rubber",
-    "speed_set_mm_s",
-}
+    "file", "record", "run_id", "bin", "stroke_id", "n", "force_N", "force_sd_N", "presliding_N",
+    "speed_bin_mm_s", "specimen_id", "condition", "series", "rubber", "speed_set_mm_s",
+}  # fmt: skip
 
 
 class Cache(dict):

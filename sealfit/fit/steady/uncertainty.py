@@ -33,17 +33,8 @@ SMALLEST_SHARE = 0.05
 SHIFT = "effects_u"
 
 NEEDED = (
-    "condition",
-    "series",
-    "rubber",
-    "run_id",
-    "file",
-    "direction",
-    "speed_mm_s",
-    "load_N",
-    "force_N",
-    "used",
-)
+    "condition", "series", "rubber", "run_id", "file", "direction", "speed_mm_s", "load_N", "force_N", "used",
+)  # fmt: skip
 
 
 def run_means(steady: pd.DataFrame) -> pd.DataFrame:
