@@ -46,8 +46,8 @@ REPORTED = {  # of tables with a row per bin, what the report looks at
 }  # fmt: skip
 FAULTY = ("warning", "error")  # severities that count as a fault
 
+# How many rows a step worked on, and what they are.
 Counted = tuple[int, str]
-"""How many rows a step worked on, and what they are."""
 
 
 @dataclass(frozen=True, slots=True)

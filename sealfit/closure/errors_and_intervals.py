@@ -20,16 +20,14 @@ from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 from sealfit.tables import LEVELS as TABLE_OF_LEVELS
 
+# Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3.
 SHAPES = 3
-"""Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3."""
-
 RANK = 1e-9  # Relative singular value below which a direction of a tangent is zero.
 
+# Value and both ends of its 95 % interval.
 Interval = tuple[float, float, float]
-"""Value and both ends of its 95 % interval."""
-
+# Amplitudes of sines, and the phase of each.
 PHASES = {"A": "phi", "B": "phi_2"}
-"""Amplitudes of sines, and the phase of each."""
 
 
 # ---------------------------------------------------------------- errors

@@ -18,10 +18,9 @@ from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time, stroke_i
 
 SAMPLED = ("displacement_mm", "time_s", "force_N")  # columns of the samples that the ripple search reads
 
+# Steps between samples up to which a turn follows the one before without a gap. A change of speed leaves
+# more: its rise is not in the steady windows.
 GAP = 3
-"""Steps between samples up to which a turn follows the one before without a gap.
-
-A change of speed leaves more: its rise is not in the steady windows."""
 
 
 class Ripples:

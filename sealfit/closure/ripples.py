@@ -57,22 +57,17 @@ class Peak:
 
 AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 
+# Periods per median stroke that are tried for waves of few periods.
 LONG_WAVES = np.linspace(1.5, 4.5, 16)
-"""Periods per median stroke that are tried for waves of few periods."""
-
+# Periods per stroke about a wave in the model within which what is left of it is found again.
 MAIN_LOBE = 2
-"""Periods per stroke about a wave in the model within which what is left of it is found again."""
-
+# Degree of the Legendre series of a curve of the position; it resolves six periods.
 CURVE_DEGREE = 14
-"""Degree of the Legendre series of a curve of the position; it resolves six periods."""
-
+# Degrees of the Legendre series of a smooth curve along the travel, without the parabola.
 TRAVEL_DEGREES = np.arange(3, 7)
-"""Degrees of the Legendre series of a smooth curve along the travel, without the parabola."""
-
+# Least share of what a curve of the position explains that a wave must explain. A bump of the position, a
+# change of slope and warming leave 7 % and more of the curve unexplained.
 WAVE_OF_CURVE = 0.95
-"""Least share of what a curve of the position explains that a wave must explain.
-
-A bump of the position, a change of slope and warming leave 7 % and more of the curve unexplained."""
 
 
 def find_ripple(

@@ -14,11 +14,11 @@ from sealfit.draft.file_names import read_names
 from sealfit.draft.files_found import find_table, look, read_tables
 from sealfit.errors import RequestError
 
+# Guesses that the summary repeats: the others are in the draft.
 SHOWN = (
     "trace.columns.", "trace.rate_Hz", "condition", "files.glob", "files.name_pattern", "files.runs_columns",
     "strokes.",
 )  # fmt: skip
-"""Guesses that the summary repeats: the others are in the draft."""
 
 
 @dataclass(frozen=True)

@@ -20,27 +20,22 @@ from sealfit.draft.vocabulary import Unit, column_role, name_and_unit, plain, se
 from sealfit.ingest.files import as_number, split_line
 from sealfit.units import conversion
 
+# Lines from the top that are looked at: longer than the headers we know of, by five times.
 SAMPLE_LINES = 200
-"""Lines from the top that are looked at: longer than the headers we know of, by five times."""
-
+# Lines at either end of a file that are looked at for lines that are no data.
 ENDS = 1000
-"""Lines at either end of a file that are looked at for lines that are no data."""
-
+# Lines given to clevercsv, whose time grows with the square of their number.
 SNIFFED_LINES = 60
-"""Lines given to clevercsv, whose time grows with the square of their number."""
-
+# Fewer rows of numbers are a table of settings or results, not a trace.
 MIN_ROWS = 8
-"""Fewer rows of numbers are a table of settings or results, not a trace."""
-
+# Header lines above the data in which names and units are looked for.
 NAMES_ABOVE = 12
-"""Header lines above the data in which names and units are looked for."""
-
+# What lines end in without meaning: separators of empty columns, and those that a spreadsheet adds.
 STRAYS = ",;| \t"
-"""What lines end in without meaning: separators of empty columns, and those that a spreadsheet adds."""
-
 DELIMITERS = ("tab", ";", ",", "|", "whitespace")
 _OF_SNIFFER = {"\t": "tab", " ": "whitespace", "": "whitespace"}
 
+# What header lines may set, and what its unit measures.
 SETTINGS = {
     "temperature_C": "temperature",
     "compression_ratio_pct": "share",
@@ -48,8 +43,6 @@ SETTINGS = {
     "load_N": "force",
     "speed_mm_s": "speed",
 }
-"""What header lines may set, and what its unit measures."""
-
 _LINE = re.compile(r'^"?(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
 _SPECIMEN = re.compile(r"(specimen|probe|sample|pruefling|muster)( (id|nr|no|number|nummer|name))?")
 _NUMBER = re.compile(r"^[-+]?\d+(?:[.,]\d+)?(?=$|[\s;,\t\"°%A-Za-zµ])")

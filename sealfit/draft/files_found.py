@@ -21,21 +21,16 @@ from sealfit.ingest.listing import RUNS_CSV, natural
 from sealfit.ingest.runs import time_of
 from sealfit.ingest.workbooks import LONGEST, read_sheet
 
+# Files of one kind of name that are looked at, spread evenly: more would show the same.
 SNIFFED = 24
-"""Files of one kind of name that are looked at, spread evenly: more would show the same."""
-
+# Files that are looked at, however many ways of naming them there are.
 MOST = 240
-"""Files that are looked at, however many ways of naming them there are."""
-
+# Trace files that are read whole, for how their columns behave.
 READ = 6
-"""Trace files that are read whole, for how their columns behave."""
-
+# Larger files are looked at in their first 64 kB only, and their ends are not known.
 WHOLE_BYTES = 8_000_000
-"""Larger files are looked at in their first 64 kB only, and their ends are not known."""
-
+# Rows of a trace that are read: enough for some strokes.
 ROWS = 20_000
-"""Rows of a trace that are read: enough for some strokes."""
-
 FORMATS = {
     ".xls": "Excel workbooks before 2007", ".h5": "HDF5 files", ".hdf5": "HDF5 files", ".bin": "binary files",
 }  # fmt: skip
@@ -45,11 +40,10 @@ DOCUMENTS = {
 }  # fmt: skip
 NO_TRACES = ("readme", "license", "licence", "notice", "sha256sums", "changelog")
 
+# Share of a column's cells that must be names of trace files: a log may list tests that were not kept.
 NAMING = 0.5
-"""Share of a column's cells that must be names of trace files: a log may list tests that were not kept."""
-
+# A larger file is no list of runs.
 MAX_BYTES = 4_000_000
-"""A larger file is no list of runs."""
 
 
 @dataclass(frozen=True)

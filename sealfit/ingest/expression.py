@@ -17,12 +17,10 @@ import numpy as np
 
 from sealfit.errors import ConfigError, nearest
 
+# Longest text of an expression: nobody writes a longer one by hand, and the parser's memory is bounded.
 MAX_CHARACTERS = 1000
-"""Longest text of an expression: nobody writes a longer one by hand, and the parser's memory is bounded."""
-
+# Deepest nesting: keeps the walk far below Python's recursion limit.
 MAX_DEPTH = 60
-"""Deepest nesting: keeps the walk far below Python's recursion limit."""
-
 _OF_ONE = ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh", "sign")
 FUNCTIONS = {  # name: (function, fewest arguments, most arguments)
     **{name: (getattr(np, name), 1, 1) for name in _OF_ONE},

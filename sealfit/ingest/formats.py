@@ -403,8 +403,8 @@ def _hdf5_value(item) -> np.ndarray | float | str | None:
 # ---------------------------------------------------------------- Parquet
 
 _OF_WRITERS = (b"pandas", b"ARROW:schema")  # what writers keep for themselves
+# Largest number of cells of a Parquet file: 1.6 GB as numbers. Equal rows take no room in the file.
 MOST_CELLS = 2 * 10**8
-"""Largest number of cells of a Parquet file: 1.6 GB as numbers. Equal rows take no room in the file."""
 
 
 def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:

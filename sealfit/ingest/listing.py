@@ -33,8 +33,8 @@ PASSED_OVER = {"severity": "info", "action": "file left out"}
 FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
 _BLANK = b" \t,;\n"  # a line of nothing else is none
 
+# Ending of the files that LabVIEW writes beside its traces.
 INDEX = ".tdms_index"
-"""Ending of the files that LabVIEW writes beside its traces."""
 
 
 @dataclass(frozen=True, slots=True)

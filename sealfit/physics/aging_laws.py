@@ -172,6 +172,7 @@ def _induction_slopes(days, b, t_i):
     return days * per_day, -late * per_day, -t_i * per_day
 
 
+# Every shape by name.
 LOSSES = {
     loss.name: loss
     for loss in (
@@ -187,4 +188,3 @@ LOSSES = {
         ),
     )
 }  # fmt: skip
-"""Every shape by name."""

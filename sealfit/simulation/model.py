@@ -149,8 +149,8 @@ class EffectEntry(Strict):
         return self
 
 
+# Channels -> added force, factor minus one or change.
 Shape = Callable[[Mapping[str, np.ndarray]], np.ndarray]
-"""Channels -> added force, factor minus one or change."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,17 +28,15 @@ from sealfit.errors import OutError
 # A step is current if its stored key equals the key computed now. The key depends on the program's version,
 # the part of the config that the step uses, its inputs, and the step before it.
 
+# The steps in order; each reads the tables of those before it.
 STEPS = ("ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report")
-"""The steps in order; each reads the tables of those before it."""
-
+# The steps of a table of properties, which has no traces.
 STEPS_OF_PROPERTIES = ("fit-aging", "report")
-"""The steps of a table of properties, which has no traces."""
-
+# Parts of the config that a step does not use, with defaults; a change of them does not make it stale.
 UNSEEN = {
     "ingest": {"sensor": Sensor(), "loop": Loop()},
     **{step: {"loop": Loop()} for step in ("fit-steady", "fit-aging", "fit-dynamic")},
 }
-"""Parts of the config that a step does not use, with defaults; a change of them does not make it stale."""
 
 
 class Fingerprint(NamedTuple):

@@ -112,9 +112,8 @@ ALONG = ("displacement_mm", "distance_mm", "time_s")
 # Derived channel if loads differ: load times |speed|, the power of friction over its coefficient.
 POWER = "power"
 
+# Ratio of the largest to the smallest load up to which it is one setting.
 SAME_LOAD = 1.05
-"""Ratio of the largest to the smallest load up to which it is one setting."""
-
 NOT_CHANNELS = {
     "file", "record", "run_id", "bin", "stroke_id", "n", "force_N", "force_sd_N", "presliding_N",
     "speed_bin_mm_s", "specimen_id", "condition", "series", "rubber", "speed_set_mm_s",

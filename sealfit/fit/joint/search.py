@@ -325,8 +325,8 @@ def solve_linear(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarra
     return model.at(np.clip(solved.vector(), *bounds))
 
 
+# Normal matrix, (k, k), and gradient, (k,), of the linear parameters, and the sum of squares.
 Equations = tuple[np.ndarray, np.ndarray, float]
-"""Normal matrix, (k, k), and gradient, (k,), of the linear parameters, and the sum of squares."""
 
 
 def _equations(model: Model, rows: Rows, whitening: Whitening) -> Equations:
