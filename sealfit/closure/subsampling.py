@@ -24,25 +24,18 @@ from sealfit.fit.joint.rows import POWER, Rows, make_rows, merge, thin
 
 # A campaign with no more strokes is searched in full. Of a larger one this many are drawn, by whole runs.
 STROKES = 4_000
-
 # Least number of runs drawn: runs are the evidence for most variables.
 RUNS = 1_000
-
 # Least number of runs drawn for each parameter of the declared model.
 LEAST_RUNS = 20
-
 # Factor on the number of strokes drawn next if the full campaign shows more than those searched.
 FURTHER = 4
-
 # Approximate number of rows in a search. More rows are merged along their strokes.
 ROWS = 4_000
-
 # Number of merged rows kept per stroke, if `MOST_ROWS` allows it.
 PER_STROKE = 8
-
 # Largest number of rows in a search.
 MOST_ROWS = 8_000
-
 # If `MOST_ROWS` allows fewer rows per stroke, some files keep `PER_STROKE` and the others one row per stroke.
 LEAST_PER_STROKE = 4
 
