@@ -26,24 +26,20 @@ from sealfit.simulation.noise import Channel, Noise
 # its limit.
 STEADY_LENGTHS = 9.0
 
+Positive = Annotated[float, Field(gt=0)]
+
 
 class Design(Strict):
     """The runs of a campaign, the rig, and the order of tests."""
 
     temperatures_C: tuple[float, ...] = Field((60.0,), description="empty: no such column")
-    compressions_pct: tuple[Annotated[float, Field(gt=0)], ...] = Field(
-        (80.0,), description="empty: no such column"
-    )
-    days: tuple[Annotated[float, Field(gt=0)], ...] = Field(
-        (1.0, 2.0, 4.0, 8.0), description="days of the aged rubber"
-    )
+    compressions_pct: tuple[Positive, ...] = Field((80.0,), description="empty: no such column")
+    days: tuple[Positive, ...] = Field((1.0, 2.0, 4.0, 8.0), description="days of the aged rubber")
     unaged: bool = Field(True, description="unaged rubber too, as day 0; false and no days: no such column")
     unaged_temperature_C: float = 23.0
     unaged_compression_pct: float = Field(100.0, gt=0)
-    loads_N: tuple[Annotated[float, Field(gt=0)], ...] = Field((49.03,), description="empty: no such column")
-    speeds_mm_s: tuple[Annotated[float, Field(gt=0)], ...] = Field(
-        (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 50.0), min_length=1
-    )
+    loads_N: tuple[Positive, ...] = Field((49.03,), description="empty: no such column")
+    speeds_mm_s: tuple[Positive, ...] = Field((0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 50.0), min_length=1)
     directions: tuple[Literal[1, -1], ...] = Field((1,), min_length=1, max_length=2)
     strokes_per_file: int = Field(1, ge=1, description="more than one: strokes both ways in every file")
     repeats: int = Field(3, ge=1)
