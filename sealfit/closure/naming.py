@@ -71,12 +71,11 @@ def propose(
         and others
         and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)
     ):
-        return named_among(fitted, _best_few(found))
+        return named_among(fitted, found)
     # Conditions are tested one after the other, so the calendar is correlated with them: other channels come
     # first, unless a named form along the calendar fits much better.
-    others, calendar = (
-        _refitted(fitted, part) for part in (_best_few(others), _best_few(calendar)[:CALENDAR_RIVALS])
-    )
+    others = _refitted(fitted, _best_few(others), others)
+    calendar = _refitted(fitted, _best_few(calendar)[:CALENDAR_RIVALS])
     calendar.sort(key=lambda p: p.bic)
     if calendar[0].named and calendar[0].bic < min(p.bic for p in others) - RIVAL_BIC:
         return _ordered(fitted, [*calendar, *others])
@@ -89,12 +88,12 @@ def propose_ripples(
     """Return jointly refitted proposals for a periodic component, best first."""
     linearised = Linearised(fitted)
     found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
-    return named_among(fitted, _best_few(found))
+    return named_among(fitted, found)
 
 
 def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return proposals, fitted jointly with the model from their start values: first the one to report."""
-    return _ordered(fitted, _refitted(fitted, found))
+    """Return the best proposals, fitted jointly with the model: first the one to report."""
+    return _ordered(fitted, _refitted(fitted, _best_few(found), found))
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
@@ -131,10 +130,13 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
             continue
         if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
-    known, most = {p.term.target for p in kept if p.named}, max((p.chi2 for p in found), default=0.0)
-    for target in dict.fromkeys(p.term.target for p in ranked if p.chi2 >= CONTENDER_SHARE * most):
-        if target not in known:
-            kept += [p for p in ranked if p.term.target == target][:FORMS_EACH]
+    most = max((p.chi2 for p in found), default=0.0)
+    near = [p for p in ranked if p.chi2 >= CONTENDER_SHARE * most and p.named]
+    for part in (lambda p: p.term.target, lambda p: p.term.channels):
+        known = {part(p) for p in kept if p.named}
+        for own in dict.fromkeys(map(part, near)):
+            if own not in known:
+                kept += [p for p in near if part(p) == own and p not in kept][:FORMS_EACH]
     return kept
 
 
@@ -239,10 +241,11 @@ def _identical(one: Proposal, other: Proposal) -> bool:
     return one.term.key()[1:] == other.term.key()[1:] and abs(one.bic - other.bic) < 1e-3
 
 
-def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
+def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal] = ()) -> list[Proposal]:
     """Return proposals fitted jointly with the model, best first.
 
-    The scatter is re-estimated for those near the best. Nearness is the BIC under the scatter of the best. If
+    With them some of `more` are: further named forms of the variables of the best. The missing effect biases
+    the model in whose tangent space they were ranked. The scatter is re-estimated for those near the best. Nearness is the BIC under the scatter of the best. If
     most of the former scatter was the missing effect, as the few likeliest proposals show, all are fitted
     under the re-estimated one.
     """
@@ -253,6 +256,7 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
     first = min(joint, key=lambda p: p.bic)
     best, alone = _reestimated(first), _reestimated(first, noise=True)
     joint += [_joint(fitted, p) for p in likeliest[LIKELIEST:]]
+    joint += [_joint(fitted, p) for p in _further_forms(min(joint, key=lambda p: p.bic), found, more)]
     if first.fitted.deviance - alone.fitted.deviance > SCATTER_FALL:
         joint = list(_refitted_under(fitted, joint, alone.fitted.scatter))
     refitted = sorted(joint, key=lambda p: p.bic)
@@ -264,6 +268,13 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
     own = [_reestimated(p) for p, n in zip(refitted[1:], near, strict=True) if n]
     far = [p for p, n in zip(refitted[1:], near, strict=True) if not n]
     return [best, *own, *far[:LIKELIEST]]
+
+
+def _further_forms(best: Proposal, tried: Sequence[Proposal], found: Sequence[Proposal]) -> list[Proposal]:
+    """Return the likeliest named forms of the variables of the best proposal that were not tried."""
+    known = {p.term.key() for p in tried}
+    own = [p for p in found if p.named and p.term.channels == best.term.channels and p.term.key() not in known]
+    return sorted(own, key=lambda p: p.bic)[:REFITTED]
 
 
 def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
