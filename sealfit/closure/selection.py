@@ -155,7 +155,8 @@ class _Loop:
         if not open_ or number > self.context.config.loop.max_rounds:
             return not self.rename_earlier()
         claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
-        open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
+        related = _related_candidates(open_, claimable, self.channels)
+        open_ += [c for c in related if c.key not in self.refused]
         proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
         failed: list[RefusedEffect] = []
         accepted = self.confirm(self.fitted, proposals, number, failed)
@@ -351,22 +352,27 @@ def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candi
     return sorted(found, key=lambda c: c.p_value)
 
 
-def _related_candidates(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
+def _related_candidates(
+    significant: list[Candidate], candidates: list[Candidate], channels: Mapping[str, Channel]
+) -> list[Candidate]:
     """Return further candidates that may explain the same structure as the significant ones.
 
-    The same channel on other quantities is one: the fits decide on which it acts. Conditions that explain
-    half of what the calendar does on the same quantity are others: they are tested one after the other, so
-    the calendar is correlated with them, and a dozen specimens may give too little evidence.
+    The same channel on other quantities is one: the fits decide on which it acts. So are the channels along
+    strokes: time, distance and position are the same there but for the speed. Conditions that explain half of
+    what the calendar does on the same quantity are others: they are tested one after the other, so the
+    calendar is correlated with them, and a dozen specimens may give too little evidence.
     """
+    along = {name for name, channel in channels.items() if channel.unit == "sample"}
     found = []
     keys = {c.key for c in significant}
     for strong in significant:
         for c in candidates:
             same_target = c.target == strong.target
             condition = strong.channels[0] in CALENDAR and c.unit == "specimen" and same_target
+            one, other = c.channels[-1], strong.channels[-1]
             same_channel = (
-                c.channels[-1:] == strong.channels[-1:]
-                and not strong.pair
+                (one == other or {one, other} <= along)
+                and not (c.pair or strong.pair)
                 and c.columns.shape == strong.columns.shape
             )
             if (condition or same_channel) and c.key not in keys and c.chi2 >= HALF_OF_CALENDAR * strong.chi2:
