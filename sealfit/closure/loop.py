@@ -180,15 +180,15 @@ class _HeldOut:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[Model] | None]:
         """Return each row's force before and after, by fits without its group, and the models.
 
-        A force is NaN if its row was never held out. The third array is true where the model before is
-        determined. The models are those of the repeated searches; None if the search is not repeated. A
+        A force is NaN if its row was never held out. The third array is true where both are determined by
+        the rows not held out. The models are those of the repeated searches; None if the search is not repeated. A
         repeated search has as many rounds as the full campaign needed for its last effect: with less power it
         would go on for many rounds with small effects that it refuses.
         """
         if not (selection.added and self.repeats):
             before, determined = self.refitted(selection.before)
-            after = self.refitted(selection.after)[0] if selection.added else before
-            return before, after, determined, None
+            after, also = self.refitted(selection.after) if selection.added else (before, determined)
+            return before, after, determined & also, None
         rounds = max(a.round for a in selection.added)
         parts = run_map(_held_out, _Folds(self, selection.before, rounds), workers=self.context.workers)
         before, after = np.full((2, self.rows.force.size), np.nan)
@@ -263,7 +263,7 @@ class _Prediction:
 
     before: np.ndarray
     after: np.ndarray
-    determined: np.ndarray  # whether the other rows determine the force before
+    determined: np.ndarray  # whether the other rows determine both forces
     model: Model
 
 
@@ -280,13 +280,15 @@ def _held_out(fold: _Fold) -> _Prediction:
     def on_every(fitted: Fitted) -> Fitted:
         return fitted if fold.every is None else fit(fitted.model, fold.every, fitted.scatter, turns=0)
 
-    own = on_every(before)
-    first, tangent = evaluate(own.model, fold.test)
-    second = first
-    if after is not before:
-        second = evaluate(on_every(after).model, fold.test, jacobian=False)[0]
-    scatter = np.sqrt(own.rows.weight @ own.residual**2)
-    return _Prediction(first, second, mean_se(tangent, own.covariance) < DETERMINED * scatter, after.model)
+    def predicted(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+        own = on_every(fitted)
+        force, tangent = evaluate(own.model, fold.test)
+        scatter = np.sqrt(own.rows.weight @ own.residual**2)
+        return force, mean_se(tangent, own.covariance) < DETERMINED * scatter
+
+    first, determined = predicted(before)
+    second, also = (first, determined) if after is before else predicted(after)
+    return _Prediction(first, second, determined & also, after.model)
 
 
 def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
@@ -351,8 +353,13 @@ def _only_gains(
         if not selection.added:
             models = replace(models, after=models.before, held_after=models.held_before)
         else:
+            held, determined = heldout.refitted(own)
             models = replace(
-                models, after=after, held_after=heldout.refitted(own)[0], covered=heldout.covered(own.model)
+                models,
+                after=after,
+                held_after=held,
+                covered=heldout.covered(own.model),
+                determined=models.determined & determined,
             )
     strong = tuple(r for r in refused if not r.weak)
     return replace(selection, refused=(*selection.refused, *refused), worse=strong), models
