@@ -180,10 +180,10 @@ class _HeldOut:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[Model] | None]:
         """Return each row's force before and after, by fits without its group, and the models.
 
-        A force is NaN if its row was never held out. The third array is true where both are determined by
-        the rows not held out. The models are those of the repeated searches; None if the search is not repeated. A
-        repeated search has as many rounds as the full campaign needed for its last effect: with less power it
-        would go on for many rounds with small effects that it refuses.
+        A force is NaN if its row was never held out. The third array is true where the rows not held out
+        determine both forces. The models are those of the repeated searches; None if the search is not
+        repeated. A repeated search has as many rounds as the full campaign needed for its last effect: with
+        less power it would go on for many rounds with small effects that it refuses.
         """
         if not (selection.added and self.repeats):
             before, determined = self.refitted(selection.before)

@@ -39,7 +39,7 @@ from sealfit.fit.joint.whitening import Scatter, Whitening
 from sealfit.tables import CALENDAR
 
 REFITTED = 8  # Proposals that are refitted jointly.
-FORMS_EACH = 2  # Proposals that are refitted for each further quantity.
+FORMS_EACH = 2  # Proposals that are refitted for each further quantity and each further set of variables.
 LIKELIEST = 3  # Proposals that are refitted first, to see whether most of the scatter was the missing effect.
 CALENDAR_RIVALS = 2  # Calendar proposals that are refitted as rivals of others.
 LINEAR = "linear"
@@ -118,8 +118,8 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
     """Return the few best proposals to refit, the best free shape among them.
 
     Each effect is kept at most once per target and on at most two. A grid is coarse, so physical effects get
-    a margin. Every further quantity that explains nearly as much has a named form among them: the missing
-    effect biases the model it is tested on.
+    a margin. Every further quantity and set of variables that explains nearly as much has a named form among
+    them: the missing effect biases the model it is tested on.
     """
     kept: list[Proposal] = []
     ranked = sorted(found, key=lambda p: p.bic - EQUAL_BIC * p.term.effect.physical)
@@ -244,10 +244,10 @@ def _identical(one: Proposal, other: Proposal) -> bool:
 def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal] = ()) -> list[Proposal]:
     """Return proposals fitted jointly with the model, best first.
 
-    With them some of `more` are: further named forms of the variables of the best. The missing effect biases
-    the model in whose tangent space they were ranked. The scatter is re-estimated for those near the best. Nearness is the BIC under the scatter of the best. If
-    most of the former scatter was the missing effect, as the few likeliest proposals show, all are fitted
-    under the re-estimated one.
+    Further named forms of the variables of the best are among them, from `more`: the missing effect biases
+    the model in whose tangent space they were ranked. The scatter is re-estimated for those near the best.
+    Nearness is the BIC under the scatter of the best. If most of the former scatter was the missing effect,
+    as the few likeliest proposals show, all are fitted under the re-estimated one.
     """
     if not found:
         return []
@@ -273,8 +273,8 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal
 def _further_forms(best: Proposal, tried: Sequence[Proposal], found: Sequence[Proposal]) -> list[Proposal]:
     """Return the likeliest named forms of the variables of the best proposal that were not tried."""
     known = {p.term.key() for p in tried}
-    own = [p for p in found if p.named and p.term.channels == best.term.channels and p.term.key() not in known]
-    return sorted(own, key=lambda p: p.bic)[:REFITTED]
+    same = [p for p in found if p.term.channels == best.term.channels and p.named]
+    return sorted((p for p in same if p.term.key() not in known), key=lambda p: p.bic)[:REFITTED]
 
 
 def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:

@@ -55,7 +55,7 @@ class BeforeAfter:
     held_before: np.ndarray  # (n,) NaN where never held out
     held_after: np.ndarray
     covered: np.ndarray  # (n,) whether the other rows cover the row; else it is extrapolated
-    determined: np.ndarray  # (n,) whether they determine its force before and after; else it is extrapolated, too
+    determined: np.ndarray  # (n,) whether they determine both forces; else it is extrapolated, too
 
     def heldout_rmse_N(self, held: np.ndarray, *, extrapolated: bool = False) -> float | None:
         """Return the held-out error, on rows that the other rows cover or on extrapolated ones."""
