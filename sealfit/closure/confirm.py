@@ -10,6 +10,7 @@ import pandas as pd
 
 from sealfit.closure.channels import level_values, settings, unit_of, varies
 from sealfit.closure.criteria import (
+    COMMON_PROFILE,
     CURVE_P,
     HALVED,
     LEAST_FALL,
@@ -35,7 +36,7 @@ from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.fit.joint import Fitted, fit, with_reml_smoothness
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
-from sealfit.fit.joint.rows import LEVELS, Rows
+from sealfit.fit.joint.rows import ALONG, LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
 from sealfit.tables import CALENDAR
 
@@ -367,17 +368,38 @@ def vague_between_speeds(before: Fitted, proposal: Proposal) -> bool:
 
 
 def _changes_the_curve(proposal: Proposal) -> bool:
-    """Whether it is a free shape within specimens, of one coefficient or of speed and another variable."""
+    """Whether it acts on one coefficient, or is a shape of the speed and another variable.
+
+    Mechanisms between strokes are exempt, and so is what differs between specimens.
+    """
     term = proposal.term
+    if proposal.unit == "specimen":
+        return False
+    if term.effect.physical:
+        return term.acts_on not in WHOLE and not set(ALONG).isdisjoint(term.channels)
     by_speed = len(term.channels) > 1 and "speed_mm_s" in term.channels
-    free = not term.effect.physical and proposal.unit != "specimen"
-    return free and (by_speed or term.acts_on not in WHOLE)
+    return by_speed or term.acts_on not in WHOLE
 
 
 def _shape_along_strokes(term: Term, rows: Rows) -> bool:
-    """Whether it is a form without a mechanism of a channel that varies within strokes."""
-    within = any(unit_of(rows.values(name), rows) == "sample" for name in term.channels)
-    return within and not term.effect.physical
+    """Whether it is a form without a mechanism of a channel that follows the strokes."""
+    return not term.effect.physical and any(_follows_strokes(name, rows) for name in term.channels)
+
+
+def _follows_strokes(name: str, rows: Rows) -> bool:
+    """Whether a channel is the same along all strokes to a part, as the profiles of specimens may be.
+
+    A column of the traces is if a parabola of distance and position explains `COMMON_PROFILE` of its variance
+    within strokes.
+    """
+    values = rows.values(name)
+    if name in ALONG or unit_of(values, rows) != "sample":
+        return name in ALONG
+    places = [rows.values(own) for own in ("distance_mm", "displacement_mm") if own in rows.table]
+    columns = np.column_stack([about_means(own**k, rows, "stroke") for own in places for k in (1, 2)])
+    own = about_means(values, rows, "stroke")
+    left = own - columns @ np.linalg.lstsq(columns, own)[0]
+    return left @ left < (1 - COMMON_PROFILE) * (own @ own)
 
 
 def added_force(proposal: Proposal) -> np.ndarray:

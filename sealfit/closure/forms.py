@@ -44,6 +44,11 @@ NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1
 PHASES = tuple(np.arange(4) * np.pi / 4)
 """Phases of a ripple that are tried, in rad."""
 
+CHANGES_A_WAVE = (
+    "direction", "speed_mm_s", "load_N", "temperature_C", "compression_ratio_pct", "aging_days"
+)  # fmt: skip
+"""Channels along which the amplitude of a wave may change."""
+
 
 def terms_of(
     candidate: Candidate, channels: Mapping[str, Channel], fitted: Fitted, effects: Mapping[str, Effect]
@@ -212,6 +217,7 @@ def periodic_terms(
     """Yield the terms that a periodic component may be, each with its grid and a candidate."""
     rows = fitted.rows
     effect = _near(effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"], peak)
+    changing = _near(effects["sinusoid_changing"], peak)
     both = np.unique(np.sign(rows.speed)).size == 2
     targets = [ADDED] if peak.sign_symmetric else []
     if not both or not peak.sign_symmetric:
@@ -236,6 +242,11 @@ def periodic_terms(
                 (peak.axis,), *target, "file", np.empty((0, 0)), test_result, p_value=peak.p_value
             )
             yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
+            for name in CHANGES_A_WAVE:
+                values = np.abs(rows.values(name)) if name == "speed_mm_s" else rows.values(name)
+                if np.ptp(values) > 0:
+                    own = {**fixed, "z_ref": reference(values)}
+                    yield Term(changing, (peak.axis, name), *target, fixed=own), names, candidate
 
 
 def _near(effect: Effect, peak: Peak) -> Effect:

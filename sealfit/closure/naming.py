@@ -85,10 +85,14 @@ def propose(
 def propose_ripples(
     fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
 ) -> list[Proposal]:
-    """Return jointly refitted proposals for a periodic component, best first."""
+    """Return jointly refitted proposals for a periodic component, best first.
+
+    Changes of its amplitude that are not the best are no rivals: none of them was found.
+    """
     linearised = Linearised(fitted)
     found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
-    return named_among(fitted, found)
+    best, *others = named_among(fitted, found)
+    return [best, *(p for p in others if len(p.term.channels) == 1)]
 
 
 def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:

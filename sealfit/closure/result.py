@@ -79,7 +79,7 @@ class BeforeAfter:
         if max(inside) > SAME_ERROR or (weak and inside[1] >= 1):
             return False
         if around is not None and not weak and max(inside) < HALVED:
-            return whole[0] <= SAME_ERROR
+            return whole[0] <= HARMLESS
         strong = not weak or inside[1] < HALVED
         return max(whole) <= (HARMLESS if strong else SAME_ERROR)
 

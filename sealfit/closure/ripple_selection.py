@@ -103,7 +103,12 @@ def without_ripples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
             shifts = np.zeros_like(level)
             shifts[ids] = passes(strokes).map(shift).to_numpy(dtype=float)
             place = place + shifts[own]
-        shape = term.effect.shape({term.effect.reads[0]: place, **term.fixed}, **values)
+        given = {term.effect.reads[0]: place, **term.fixed}
+        for name in term.effect.reads[1:]:
+            second = np.zeros_like(level)
+            second[ids] = term.inputs(rows)[name][rows.groups.starts["stroke"]]
+            given[name] = second[own]
+        shape = term.effect.shape(given, **values)
         residual = residual - shape * (1.0 if term.operation == "add" else level[own])
     return samples.assign(residual_N=residual)
 

@@ -59,6 +59,8 @@ AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 
 # Periods per median stroke that are tried for waves of few periods.
 LONG_WAVES = np.linspace(1.5, 4.5, 16)
+# Sums with random phases with which that of the files is compared.
+RANDOM_PHASES = 9_999
 # Periods per stroke about a wave in the model within which what is left of it is found again.
 MAIN_LOBE = 2
 # Degree of the Legendre series of a curve of the position; it resolves six periods.
@@ -110,7 +112,31 @@ def find_ripple(
         p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED_PHASE
     ]
     best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
+    if common_phase and not best.common_phase:
+        best = _with_shared_phase(best, samples)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
+
+
+def _with_shared_phase(peak: Peak, samples: pd.DataFrame) -> Peak:
+    """Return a peak of the mean power, with one phase in all files if their phases agree.
+
+    The sum of the files' complex amplitudes is compared with sums in which the phases are random. The power
+    gives the wavelength, so no other is tried, and files without the wave have little weight: a ripple may be
+    that of one direction or of some conditions.
+    """
+    waves = waves_of(samples, np.array([peak.wavelength]), peak.axis)
+    own = waves.amplitudes[:, 0] @ np.array([1, 1j])
+    files, file = np.unique(waves.unit, return_inverse=True)
+    turned = np.exp(2j * np.pi * np.random.default_rng(0).random((RANDOM_PHASES, files.size)))
+    tests = []
+    for signs in (np.ones_like(waves.direction), waves.direction):
+        of_file = np.zeros(files.size, dtype=complex)
+        np.add.at(of_file, file, signs * own)
+        random = np.abs(turned @ np.abs(of_file))
+        tests.append((1 + int((random >= np.abs(of_file.sum())).sum())) / (1 + RANDOM_PHASES))
+    if len(tests) * min(tests) > SHARED_PHASE:
+        return peak
+    return replace(peak, common_phase=True, sign_symmetric=tests[0] <= tests[1])
 
 
 def _coherent(spectrum: Spectrum) -> list[Peak]:

@@ -347,6 +347,40 @@ SINUSOID = closed_form(
 )
 
 
+def sinusoid_changing_shape(inputs, *, A, B, lambda_, phi):
+    r"""Sine of any channel whose amplitude is a straight line in a second one.
+
+    A screw that runs smoothly one way, a joint that is passed at speed, a guide that bends under load: the
+    ripple is stronger in one direction, at one end of the speeds, in some conditions.
+    """
+    return (A + B * deviation(inputs, SECOND)) * sinusoid_shape(inputs, A=1.0, lambda_=lambda_, phi=phi)
+
+
+SINUSOID_CHANGING = closed_form(
+    id="sinusoid_changing",
+    label="periodic in {x}, with an amplitude that changes with {z}",
+    equation=r"h = (A + B (z - z_{ref})) \sin(2 \pi x / \lambda + \varphi)",
+    form="(A + B (z - z_ref)) sin(2 pi x / lambda + phi)",
+    reference="mean over a wavelength",
+    reads=(CHANNEL, SECOND),
+    acts_on=SINUSOID.acts_on,
+    parameters=(
+        Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude at z = z_ref", linear=True),
+        Parameter("B", "{y}/{z}", 0.0, AMPLITUDE, "its change with z", linear=True),
+        *SINUSOID.parameters[1:],
+    ),
+    shape=sinusoid_changing_shape,
+    source="Form: ours. The first Fourier term, with the first order of a change of its amplitude.",
+    # By hand: -1/2 as above, times 4 + 3 * (5 - 3).
+    worked=(
+        {"x": 0.02, "z": 5.0, "z_ref": 3.0},
+        {"A": 4.0, "B": 3.0, "lambda_": 0.04, "phi": np.pi / 6},
+        -5.0,
+    ),
+    periodic=True,
+)
+
+
 def sinusoid_harmonics_shape(inputs, *, A, B, lambda_, phi, phi_2):
     r"""Sine of any channel with its second harmonic.
 

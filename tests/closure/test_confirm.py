@@ -266,12 +266,14 @@ def test_what_just_suffices_is_accepted(decide, given):
         ("surface", ("speed_mm_s", "repeat"), "mu", 1e-4, 0.4, False),
         ("surface", ("oil_ppm", "dust_mg"), "mu", 1e-4, 0.4, True),
         ("asymmetry", ("direction",), "sigma_2", 1e-4, 0.4, True),
+        ("warming_distance", ("distance_mm",), "mu_c", 1e-4, 0.4, False),
+        ("warming_distance", ("distance_mm",), "mu", 1e-4, 0.4, True),
     ],
 )
 def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
     decide, effect, channels, acts_on, p_value, share, claimed
 ):
-    made = proposal(effect, channels, acts_on, p_value, physical=effect == "asymmetry")
+    made = proposal(effect, channels, acts_on, p_value, physical=effect in ("asymmetry", "warming_distance"))
     found, refused, _ = decide([made], [Gain(share, 1 - share, 10.0)])
     assert (found is not None) == claimed
     assert [item.weak for item in refused] == ([] if claimed else [True])

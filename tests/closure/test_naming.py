@@ -63,7 +63,7 @@ def proposal(
 @pytest.fixture
 def first_of(monkeypatch):
     """Say which proposal is reported of some that are refitted already, on a model with some effects."""
-    monkeypatch.setattr(naming, "_refitted", lambda fitted, found: list(found))
+    monkeypatch.setattr(naming, "_refitted", lambda fitted, found, more: list(found))
 
     def first(*found, before=()):
         fitted = SimpleNamespace(
@@ -220,13 +220,39 @@ def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
     fitted = fit_declared(make_rows(bins, has_aging=True))
     first, second = naming.propose_ripples(fitted, peak, bins.iloc[:0], EFFECTS)[:2]
     assert (first.term.acts_on, first.term.operation) == ("force", "add")
+    assert second.term.effect.id == "ripple"
     assert second.bic - first.bic > 100
+
+
+@pytest.mark.parametrize(("back", "changes"), [(1.0, False), (0.0, True)])
+def test_a_ripple_of_one_direction_has_an_amplitude_that_changes_with_the_direction(back, changes):
+    bins = numbered(make_bins(days=(), repeats=2, noise_N=0.05, directions=(1, -1)))
+    wave = np.sin(2 * np.pi * bins["displacement_mm"] / 8.0)
+    strength = np.where(bins["direction"] > 0, 0.3, back * 0.3)
+    rows = make_rows(bins.assign(force_N=bins["force_N"] + strength * wave), has_aging=True)
+    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0, 1.0)
+    first, *others = naming.propose_ripples(fit_declared(rows), peak, bins.iloc[:0], EFFECTS)
+    assert (first.term.effect.id == "sinusoid_changing") == changes
+    assert first.term.channels == ("displacement_mm", "direction")[: 1 + changes]
+    assert all(len(p.term.channels) == 1 for p in others)
+    if changes:
+        values = first.fitted.model.values[-1]
+        assert values["B"] == pytest.approx(values["A"], rel=0.2)
 
 
 def test_proposals_of_one_term_are_compared_by_identity():
     one, other = (proposal("linear", column=np.array([1.0, 2.0])) for _ in range(2))
     assert one in [one]
     assert one not in [other]
+
+
+def test_every_set_of_variables_that_explains_nearly_as_much_has_named_forms_among_those_refitted():
+    along = [proposal(name, behind=k) for k, name in enumerate(("log", "quadratic", "power", "bump"))]
+    time = [proposal(name, behind=30.0 + k, channels=("time_s",)) for k, name in enumerate(("linear", "log"))]
+    kept = naming._best_few([*time, *along])
+    assert all(p in kept for p in time)
+    further = naming._further_forms(time[0], kept, [*time, *along, proposal("power", channels=("time_s",))])
+    assert [p.term.effect.id for p in further] == ["power"]
 
 
 def test_a_free_shape_of_a_quantity_leaves_its_named_forms_among_those_refitted():

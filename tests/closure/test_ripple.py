@@ -60,6 +60,17 @@ def test_free_phase_ripple_is_found_by_its_power():
     assert peak.p_value < 1e-4
 
 
+@pytest.mark.parametrize("phase", ["common", "free"])
+def test_a_ripple_of_some_files_has_one_phase_if_theirs_agree(phase):
+    samples = make_samples(amplitude=0.4, phase=phase, files=24, noise_N=0.7)
+    quiet = make_samples(seed=1, files=24, noise_N=0.7)
+    samples["residual_N"] = samples["residual_N"].where(samples["unit"] % 4 == 0, quiet["residual_N"])
+    peak = find_ripple(samples, common_phase=True)
+    assert peak.wavelength == pytest.approx(3.0, rel=0.02)
+    assert peak.p_value < 1e-3
+    assert peak.common_phase == (phase == "common")
+
+
 def test_hum_in_time_is_not_taken_for_position():
     peak = find_ripple(make_samples(amplitude=0.15, along="t"), common_phase=True)
     assert peak.axis == "time_s"
