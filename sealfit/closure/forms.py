@@ -44,10 +44,10 @@ NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1
 PHASES = tuple(np.arange(4) * np.pi / 4)
 """Phases of a ripple that are tried, in rad."""
 
+# Channels along which the amplitude of a wave may change.
 CHANGES_A_WAVE = (
     "direction", "speed_mm_s", "load_N", "temperature_C", "compression_ratio_pct", "aging_days"
 )  # fmt: skip
-"""Channels along which the amplitude of a wave may change."""
 
 
 def terms_of(
