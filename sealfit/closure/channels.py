@@ -14,6 +14,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from sealfit.closure.criteria import (
+    COMMON_PROFILE,
     CONSTANT_SHARE,
     FREE_DF,
     LEAST_GROUPS_HELD_OUT,
@@ -28,13 +29,12 @@ from sealfit.closure.criteria import LEAST_UNITS_OF_SLOPES as LEAST_SLOPES
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.declared import SAME_SPEED
-from sealfit.fit.joint.rows import LEVELS, POWER, Rows, one_load, open_columns
+from sealfit.fit.joint.rows import ALONG, LEVELS, POWER, Rows, one_load, open_columns
 from sealfit.ingest.quality import STILL_RISING
 from sealfit.tables import CALENDAR
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
 ROUNDING = 1e-9  # Relative rounding error of the mean of equal numbers.
-ALONG_STROKES = ("time_s", "distance_mm", "displacement_mm")  # proportional to one another at steady speed
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def searched(channels: Iterable[Channel], rows: Rows) -> list[Channel]:
     Where strokes end before the friction is steady, a residual along them is an error of the bristle model,
     by which the rest of the rise is taken out.
     """
-    left_out = ALONG_STROKES if too_short(rows) else ()
+    left_out = ALONG if too_short(rows) else ()
     return [c for c in channels if c.name not in left_out]
 
 
@@ -189,6 +189,41 @@ def run_means(channel: Channel, rows: Rows) -> Channel | None:
     if np.mean((channel.values - means) ** 2) > MOST_WITHIN_RUNS * np.var(channel.values):
         return None
     return replace(channel, values=means, unit="run")
+
+
+def follows_strokes(name: str, rows: Rows) -> bool:
+    """Whether a channel is the same along all strokes to a part, as the profiles of specimens may be.
+
+    Time, distance and position are. A column of the traces is if a common parabola of distance and position
+    explains `COMMON_PROFILE` of its variance within strokes.
+    """
+    values = rows.values(name)
+    if name in ALONG or unit_of(values, rows) != "sample":
+        return name in ALONG
+    places = [rows.values(own) for own in ("distance_mm", "displacement_mm") if own in rows.table]
+    columns = np.column_stack([*(own**k for own in places for k in (1, 2)), values])
+    columns = columns - rows.groups.means(columns, "stroke")[rows.codes("stroke")]
+    shared, own = columns[:, :-1], columns[:, -1]
+    left = own - shared @ np.linalg.lstsq(shared, own)[0]
+    return bool(left @ left < (1 - COMMON_PROFILE) * (own @ own))
+
+
+def without_trends(channel: Channel, rows: Rows) -> Channel:
+    """Return a column of the traces that does not follow the strokes, less a parabola along each of them.
+
+    Specimens differ in their profiles along strokes, which would hide what the column does. Other channels
+    are returned as they are.
+    """
+    if not channel.numeric or channel.unit != "sample" or follows_strokes(channel.name, rows):
+        return channel
+    place, code = rows.values("distance_mm"), rows.codes("stroke")
+    left = np.column_stack([place, place**2, channel.values])
+    left -= rows.groups.means(left, "stroke")[code]
+    for k in (0, 1):  # each power is removed from the columns after it, in every stroke
+        power, rest = left[:, [k]], left[:, k + 1 :]
+        size = np.maximum(rows.groups.sums(power**2, "stroke"), 1e-300)
+        left[:, k + 1 :] = rest - (rows.groups.sums(power * rest, "stroke") / size)[code] * power
+    return replace(channel, values=left[:, -1])
 
 
 def settings(values: np.ndarray) -> np.ndarray:

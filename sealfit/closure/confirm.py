@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import level_values, settings, unit_of, varies
+from sealfit.closure.channels import follows_strokes, level_values, settings, varies
 from sealfit.closure.criteria import (
-    COMMON_PROFILE,
     CURVE_P,
     HALVED,
     LEAST_FALL,
@@ -383,23 +382,7 @@ def _changes_the_curve(proposal: Proposal) -> bool:
 
 def _shape_along_strokes(term: Term, rows: Rows) -> bool:
     """Whether it is a form without a mechanism of a channel that follows the strokes."""
-    return not term.effect.physical and any(_follows_strokes(name, rows) for name in term.channels)
-
-
-def _follows_strokes(name: str, rows: Rows) -> bool:
-    """Whether a channel is the same along all strokes to a part, as the profiles of specimens may be.
-
-    A column of the traces is if a parabola of distance and position explains `COMMON_PROFILE` of its variance
-    within strokes.
-    """
-    values = rows.values(name)
-    if name in ALONG or unit_of(values, rows) != "sample":
-        return name in ALONG
-    places = [rows.values(own) for own in ("distance_mm", "displacement_mm") if own in rows.table]
-    columns = np.column_stack([about_means(own**k, rows, "stroke") for own in places for k in (1, 2)])
-    own = about_means(values, rows, "stroke")
-    left = own - columns @ np.linalg.lstsq(columns, own)[0]
-    return left @ left < (1 - COMMON_PROFILE) * (own @ own)
+    return not term.effect.physical and any(follows_strokes(name, rows) for name in term.channels)
 
 
 def added_force(proposal: Proposal) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import ALONG_STROKES, too_short
+from sealfit.closure.channels import too_short
 from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import describe, grid_of, reference
@@ -19,7 +19,7 @@ from sealfit.config import Config
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import Model, Term, evaluate, mean_derivatives
-from sealfit.fit.joint.rows import POWER, Rows, sliding_power
+from sealfit.fit.joint.rows import ALONG, POWER, Rows, sliding_power
 from sealfit.fit.joint.search import bounds_of
 from sealfit.ingest.columns import condition_columns
 
@@ -160,7 +160,7 @@ def _is_tested(conditions: Mapping[str, object], rows: Rows) -> bool:
     same = np.ones(rows.force.size, dtype=bool)
     for name, value in conditions.items():
         own = rows.table[name].to_numpy()
-        if name in ALONG_STROKES:
+        if name in ALONG:
             same &= value <= 1.001 * np.max(own)  # another place of a stroke is not another run
         elif isinstance(value, float) and name != "direction":
             same &= np.isclose(np.abs(own.astype(float)), abs(value), rtol=1e-3)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.channels import ALONG_STROKES, Channel
+from sealfit.closure.channels import Channel
 from sealfit.closure.confirm import AcceptedEffect, Context, confirmed
 from sealfit.closure.criteria import EQUAL_BIC, RIVAL_BIC
 from sealfit.closure.linearised import Linearised, Proposal
@@ -21,6 +21,7 @@ from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import channel_candidates, search_pairs
 from sealfit.fit.joint import Fitted, fit
+from sealfit.fit.joint.rows import ALONG
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ class Renaming:
         """Return the channels of two effects; if both vary along strokes, all channels that do."""
         found = list(dict.fromkeys(names))
         if all(self.channels[name].unit == "sample" for name in names):
-            found += [name for name in ALONG_STROKES if name in self.channels and name not in found]
+            found += [name for name in ALONG if name in self.channels and name not in found]
         return found
 
     def _products(self, without: Fitted, names: tuple[str, str], p_value: float) -> Sequence[Proposal]:

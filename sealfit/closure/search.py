@@ -20,6 +20,7 @@ from sealfit.closure.channels import (
     scatter_level,
     shifted_from_zero,
     unit_of,
+    without_trends,
 )
 from sealfit.closure.criteria import (
     CONSTANT_IN_RUNS,
@@ -72,6 +73,7 @@ def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Genera
 def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
     """Yield the candidates of one channel, with p-values that are not adjusted."""
     rows = tests.fitted.rows
+    channel = without_trends(channel, rows)
     if channel.name == "direction":
         yield from _shape_candidates(tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return

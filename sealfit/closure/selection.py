@@ -30,7 +30,7 @@ from sealfit.closure.search import (
 from sealfit.effects.contract import Effect
 from sealfit.fit.joint import Fitted, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model
-from sealfit.fit.joint.rows import Rows
+from sealfit.fit.joint.rows import ALONG, Rows
 from sealfit.fit.joint.whitening import Scatter
 from sealfit.tables import CALENDAR
 
@@ -155,8 +155,7 @@ class _Loop:
         if not open_ or number > self.context.config.loop.max_rounds:
             return not self.rename_earlier()
         claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
-        related = _related_candidates(open_, claimable, self.channels)
-        open_ += [c for c in related if c.key not in self.refused]
+        open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
         proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
         failed: list[RefusedEffect] = []
         accepted = self.confirm(self.fitted, proposals, number, failed)
@@ -352,9 +351,7 @@ def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candi
     return sorted(found, key=lambda c: c.p_value)
 
 
-def _related_candidates(
-    significant: list[Candidate], candidates: list[Candidate], channels: Mapping[str, Channel]
-) -> list[Candidate]:
+def _related_candidates(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
     """Return further candidates that may explain the same structure as the significant ones.
 
     The same channel on other quantities is one: the fits decide on which it acts. So are the channels along
@@ -362,7 +359,6 @@ def _related_candidates(
     what the calendar does on the same quantity are others: they are tested one after the other, so the
     calendar is correlated with them, and a dozen specimens may give too little evidence.
     """
-    along = {name for name, channel in channels.items() if channel.unit == "sample"}
     found = []
     keys = {c.key for c in significant}
     for strong in significant:
@@ -371,7 +367,7 @@ def _related_candidates(
             condition = strong.channels[0] in CALENDAR and c.unit == "specimen" and same_target
             one, other = c.channels[-1], strong.channels[-1]
             same_channel = (
-                (one == other or {one, other} <= along)
+                (one == other or {one, other} <= set(ALONG))
                 and not (c.pair or strong.pair)
                 and c.columns.shape == strong.columns.shape
             )
