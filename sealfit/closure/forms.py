@@ -242,7 +242,7 @@ def periodic_terms(
                 (peak.axis,), *target, "file", np.empty((0, 0)), test_result, p_value=peak.p_value
             )
             yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
-            for name in CHANGES_A_WAVE:
+            for name in (name for name in CHANGES_A_WAVE if name in rows.table):
                 values = np.abs(rows.values(name)) if name == "speed_mm_s" else rows.values(name)
                 if np.ptp(values) > 0:
                     own = {**fixed, "z_ref": reference(values)}

@@ -227,6 +227,7 @@ def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
 @pytest.mark.parametrize(("back", "changes"), [(1.0, False), (0.0, True)])
 def test_a_ripple_of_one_direction_has_an_amplitude_that_changes_with_the_direction(back, changes):
     bins = numbered(make_bins(days=(), repeats=2, noise_N=0.05, directions=(1, -1)))
+    bins = bins.drop(columns="load_N")  # a rig may lack a channel along which amplitudes may change
     wave = np.sin(2 * np.pi * bins["displacement_mm"] / 8.0)
     strength = np.where(bins["direction"] > 0, 0.3, back * 0.3)
     rows = make_rows(bins.assign(force_N=bins["force_N"] + strength * wave), has_aging=True)
