@@ -195,8 +195,8 @@ def test_torque_is_never_called_force_nor_its_slot(reports, pages):
 
 def test_without_a_load_effects_act_on_friction_and_the_forces(unsaved):
     made = torque_campaign()
-    why = "would distinguish linear in dust_mg, factor on mu from linear in dust_mg, added to mu_s"
-    wear = {**aging_campaign().closure["effects"][0], "label": "linear in dust_mg, factor on mu"}
+    why = "would distinguish linear in dust_mg, factor on friction from linear in dust_mg, added to F_s"
+    wear = {**aging_campaign().closure["effects"][0], "label": "linear in dust_mg, factor on friction"}
     place = {"variable": "dust_mg", "level": "run"}
     made.closure |= {
         "verdict": "unexplained",
