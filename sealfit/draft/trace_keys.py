@@ -13,7 +13,7 @@ from sealfit.draft.columns import BY_BEHAVIOUR, Column, Roles
 from sealfit.draft.config_text import Notes, column_guesses, date_lines, file_column
 from sealfit.draft.dialect import STRAYS
 from sealfit.draft.files_found import Found
-from sealfit.draft.header_lines import rate_in, settings_in, started_in
+from sealfit.draft.header_lines import RATE, rate_in, settings_in, started_in
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
@@ -255,8 +255,11 @@ def _clock_or_rate(found: Found, notes: Notes) -> str | None:
     rate = rate_in([one.header for one in found.sniffed], one.decimal)
     if rate is None:
         return None
-    evidence = f"no column of time; rows per second by the header of every file looked at: '{rate[1]}'"
-    notes.guess("trace.rate_Hz", rate[0], evidence)
+    per_second, line, pattern = rate
+    evidence = f"no column of time; rows per second by the header of every file looked at: '{line}'"
+    notes.guess("trace.rate_Hz", per_second, evidence)
+    if isinstance(per_second, str):
+        notes.guess(f"trace.header_fields.{RATE}", pattern, "the number of that line, which differs")
     return ""
 
 

@@ -307,10 +307,32 @@ def test_without_a_time_the_rate_of_the_header_gives_it(line, rate, tmp_path):
     assert ingested.tables["runs"]["used"].all()
 
 
-def test_files_of_different_rates_are_a_doubt_that_names_the_key(tmp_path):
+@pytest.mark.parametrize(
+    ("line", "scale", "rate"),
+    [
+        ("Abtastrate [kHz]: {:.9g}", 0.001, "1000 * _rate"),
+        ("Delta_X (ms);{:.9g}", None, "1 / (0.001 * _rate)"),
+    ],
+)
+def test_of_files_of_different_rates_the_header_gives_each_its_own(line, scale, rate, tmp_path):
     for one in exports.records():
+        step = one.time_s[1]
         columns = exports.table([one.displacement_mm, one.force_N], ";", 4)
-        head = f"Abtastrate: {1 / one.time_s[1]:g} Hz\nWeg [mm];Kraft [N]\n"
+        head = line.format(scale / step if scale else 1000 * step) + "\nWeg [mm];Kraft [N]\n"
+        exports.write(tmp_path, f"T80_d{one.days}_v{one.speed:g}_r{one.repeat}.txt", head + columns)
+    made, config, ingested = read(tmp_path)
+    assert config.trace.rate_Hz == rate
+    assert not any("time" in doubt.reason for doubt in made.doubts)
+    runs = ingested.tables["runs"]
+    assert runs["used"].all()
+    assert "_rate" not in runs
+    npt.assert_allclose(runs["speed_mm_s"].abs(), runs["speed_set_mm_s"], rtol=0.02)
+
+
+def test_files_of_which_one_has_no_rate_are_a_doubt_that_names_the_key(tmp_path):
+    for k, one in enumerate(exports.records()):
+        columns = exports.table([one.displacement_mm, one.force_N], ";", 4)
+        head = f"{'Abtastrate' if k else 'Pause'}: {1 / one.time_s[1]:g} Hz\nWeg [mm];Kraft [N]\n"
         exports.write(tmp_path, f"T80_d{one.days}_v{one.speed:g}_r{one.repeat}.txt", head + columns)
     (doubt,) = (one for one in draft(tmp_path).doubts if "there is no time" in one.reason)
     assert "rate_Hz" in doubt.fix
