@@ -20,7 +20,7 @@ SETTINGS = {
 }
 """What header lines may set, and what its unit measures."""
 
-_LINE = re.compile(r'^"?(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
+_LINE = re.compile(r'^\W*(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
 _SPECIMEN = re.compile(r"(specimen|probe|sample|pruefling|muster)( (id|nr|no|number|nummer|name))?")
 _NUMBER = re.compile(r"^[-+]?\d+(?:[.,]\d+)?(?=$|[\s;,\t\"°%A-Za-zµ])")
 _SIZE = re.compile(r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?")
@@ -76,6 +76,8 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
     found: dict[str, Setting] = {}
     for number, line in enumerate(headers[0], start=1):
         match = _LINE.match(line)
+        if match and match["key"].count("/") > 1:
+            continue  # group/channel/property of a TDMS file: it is about the channel
         if match and _SPECIMEN.fullmatch(plain(match["key"])):
             pattern = _after(match["key"], r'([^\s;,"][^;,\t"]*)')
             values = _found(pattern, headers)
@@ -185,7 +187,7 @@ def _leading(text: str) -> str:
 
 def _after(key: str, value: str) -> str:
     """Return the pattern of a value behind the key of its line."""
-    return rf'^"?{re.escape(key)}"?[\s:=;,"]*'.replace(r"\ ", " ") + value
+    return rf'^\W*{re.escape(key)}"?[\s:=;,"]*'.replace(r"\ ", " ") + value
 
 
 def _everywhere(pattern: str, headers: Sequence[Sequence[str]]) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from sealfit.config import AGING_CONDITION
 from sealfit.draft.files_found import text_of
+from sealfit.draft.header_lines import SETTINGS
 from sealfit.draft.vocabulary import UNAGED, Unit, name_and_unit, setting
 from sealfit.errors import BadFile
 from sealfit.ingest.files import as_number, split_line
@@ -89,6 +90,8 @@ def _meanings(
     for name in [*exact, *names]:
         base, unit = name_and_unit(name)
         meaning = setting(base) or setting(name)
+        if unit is not None and unit.dimension != SETTINGS.get(meaning, unit.dimension):
+            meaning = ""  # an oven's temperature is no time, whatever word stands beside it
         if not meaning and unit is not None and unit.dimension == "speed":
             meaning = "speed_mm_s"
         if not meaning or name in ours or meaning in ours.values() or not _fits(meaning, cells.get(name, ())):

@@ -339,7 +339,8 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
             notes.doubt("trace.columns.time_s", reason, "Change the unit if it is another.")
             return UNITS["ms"]
     if column.role == role:  # else it is said where nothing but its behaviour speaks for it
-        reason = f"{column.place} has no unit; {slot.rpartition('_')[2]} is assumed."
+        has = f"the unit '{column.unknown}', which is not known here" if column.unknown else "no unit"
+        reason = f"{column.place} has {has}; {slot.rpartition('_')[2]} is assumed."
         fix = f"If it is another, name it: {slot} = {{ name = ..., unit = ... }}."
         notes.doubt(f"trace.columns.{slot}", reason, fix)
     return None

@@ -12,7 +12,7 @@ import pytest
 
 from sealfit.config import parse_config
 from sealfit.draft.draft import draft
-from sealfit.draft.header_lines import started_in
+from sealfit.draft.header_lines import settings_in, started_in
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_trace
@@ -272,6 +272,41 @@ def test_a_rotating_rig_with_two_loads_needs_no_edit(angle, turn, tmp_path):
     assert len(runs) == 8  # of a rubber, a load and a speed
     assert sorted(runs.round(1).unique()) == [2.0, 20.0]  # in rpm
     assert list(ingested.faults) == []
+
+
+@pytest.mark.parametrize(
+    ("unit", "said"),
+    [("daN", None), ("ozf", "'Kraft' has the unit 'ozf', which is not known here; N is assumed")],
+)
+def test_a_unit_below_the_name_is_used_or_named_in_a_doubt(unit, said, tmp_path):
+    for one in exports.records(speeds=(5.0,)):
+        head = f"Zeit;Weg;Kraft\ns;mm;{unit}\n"
+        exports.write(
+            tmp_path, f"T80_d{one.days}_r{one.repeat}.csv", head + exports.table(exports.slots(one), ";", 4)
+        )
+    made, config, _ = read(tmp_path)
+    assert config.trace.columns["force_N"].unit == (None if said else unit)
+    assert [doubt.reason for doubt in made.doubts if "Kraft" in doubt.reason] == (
+        [f"column 3 {said}."] if said else []
+    )
+
+
+def test_settings_in_a_header_of_comments_are_read(tmp_path):
+    written = {}
+    for one in exports.records():
+        head = f"# temperature = {one.temperature} degC\n# aged = {one.days} days\n# compression = 80 %\n"
+        file = f"{one.started:%Y%m%d-%H%M%S}.dat"
+        body = exports.table(exports.slots(one), " ", 4)
+        exports.write(tmp_path, file, f"{head}# t[s] x[mm] F[N]\n{body}")
+        written[file] = one
+    made, _, ingested = read(tmp_path)
+    assert made.doubts == ()
+    assert_settings(ingested, written, ("temperature_C", "compression_ratio_pct", "aging_days", "started_at"))
+
+
+def test_properties_of_a_tdms_channel_are_no_settings_of_the_file():
+    header = ("Group/LoadCell/wf_increment\t0.14", "Group/Speed/gain\t2", "Load [N]\t50", "Speed [mm/s]\t5")
+    assert [(one.ours, one.line) for one in settings_in([header], ".")] == [("load_N", 3), ("speed_mm_s", 4)]
 
 
 def test_times_of_day_are_found_as_the_time(tmp_path):
