@@ -259,7 +259,8 @@ def _where(left: Mapping, config: Config) -> str:
         text += f" with {joined([channel_label(name, config.units) for name in names])}"
     if level:
         text += f" {level_words(level)}"
-    return f"{text} (p {p_value(left.get('p_value'))})" if known(left.get("p_value")) else text
+    p = p_value(left.get("p_value")).replace(" ", "\u00a0")  # on one line
+    return f"{text} (p\u00a0{p})" if known(left.get("p_value")) else text
 
 
 def without_load(closure: Mapping) -> dict:
