@@ -223,6 +223,12 @@ def test_a_long_name_of_a_file_does_not_scale_the_sheets_down(tmp_path):
     assert sheets(sections, tmp_path) == 2
 
 
+def test_the_residual_by_level_stands_above_its_table(tmp_path):
+    part = '<div style="height: 150mm"></div>'
+    sections = f'<section id="residual"><div class="split">{part}{part}</div></section>'
+    assert sheets(sections, tmp_path) == 2
+
+
 def sheets(sections, folder):
     """Return how many sheets of A4 sections of the page are printed on."""
     style = Path(report_page.__file__).with_name("style.css").read_text("utf-8")
