@@ -18,7 +18,7 @@ from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
 from sealfit.ingest.formats import kind_of
-from sealfit.ingest.workbooks import longest_sheet
+from sealfit.ingest.workbooks import rows_of_sheets
 from sealfit.units import Units, conversion
 
 LONG_S = 3600.0
@@ -26,6 +26,9 @@ LONG_S = 3600.0
 
 BAD_ROWS = 2
 """Rows with a missing value that may stand above the first whole row of data."""
+
+AS_LONG = 0.5
+"""Share of the rows of a workbook's longest sheet above which another may be a recording, too."""
 
 SLOTS = {"time": "time_s", "displacement": "displacement_mm", "force": "force_N", "load": "load_N"}
 CHANNELS = ("temperature", "humidity", "pressure")
@@ -50,9 +53,17 @@ def _footer_key(footers: Sequence[Sequence[str]], sniffed: int, notes: Notes) ->
 def _sheet_key(found: Found, notes: Notes) -> None:
     """Add the sheet of the workbooks, if they have several."""
     if kind_of(found.traces[0]) == "xlsx":
-        sheet, filled = longest_sheet(read_bytes(found.folder, found.traces[0]), found.traces[0])
-        if filled > 1:
-            notes.guess("trace.sheet", sheet, f"has the most rows of the {filled} sheets of a workbook")
+        file = found.traces[0]
+        sheet, *others = rows_of_sheets(read_bytes(found.folder, file), file).items()
+        if filled := sum(rows > 0 for _, rows in others):
+            notes.guess(
+                "trace.sheet", sheet[0], f"has the most rows of the {filled + 1} sheets of a workbook"
+            )
+        if alike := [f"'{name}'" for name, rows in others if rows > AS_LONG * sheet[1]]:
+            reason = (
+                f"only '{sheet[0]}' of {file} is read, and {', '.join(alike[:5])} may be recordings, too."
+            )
+            notes.doubt("trace.sheet", reason, "If so, save each sheet in a file of its own.")
 
 
 def dialect_keys(found: Found, notes: Notes) -> None:

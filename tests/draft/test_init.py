@@ -434,6 +434,17 @@ def test_the_sheet_with_the_most_rows_holds_the_trace(tmp_path, monkeypatch):
     assert not [fault for fault in ingested.faults if fault.severity == "error"]
 
 
+def test_a_workbook_with_several_recordings_is_a_doubt(tmp_path):
+    for days in (1, 4):
+        with pd.ExcelWriter(tmp_path / f"80C_{days}d.xlsx") as book:
+            for one in exports.records(days=(days,), repeats=(1,)):
+                data = pd.DataFrame(dict(zip(("t [s]", "x [mm]", "F [N]"), exports.slots(one), strict=True)))
+                data.to_excel(book, sheet_name=f"v{one.speed:g}", index=False)
+    (doubt,) = (one for one in draft(tmp_path).doubts if one.key == "trace.sheet")
+    assert doubt.reason == "only 'v1' of 80C_1d.xlsx is read, and 'v5' may be recordings, too."
+    assert "a file of its own" in doubt.fix
+
+
 def test_two_words_that_follow_the_displacement_are_the_direction(tmp_path):
     for one in exports.records(days=(1,), speeds=(1.0, 5.0)):
         name = f"{one.speed:g}mms_{{}}_r{one.repeat}.csv"
