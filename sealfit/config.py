@@ -124,9 +124,9 @@ class TraceFormat(Strict):
     """Our name = the file's name, or its position from 1; with the unit that its numbers are in: `force_N =
     {name = "Kraft", unit = "kgf"}`.
     """
-    rate_Hz: float | None = Field(None, gt=0, le=MOST)
-    """Rows per second of files without a column of time: it counts from 0 at the first row of data. For files
-    that differ in rate, one config each.
+    rate_Hz: float | str | None = None
+    """Rows per second of files without a column of time: it counts from 0 at the first row of data. Where
+    files differ, an expression over what runs.csv, its name or its header says of each: `"1000 * rate_kHz"`.
     """
     optional: list[str] = Field(default_factory=list)
     """Those of `columns` that a file may lack."""
@@ -146,6 +146,13 @@ class TraceFormat(Strict):
     """Speed column whose integral over time is the displacement."""
     integrate_per: Literal["s", "min"] = "s"
     """Time unit of that speed; `"min"` for rpm."""
+
+    @field_validator("rate_Hz")
+    @classmethod
+    def _some_rate(cls, rate: float | str | None) -> float | str | None:
+        if isinstance(rate, float) and not 0 < rate <= MOST:
+            raise ValueError(f"{rate:g} rows per second are not possible")
+        return rate
 
     @model_validator(mode="before")
     @classmethod
@@ -425,6 +432,8 @@ class Config(Strict):
         rows |= {f"runs.compute.{k}": (v, False) for k, v in self.runs.compute.items()}
         if self.trace.keep is not None:
             rows["trace.keep"] = (self.trace.keep, True)
+        if isinstance(self.trace.rate_Hz, str):
+            rows["trace.rate_Hz"] = (self.trace.rate_Hz, False)
         for place, (text, condition) in rows.items():
             try:
                 parse(text, condition=condition)

@@ -307,7 +307,8 @@ def confirmed(
         gain = heldout_gain(fitted, proposal, *folds_of)
         reason = _reason_refused(fitted, proposal, gain, samples, folds_of[-1])
         unit = config.units.unit("force")
-        context.say(f"  round {number}: {describe(proposal.term)}: held-out gain {gain.rmse_N:.4g} {unit}")
+        label = describe(proposal.term, fitted.rows)
+        context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
             others = rivals(proposal, proposals)
             rmse = (

@@ -29,6 +29,7 @@ from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_eff
 from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Term, mean_derivatives, shape_of
 from sealfit.fit.joint.rows import Rows
+from sealfit.fit.steady.fit import FORCES
 from sealfit.tables import CALENDAR
 
 # ---------------------------------------------------------------- forms
@@ -312,10 +313,15 @@ def grid_of(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
     return grids
 
 
-def describe(term: Term) -> str:
+WITHOUT_LOAD = {"mu": "friction", **FORCES}
+"""What is fitted in place of a coefficient where no load is given."""
+
+
+def describe(term: Term, rows: Rows) -> str:
     """Return the label of an effect, e.g. "ripple along displacement_mm, added to force"."""
     label = term.effect.label.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
-    return f"{label}, {'added to' if term.operation == 'add' else 'factor on'} {term.acts_on}"
+    target = term.acts_on if rows.has_load else WITHOUT_LOAD.get(term.acts_on, term.acts_on)
+    return f"{label}, {'added to' if term.operation == 'add' else 'factor on'} {target}"
 
 
 # ---------------------------------------------------------------- richer laws

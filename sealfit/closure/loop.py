@@ -312,7 +312,7 @@ def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
     """Return a selection with all effects refused: their evidence is weak and no fold found them."""
     say(
         "removed, because no fold found them again: "
-        + "; ".join(describe(a.proposal.term) for a in selection.added)
+        + "; ".join(describe(a.proposal.term, selection.after.rows) for a in selection.added)
     )
     reason = "its evidence is weak, and the repeated search finds it in no fold"
     refused = [RefusedEffect(a.proposal.term, a.proposal.p_value, reason) for a in selection.added]
@@ -339,7 +339,8 @@ def _only_gains(
         _level_of(selection.added), weak=any(a.weak for a in selection.added)
     ):
         last = selection.added[-1].proposal
-        say(f"removed, because it does not lower the error: {describe(last.term)}")
+        label = describe(last.term, selection.after.rows)
+        say(f"removed, because it does not lower the error: {label}")
         reason = "it does not lower the error, in sample or on held-out data"
         refused.append(RefusedEffect(last.term, last.p_value, reason))
         model = selection.after.model.without_term(len(selection.added) - 1)

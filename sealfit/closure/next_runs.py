@@ -142,7 +142,7 @@ def next_runs(
             if found is not None and found[1] > DISTINCT * noise_N:
                 conditions, difference_N = found
                 tested = "more repeats of a tested run " if _is_tested(conditions, own.rows) else ""
-                forms = f"{describe(chosen.term)} from {describe(rival.term)}"
+                forms = " from ".join(describe(one.term, own.rows) for one in (chosen, rival))
                 size = f"{difference_N:.3g} {config.units.unit('force')}"
                 why = f"{tested}would distinguish {forms}: they differ there by {size}"
                 wanted.append({"why": why, "conditions": conditions})
@@ -200,7 +200,7 @@ def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effe
         first = aliases[0]
         found = largest_difference(first.holding, first.lacking, fitted.rows, channels, config)
         if found is not None and found[1] > SHOWN * first.size_N:
-            names = " or ".join(describe(a.term) for a in aliases)
+            names = " or ".join(describe(a.term, fitted.rows) for a in aliases)
             yield {
                 "why": f"would show {names}, which is not distinguishable from the model with these runs",
                 "conditions": found[0],
@@ -213,8 +213,9 @@ def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
     k = int(np.argmax(np.abs(added_force(item.proposal))))
     count = fitted.rows.groups.starts["specimen"].size
     few = "one specimen is" if count == 1 else f"{count} specimens are"
+    label = describe(item.proposal.term, fitted.rows)
     return {
-        "why": f"{few} too few to distinguish {describe(item.proposal.term)} from the scatter of specimens: "
+        "why": f"{few} too few to distinguish {label} from the scatter of specimens: "
         "test a second specimen of the same conditions, here first",
         "conditions": _settings(fitted.rows.table.iloc[k], (*condition_columns(config), "speed_mm_s")),
     }

@@ -185,7 +185,7 @@ def _refused(item: RefusedEffect, rows: Rows) -> dict:
         "id": item.term.effect.id,
         "channels": channels_of(item.term, rows),
         "acts_on": item.term.acts_on,
-        "label": describe(item.term),
+        "label": describe(item.term, rows),
         "p_value": item.p_value,
         "reason": item.reason,
         "weak": item.weak,
@@ -219,7 +219,7 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
     ]
     return {
         "id": term.effect.id,
-        "label": describe(term) + (", separate phase per stroke" if own_phase else ""),
+        "label": describe(term, after.rows) + (", separate phase per stroke" if own_phase else ""),
         "level": effect_level(term, after.rows),
         "channels": channels_of(term, after.rows),
         "acts_on": term.acts_on,

@@ -168,7 +168,8 @@ def reselect_on_all(
             found = named_among(base, [_on_full_campaign(p, every) for p in compared])
             chosen = next(p for p in compared if p.term is found[0].term)
             if chosen is not item.proposal:
-                say(f"on all strokes {describe(chosen.term)} fits better than {describe(item.proposal.term)}")
+                better, worse = (describe(p.term, every) for p in (chosen, item.proposal))
+                say(f"on all strokes {better} fits better than {worse}")
                 item, after = _replaced(item, chosen, after, number, samples, config)
                 added, whole = [*added[:number], *added[number + 1 :], item], found[0].fitted
             if others_of is _on_other_quantities:

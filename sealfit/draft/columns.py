@@ -194,8 +194,8 @@ class Column:
     """A column of the trace files, and what each of some files holds in it.
 
     `position` counts from 1; `label` is what the files call it, "" if nothing; `role` is what its name says,
-    with `sure` 3 for a word, 1 for a letter, 0 for nothing. `copy_of` is the position of another column that
-    is the same signal.
+    with `sure` 3 for a word, 1 for a letter, 0 for nothing. `unknown` is a unit that is not known here,
+    `copy_of` the position of another column that is the same signal.
     """
 
     position: int
@@ -205,6 +205,7 @@ class Column:
     unit: Unit | None
     values: tuple[np.ndarray, ...]
     by_name: bool
+    unknown: str = ""
     copy_of: int | None = None
 
     @property
@@ -256,14 +257,14 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
     for i in dialect.numbers:
         label = dialect.names[i] if i < len(dialect.names) else ""
         base, unit = name_and_unit(label)
-        if unit is None and i < len(dialect.units):
-            unit = unit_of(dialect.units[i])
+        said = dialect.units[i].strip("[]() ") if unit is None and i < len(dialect.units) else ""
+        unit = unit or unit_of(said)
         role, sure = column_role(base)
         if role == "torque":
             role = "force"
         by_name = bool(label) and dialect.names.count(label) == 1 and dialect.names_are_cells
         values = tuple(table[:, i] for table in tables)
-        found.append(Column(i + 1, label, role, sure, unit, values, by_name))
+        found.append(Column(i + 1, label, role, sure, unit, values, by_name, said if unit is None else ""))
     return _copies_marked(found)
 
 

@@ -16,7 +16,8 @@ WIDTH = 110  # characters of a comment's line
 
 SECTIONS = (
     "", "files", "files.columns", "files.values", "files.compute", "files.units", "files.runs_columns",
-    "trace", "trace.columns", "trace.header_fields", "trace.compute", "quantities", "strokes",
+    "runs.compute", "trace", "trace.columns", "trace.header_fields", "trace.compute", "quantities",
+    "strokes",
 )  # fmt: skip
 
 Value = str | int | float | bool | list | dict

@@ -43,13 +43,15 @@ SETTINGS = {
     "load_N": "force",
     "speed_mm_s": "speed",
 }
-_LINE = re.compile(r'^"?(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
+_LINE = re.compile(r'^\W*(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
 _SPECIMEN = re.compile(r"(specimen|probe|sample|pruefling|muster)( (id|nr|no|number|nummer|name))?")
 _NUMBER = re.compile(r"^[-+]?\d+(?:[.,]\d+)?(?=$|[\s;,\t\"°%A-Za-zµ])")
 _SIZE = re.compile(r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?")
 _SAMPLED = r"(?:sampl|abtast|mess|scan|acqui|logg|data|daten|campion|echantillon|muestre)"
 _RATE = re.compile(rf"{_SAMPLED}.*(?:rate|freq)|(?:rate|freq).*{_SAMPLED}")  # not that of a motion
 _STEP = re.compile(rf"{_SAMPLED}.*(?:interval|period)|(?:interval|period).*{_SAMPLED}|\bdt\b|\bdelta [tx]\b")
+# The header field that an expression for the rate reads; by its first letter it is no channel.
+RATE = "_rate"
 _ISO = re.compile(r"20\d\d-[01]\d-[0-3]\d[T ][0-2]\d:[0-5]\d(?::[0-5]\d)?(?!\d)")
 _DAYS = (
     (re.compile(r"[0-3]?\d\.[01]?\d\.20\d\d"), "%d.%m.%Y"),
@@ -313,6 +315,8 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
     found: dict[str, Setting] = {}
     for number, line in enumerate(headers[0], start=1):
         match = _LINE.match(line)
+        if match and match["key"].count("/") > 1:
+            continue  # group/channel/property of a TDMS file: it is about the channel
         if match and _SPECIMEN.fullmatch(plain(match["key"])):
             pattern = _after(match["key"], r'([^\s;,"][^;,\t"]*)')
             values = _found(pattern, headers)
@@ -337,23 +341,30 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
     return list(found.values())
 
 
-def rate_in(headers: Sequence[Sequence[str]], decimal: str) -> tuple[float, str] | None:
-    """Return the rows per second that a header line gives, the same in every file, and the line; or None."""
+def rate_in(headers: Sequence[Sequence[str]], decimal: str) -> tuple[float | str, str, str] | None:
+    """Return the rows per second that a header line gives, the line, and the pattern of its number; or None.
+
+    Where files differ in them they are an expression over the number, `RATE`.
+    """
     for line in headers[0]:
         match = _LINE.match(line)
         size = _SIZE.match(match["value"]) if match else None
         value = as_number(size.group(), decimal or ".") if size else None
         if not value or value < 0:
             continue
-        if len(set(_found(_after(match["key"], f"({_SIZE.pattern})"), headers))) > 1:
-            continue  # files differ
+        pattern = _after(match["key"], f"({_SIZE.pattern})")
+        if not _everywhere(pattern, headers):
+            continue
+        differ = len(set(_found(pattern, headers))) > 1
         words, unit = plain(match["key"]), name_and_unit(match["key"])[1]
         unit = unit or unit_of(match["value"][size.end() :].strip(' ;,\t"'))
         if _RATE.search(words):
-            return value * (1000.0 if unit is not None and unit.name == "kHz" else 1.0), line.strip()
+            scale = 1000.0 if unit is not None and unit.name == "kHz" else 1.0
+            return f"{scale:g} * {RATE}" if differ else value * scale, line.strip(), pattern
         if _STEP.search(words) and (unit is None or unit.dimension == "time"):
-            step_s = conversion(unit.name if unit else "s", "s")(value)
-            return float(f"{1 / step_s:.9g}"), line.strip()
+            scale = conversion(unit.name if unit else "s", "s")(1.0)
+            rate = f"1 / ({scale:g} * {RATE})" if differ else float(f"{1 / (scale * value):.9g}")
+            return rate, line.strip(), pattern
     return None
 
 
@@ -415,7 +426,7 @@ def _leading(text: str) -> str:
 
 def _after(key: str, value: str) -> str:
     """Return the pattern of a value behind the key of its line."""
-    return rf'^"?{re.escape(key)}"?[\s:=;,"]*'.replace(r"\ ", " ") + value
+    return rf'^\W*{re.escape(key)}"?[\s:=;,"]*'.replace(r"\ ", " ") + value
 
 
 def _everywhere(pattern: str, headers: Sequence[Sequence[str]]) -> bool:

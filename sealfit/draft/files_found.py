@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from sealfit.config import AGING_CONDITION, TraceFormat
-from sealfit.draft.dialect import MIN_ROWS, STRAYS, Dialect, sniff
+from sealfit.draft.dialect import MIN_ROWS, SETTINGS, STRAYS, Dialect, sniff
 from sealfit.draft.file_names import shape_of, tokens
 from sealfit.draft.vocabulary import UNAGED, Unit, name_and_unit, setting
 from sealfit.errors import BadFile, RequestError
@@ -344,6 +344,8 @@ def _meanings(
     for name in [*exact, *names]:
         base, unit = name_and_unit(name)
         meaning = setting(base) or setting(name)
+        if unit is not None and unit.dimension != SETTINGS.get(meaning, unit.dimension):
+            meaning = ""  # an oven's temperature is no time, whatever word stands beside it
         if not meaning and unit is not None and unit.dimension == "speed":
             meaning = "speed_mm_s"
         if not meaning or name in ours or meaning in ours.values() or not _fits(meaning, cells.get(name, ())):

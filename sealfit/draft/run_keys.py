@@ -339,20 +339,15 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
             notes.guess("files.started_at", {"date": theirs, "time": clock}, evidence)
             continue
         value = file_column(theirs, table.units.get(theirs), ours)
+        if ours == "compression_ratio_pct" and _compressed(theirs, table, notes):
+            ours = "_compressed_pct"
         if value != ours:
             cell = next((cell for cell in table.cells[theirs] if cell), "")
             evidence = f"column '{theirs}' of {table.file}, such as '{cell}'"
             if ours == "started_at" and (time := excel_time(cell.replace(",", "."))):
                 evidence += f": Excel's serial number of {time.isoformat(' ', 'minutes')}"
             notes.guess(f"files.runs_columns.{ours}", value, evidence)
-    cells = {ours: table.cells[theirs] for theirs, ours in table.ours.items()}
-    heights = cells.get("compression_ratio_pct", ())
-    numbers = [n for cell in heights if (n := as_number(cell) or as_number(cell, ",")) is not None]
-    if numbers and max(numbers) < HEIGHT_FROM:
-        like = "look like how much the rubber was compressed, not its height"
-        fix = "Write the height in percent of the original into the table."
-        notes.doubt("files.runs_columns", f"compressions up to {max(numbers):g} % {like}.", fix)
-    if "started_at" not in cells:
+    if "started_at" not in table.given:
         _dates_doubt(table, clock, notes)
     if unknown := [f"'{name}'" for name in table.cells if name not in table.ours and not name.isidentifier()]:
         reason = (
@@ -361,6 +356,20 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
         notes.doubt(
             "files.runs_columns", reason, "Name a load, a temperature or the like by our name for it."
         )
+
+
+def _compressed(theirs: str, table: RunsTable, notes: Notes) -> bool:
+    """Whether a column says how much the rubber was compressed; the height that is left is then computed."""
+    cells = [cell for cell in table.cells[theirs] if cell]
+    numbers = [n for cell in cells if (n := as_number(cell) or as_number(cell, ",")) is not None]
+    if not numbers or max(numbers) >= HEIGHT_FROM:
+        return False
+    fix = "If it is the height that was left, name it compression_ratio_pct, and delete this line."
+    reason = f"up to {max(numbers):g} % in '{theirs}' are taken as how much the rubber was compressed."
+    notes.doubt("runs.compute.compression_ratio_pct", reason, fix)
+    evidence = "the height that is left, in percent of the original"
+    notes.guess("runs.compute.compression_ratio_pct", "100 - _compressed_pct", evidence)
+    return True
 
 
 def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> None:

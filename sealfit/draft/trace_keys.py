@@ -19,13 +19,13 @@ from sealfit.draft.columns import (
     stroke_count,
 )
 from sealfit.draft.config_text import Notes, column_guesses, date_lines, file_column
-from sealfit.draft.dialect import STRAYS, rate_in, settings_in, started_in
+from sealfit.draft.dialect import RATE, STRAYS, rate_in, settings_in, started_in
 from sealfit.draft.files_found import Found
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
 from sealfit.ingest.formats import kind_of
-from sealfit.ingest.workbooks import longest_sheet
+from sealfit.ingest.workbooks import rows_of_sheets
 from sealfit.units import Units, conversion
 
 LONG_S = 3600.0
@@ -33,6 +33,9 @@ LONG_S = 3600.0
 
 BAD_ROWS = 2
 """Rows with a missing value that may stand above the first whole row of data."""
+
+AS_LONG = 0.5
+"""Share of the rows of a workbook's longest sheet above which another may be a recording, too."""
 
 SLOTS = {"time": "time_s", "displacement": "displacement_mm", "force": "force_N", "load": "load_N"}
 CHANNELS = ("temperature", "humidity", "pressure")
@@ -57,9 +60,17 @@ def _footer_key(footers: Sequence[Sequence[str]], sniffed: int, notes: Notes) ->
 def _sheet_key(found: Found, notes: Notes) -> None:
     """Add the sheet of the workbooks, if they have several."""
     if kind_of(found.traces[0]) == "xlsx":
-        sheet, filled = longest_sheet(read_bytes(found.folder, found.traces[0]), found.traces[0])
-        if filled > 1:
-            notes.guess("trace.sheet", sheet, f"has the most rows of the {filled} sheets of a workbook")
+        file = found.traces[0]
+        sheet, *others = rows_of_sheets(read_bytes(found.folder, file), file).items()
+        if filled := sum(rows > 0 for _, rows in others):
+            notes.guess(
+                "trace.sheet", sheet[0], f"has the most rows of the {filled + 1} sheets of a workbook"
+            )
+        if alike := [f"'{name}'" for name, rows in others if rows > AS_LONG * sheet[1]]:
+            reason = (
+                f"only '{sheet[0]}' of {file} is read, and {', '.join(alike[:5])} may be recordings, too."
+            )
+            notes.doubt("trace.sheet", reason, "If so, save each sheet in a file of its own.")
 
 
 def dialect_keys(found: Found, notes: Notes) -> None:
@@ -262,8 +273,11 @@ def _clock_or_rate(found: Found, notes: Notes) -> str | None:
     rate = rate_in([one.header for one in found.sniffed], one.decimal)
     if rate is None:
         return None
-    evidence = f"no column of time; rows per second by the header of every file looked at: '{rate[1]}'"
-    notes.guess("trace.rate_Hz", rate[0], evidence)
+    per_second, line, pattern = rate
+    evidence = f"no column of time; rows per second by the header of every file looked at: '{line}'"
+    notes.guess("trace.rate_Hz", per_second, evidence)
+    if isinstance(per_second, str):
+        notes.guess(f"trace.header_fields.{RATE}", pattern, "the number of that line, which differs")
     return ""
 
 
@@ -343,7 +357,8 @@ def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
             notes.doubt("trace.columns.time_s", reason, "Change the unit if it is another.")
             return UNITS["ms"]
     if column.role == role:  # else it is said where nothing but its behaviour speaks for it
-        reason = f"{column.place} has no unit; {slot.rpartition('_')[2]} is assumed."
+        has = f"the unit '{column.unknown}', which is not known here" if column.unknown else "no unit"
+        reason = f"{column.place} has {has}; {slot.rpartition('_')[2]} is assumed."
         fix = f"If it is another, name it: {slot} = {{ name = ..., unit = ... }}."
         notes.doubt(f"trace.columns.{slot}", reason, fix)
     return None

@@ -35,10 +35,12 @@ _SPELLINGS = {
     ("time", "min"): ("min", "minutes", "minuten"),
     ("time", "h"): ("h", "hr", "hours", "std", "stunden"),
     ("time", "d"): ("d", "days", "day", "tage", "tag"),
+    ("time", "week"): ("wk", "week", "weeks", "woche", "wochen"),
     ("length", "ft"): ("ft",),
     ("force", "N"): ("N",),
     ("force", "kN"): ("kN",),
     ("force", "mN"): ("mN",),
+    ("force", "daN"): ("daN",),
     ("force", "uN"): ("uN", "µN", "μN"),
     ("force", "lbf"): ("lbf", "lb", "lbs"),
     ("force", "kgf"): ("kgf", "kp", "kg"),
@@ -177,10 +179,10 @@ _SETTING_WORDS = (
     ("started_at", r"\bstart|date\b|datum|fecha|begin|timestamp|zeitstempel|uhrzeit"),
     (
         "temperature_C",
-        r"^temp|^oven$|^ofen$|(aging|ageing|alterungs?|auslagerungs?|lager|ofen|oven) ?temp|temp.*aging",
+        r"^temp|^oven$|^ofen$|(aging|ageing|alterungs?|(aus)?lager(ungs?)?|ofen|oven) ?temp|temp.*aging",
     ),
     ("aging_days", r"aging|ageing|\baged?\b|alter|auslager|lager|\b(days?|tage?|dias|jours|giorni|dagen)\b"),
-    ("compression_ratio_pct", r"compres|verpress|stauch|height|hoehe"),
+    ("compression_ratio_pct", r"compres|verpress|verform|stauch|height|hoehe"),
     ("speed_mm_s", r"speed|velocit|velocid|vitesse|snelheid|geschwind|vorschub|feed"),
     ("load_N", r"load\b|normal|auflast|\blast\b|anpress|carga"),
     ("repeat", r"\brep|wiederhol|\bwdh|herhal"),
@@ -241,6 +243,7 @@ AFTER = {
 }
 UNAGED = {
     "unaged", "fresh", "new", "virgin", "neu", "ungealtert", "frisch", "ref", "reference", "rt", "initial",
+    "neuf", "nuovo", "nuevo", "nieuw",
 }  # fmt: skip
 RUBBERS = {
     "nbr", "hnbr", "xnbr", "fkm", "ffkm", "epdm", "vmq", "fvmq", "acm", "aem", "nr", "sbr", "cr", "pu", "tpu",

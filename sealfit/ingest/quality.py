@@ -58,11 +58,13 @@ def stroke_faults(
     Findings of this module do not say which file and stroke they belong to; whoever asks adds that. The
     arrays, shape (n,), are the whole trace, and the line in the file of each of its rows.
     """
-    found = [] if stroke.settles else [_unsettled(stroke)]
     if stroke.short is not None:
+        reason, samples = stroke.short, float(len(stroke.rows))
         fix = "Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config."
-        samples = float(len(stroke.rows))
-        return [*found, Fault("too_short", f"{stroke.short}.", value=samples, fix=fix, **STROKE_OUT)]
+        if not stroke.settles:
+            reason, fix = f"the speed never settles: {reason}", "Drive at a constant speed."
+        return [Fault("too_short", f"{reason}.", value=samples, fix=fix, **STROKE_OUT)]
+    found = [] if stroke.settles else [_unsettled(stroke)]
     whole, steady = slice(stroke.start, stroke.stop), stroke.rows
     found += _gaps(time_s[whole], line[whole], settings)
     force_N, line = force_N[steady], line[steady]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.config import Config, TraceFormat
+from sealfit.config import MOST, Config, TraceFormat
 from sealfit.errors import KEPT, BadFile, ConfigError, Fault
 from sealfit.ingest.cells import Cells, Rows, array_cells, body_of, clean, read_cells, width_of
 from sealfit.ingest.columns import (
@@ -193,7 +193,7 @@ def _trace(read: _Read, ref: TraceRef, config: Config) -> Trace:
     settings, file, layout, cells = config.trace, ref.file, read.layout, read.cells
     columns = {name: cells.columns[i] for i, name in read.ours.items() if i in cells.columns}
     known: Mapping[str, object] = {}
-    if settings.compute or settings.keep is not None:
+    if settings.compute or settings.keep is not None or settings.rate_Hz is not None:
         named = name_parts(file, config.files, config.conversions("names")) or {}
         known = {**ref.channels, **named, **header_fields(layout.header, config), **settings.constants}
     good = ~cells.bad
@@ -203,7 +203,7 @@ def _trace(read: _Read, ref: TraceRef, config: Config) -> Trace:
     faults = [*read.faults, *cells.faults, *found]
     columns = _in_our_units(columns, config, layout, file)
     if settings.rate_Hz is not None:  # a row that is left out takes its time, too
-        columns["time_s"] = np.arange(len(good)) / settings.rate_Hz
+        columns["time_s"] = np.arange(len(good)) / _rate_Hz(settings.rate_Hz, known, file)
     good &= ~dropped
     bad = len(good[first:]) - int(np.count_nonzero(good[first:]))
     good[:first] = False
@@ -223,6 +223,15 @@ def _trace(read: _Read, ref: TraceRef, config: Config) -> Trace:
         if fault.action == "file left out":
             raise BadFile(*faults)
     return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(good), tuple(faults))
+
+
+def _rate_Hz(rate: float | str, known: Mapping[str, object], file: str) -> float:
+    """Return the rows per second of a file; raises `BadFile` where what is known of it gives none."""
+    value = float(_evaluate(parse(rate), known, file)) if isinstance(rate, str) else rate
+    if not 0 < value <= MOST:
+        reason = f'rate_Hz = "{rate}" gives {value:g} rows per second.'
+        raise bad_file(file, "rate", reason, "Correct what it reads, or the expression.")
+    return value
 
 
 def _in_our_units(

@@ -75,15 +75,15 @@ def read_sheet(
     return Sheet("\n".join(lines).encode("utf-8", "replace"), merged)
 
 
-def longest_sheet(raw: bytes, file: str) -> tuple[str, int]:
-    """Return the name of the sheet with the most rows, and how many have cells; errors as `read_sheet`."""
+def rows_of_sheets(raw: bytes, file: str) -> dict[str, int]:
+    """Return the number of rows with cells of every sheet, the most first; errors as `read_sheet`."""
     with _book(raw, file, formulas=True) as book:
-        return _longest(book)
+        return _rows(book)
 
 
-def _longest(book) -> tuple[str, int]:
+def _rows(book) -> dict[str, int]:
     rows = {sheet.title: sum(map(_has_cell, sheet.iter_rows(values_only=True))) for sheet in book.worksheets}
-    return max(rows, key=rows.get), sum(count > 0 for count in rows.values())
+    return dict(sorted(rows.items(), key=lambda item: -item[1]))
 
 
 @contextmanager
@@ -113,7 +113,7 @@ def _refuse_others(raw: bytes, file: str) -> None:
 def _title(book, wanted: str | int | object | None, file: str) -> str:
     """Return the name of the sheet that is meant."""
     if wanted is LONGEST:
-        return _longest(book)[0]
+        return next(iter(_rows(book)))
     titles = [sheet.title for sheet in book.worksheets]
     if isinstance(wanted, int):
         if 0 < wanted <= len(titles):

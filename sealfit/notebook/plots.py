@@ -53,6 +53,10 @@ class Plots:
         """Return the shape of every effect along its channels, with its 95 % band."""
         return self._drawn("effect_shapes")
 
+    def refused(self) -> Figure:
+        """Return the residual along the variables of effects that were significant, but not accepted."""
+        return self._drawn("refused")
+
     def residual_channels(self) -> Figure:
         """Return the mean residual along every channel, before and after."""
         return self._drawn("residual_channels")

@@ -176,7 +176,7 @@ def _curve(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Conf
     ]
     return {
         "place": channel_label(rows["channel"].iloc[0], config.units),
-        "value": shape_label(rows, effect, config.units),
+        "value": with_symbols(shape_label(rows, effect, config.units, str)),
         "rows": [(place, *texts) for place, texts in zip(places, values, strict=True)],
     }
 

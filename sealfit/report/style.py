@@ -218,6 +218,7 @@ RC = {
     "legend.frameon": False,
     "text.parse_math": True,
     "svg.fonttype": "none",
+    "pdf.fonttype": 42,  # TrueType: many publishers refuse Type 3
     "svg.hashsalt": "sealfit",
 }
 

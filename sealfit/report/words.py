@@ -259,18 +259,14 @@ def _where(left: Mapping, config: Config) -> str:
         text += f" with {joined([channel_label(name, config.units) for name in names])}"
     if level:
         text += f" {level_words(level)}"
-    return f"{text} (p {p_value(left.get('p_value'))})" if known(left.get("p_value")) else text
+    p = p_value(left.get("p_value")).replace(" ", "\u00a0")  # on one line
+    return f"{text} (p\u00a0{p})" if known(left.get("p_value")) else text
 
 
 def without_load(closure: Mapping) -> dict:
     """Return closure.json of a campaign without a load: F_s and F_c are fitted in place of mu_s and mu_c."""
-    return json.loads(
-        re.sub(
-            r'("acts_on": "|factor on |added to )mu(_[sc])?\b',
-            lambda found: found[1] + (f"F{found[2]}" if found[2] else "friction"),
-            json.dumps(closure),
-        )
-    )
+    text = re.sub(r'(?<="acts_on": ")mu(?=_[sc]")', "F", json.dumps(closure))
+    return json.loads(text.replace('"acts_on": "mu"', '"acts_on": "friction"'))
 
 
 def with_left_channels(closure: Mapping, channels: Collection[str]) -> dict:

@@ -105,7 +105,8 @@ def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_anot
 
 # ---------------------------------------------------------------- the decision, on gains given by hand
 SAMPLES = pd.DataFrame({"force_N": np.random.default_rng(0).normal(size=50), "stroke_id": 0})
-FORCE = SimpleNamespace(rows=SimpleNamespace(force=np.full(3, 10.0), values=lambda channel: channel))
+ROWS = SimpleNamespace(force=np.full(3, 10.0), values=lambda channel: channel, has_load=True)
+FORCE = SimpleNamespace(rows=ROWS)
 
 
 FOUR = (1.0, 3.0, 10.0, 100.0)

@@ -10,6 +10,7 @@ from bins_helpers import make_bins
 from sealfit.closure import result
 from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import NO_GAIN, AcceptedEffect, RefusedEffect
+from sealfit.closure.forms import describe
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.result import (
     BeforeAfter,
@@ -134,6 +135,19 @@ def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted, mon
     assert [(entry["id"], entry["weak"], entry["reason"]) for entry in refused["refused"]] == [
         ("warming_distance", True, weak.reason), ("warming_distance", False, strong.reason),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("acts_on", "operation", "words"),
+    [
+        ("mu", "multiply", "factor on friction"),
+        ("mu_s", "add", "added to F_s"),
+        ("v_s", "add", "added to v_s"),
+    ],
+)
+def test_without_a_load_a_label_names_what_is_fitted(acts_on, operation, words, fitted):
+    term = replace(WARMING, acts_on=acts_on, operation=operation)
+    assert describe(term, replace(fitted.rows, has_load=False)) == f"warming by sliding (distance), {words}"
 
 
 def test_an_effect_is_written_with_its_intervals_and_rivals(selection, fitted):

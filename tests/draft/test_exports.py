@@ -12,7 +12,7 @@ import pytest
 
 from sealfit.config import parse_config
 from sealfit.draft import draft
-from sealfit.draft.dialect import started_in
+from sealfit.draft.dialect import settings_in, started_in
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_trace
@@ -274,6 +274,41 @@ def test_a_rotating_rig_with_two_loads_needs_no_edit(angle, turn, tmp_path):
     assert list(ingested.faults) == []
 
 
+@pytest.mark.parametrize(
+    ("unit", "said"),
+    [("daN", None), ("ozf", "'Kraft' has the unit 'ozf', which is not known here; N is assumed")],
+)
+def test_a_unit_below_the_name_is_used_or_named_in_a_doubt(unit, said, tmp_path):
+    for one in exports.records(speeds=(5.0,)):
+        head = f"Zeit;Weg;Kraft\ns;mm;{unit}\n"
+        exports.write(
+            tmp_path, f"T80_d{one.days}_r{one.repeat}.csv", head + exports.table(exports.slots(one), ";", 4)
+        )
+    made, config, _ = read(tmp_path)
+    assert config.trace.columns["force_N"].unit == (None if said else unit)
+    assert [doubt.reason for doubt in made.doubts if "Kraft" in doubt.reason] == (
+        [f"column 3 {said}."] if said else []
+    )
+
+
+def test_settings_in_a_header_of_comments_are_read(tmp_path):
+    written = {}
+    for one in exports.records():
+        head = f"# temperature = {one.temperature} degC\n# aged = {one.days} days\n# compression = 80 %\n"
+        file = f"{one.started:%Y%m%d-%H%M%S}.dat"
+        body = exports.table(exports.slots(one), " ", 4)
+        exports.write(tmp_path, file, f"{head}# t[s] x[mm] F[N]\n{body}")
+        written[file] = one
+    made, _, ingested = read(tmp_path)
+    assert made.doubts == ()
+    assert_settings(ingested, written, ("temperature_C", "compression_ratio_pct", "aging_days", "started_at"))
+
+
+def test_properties_of_a_tdms_channel_are_no_settings_of_the_file():
+    header = ("Group/LoadCell/wf_increment\t0.14", "Group/Speed/gain\t2", "Load [N]\t50", "Speed [mm/s]\t5")
+    assert [(one.ours, one.line) for one in settings_in([header], ".")] == [("load_N", 3), ("speed_mm_s", 4)]
+
+
 def test_times_of_day_are_found_as_the_time(tmp_path):
     for name, one in zip("ab", exports.records(days=(1,), speeds=(1.0, 5.0), repeats=(1,)), strict=True):
         times = [(one.started + timedelta(seconds=float(t))).isoformat(" ") for t in one.time_s]
@@ -307,10 +342,32 @@ def test_without_a_time_the_rate_of_the_header_gives_it(line, rate, tmp_path):
     assert ingested.tables["runs"]["used"].all()
 
 
-def test_files_of_different_rates_are_a_doubt_that_names_the_key(tmp_path):
+@pytest.mark.parametrize(
+    ("line", "scale", "rate"),
+    [
+        ("Abtastrate [kHz]: {:.9g}", 0.001, "1000 * _rate"),
+        ("Delta_X (ms);{:.9g}", None, "1 / (0.001 * _rate)"),
+    ],
+)
+def test_of_files_of_different_rates_the_header_gives_each_its_own(line, scale, rate, tmp_path):
     for one in exports.records():
+        step = one.time_s[1]
         columns = exports.table([one.displacement_mm, one.force_N], ";", 4)
-        head = f"Abtastrate: {1 / one.time_s[1]:g} Hz\nWeg [mm];Kraft [N]\n"
+        head = line.format(scale / step if scale else 1000 * step) + "\nWeg [mm];Kraft [N]\n"
+        exports.write(tmp_path, f"T80_d{one.days}_v{one.speed:g}_r{one.repeat}.txt", head + columns)
+    made, config, ingested = read(tmp_path)
+    assert config.trace.rate_Hz == rate
+    assert not any("time" in doubt.reason for doubt in made.doubts)
+    runs = ingested.tables["runs"]
+    assert runs["used"].all()
+    assert "_rate" not in runs
+    npt.assert_allclose(runs["speed_mm_s"].abs(), runs["speed_set_mm_s"], rtol=0.02)
+
+
+def test_files_of_which_one_has_no_rate_are_a_doubt_that_names_the_key(tmp_path):
+    for k, one in enumerate(exports.records()):
+        columns = exports.table([one.displacement_mm, one.force_N], ";", 4)
+        head = f"{'Abtastrate' if k else 'Pause'}: {1 / one.time_s[1]:g} Hz\nWeg [mm];Kraft [N]\n"
         exports.write(tmp_path, f"T80_d{one.days}_v{one.speed:g}_r{one.repeat}.txt", head + columns)
     (doubt,) = (one for one in draft(tmp_path).doubts if "there is no time" in one.reason)
     assert "rate_Hz" in doubt.fix

@@ -298,13 +298,26 @@ def test_a_table_of_runs_in_other_units_is_converted_and_its_doubts_are_said(tmp
     table += "m1.csv,24,5,20,3/14/2024\nm2.csv,96,5,20,3/15/2024\n"
     exports.write(tmp_path, "runs.csv", table)
     made = draft(tmp_path)
-    columns = parse_config(made.text, "rig.toml").files.runs_columns
+    config = parse_config(made.text, "rig.toml")
+    columns = config.files.runs_columns
     assert (columns["aging_days"].name, columns["aging_days"].unit) == ("Aging time (h)", "h")
     assert (columns["load_N"].name, columns["load_N"].unit) == ("Normal load (kg)", "kgf")
-    assert columns["compression_ratio_pct"].unit is None
+    assert (columns["_compressed_pct"].name, columns["_compressed_pct"].unit) == ("Compression (%)", None)
+    assert {ref.channels["compression_ratio_pct"] for ref in list_traces(tmp_path, config)[0]} == {80.0}
     reasons = " ".join(doubt.reason for doubt in made.doubts)
     assert "how much the rubber was compressed" in reasons
     assert "dates that are not ISO 8601, such as '3/14/2024'" in reasons
+
+
+def test_a_column_in_a_unit_of_another_quantity_is_not_what_its_words_say(tmp_path):
+    for number in (1, 2):
+        (one,) = exports.records(days=(number,), speeds=(5.0,), repeats=(1,))
+        exports.write(tmp_path, f"m{number}.csv", plain(one))
+    table = "Datei,Lagerung [°C],Lagerungstemp.,Lagerdauer [Wochen]\nm1,80,81,1\nm2,80,81,2\n"
+    exports.write(tmp_path, "plan.csv", table)
+    columns = parse_config(draft(tmp_path).text, "rig.toml").files.runs_columns
+    assert columns["temperature_C"].name == "Lagerungstemp."
+    assert (columns["aging_days"].name, columns["aging_days"].unit) == ("Lagerdauer [Wochen]", "week")
 
 
 def test_files_that_nothing_tells_apart_are_one_condition(tmp_path):
@@ -419,6 +432,17 @@ def test_the_sheet_with_the_most_rows_holds_the_trace(tmp_path, monkeypatch):
     assert made.files == 12
     ingested = ingest_campaign(tmp_path, config)
     assert not [fault for fault in ingested.faults if fault.severity == "error"]
+
+
+def test_a_workbook_with_several_recordings_is_a_doubt(tmp_path):
+    for days in (1, 4):
+        with pd.ExcelWriter(tmp_path / f"80C_{days}d.xlsx") as book:
+            for one in exports.records(days=(days,), repeats=(1,)):
+                data = pd.DataFrame(dict(zip(("t [s]", "x [mm]", "F [N]"), exports.slots(one), strict=True)))
+                data.to_excel(book, sheet_name=f"v{one.speed:g}", index=False)
+    (doubt,) = (one for one in draft(tmp_path).doubts if one.key == "trace.sheet")
+    assert doubt.reason == "only 'v1' of 80C_1d.xlsx is read, and 'v5' may be recordings, too."
+    assert "a file of its own" in doubt.fix
 
 
 def test_two_words_that_follow_the_displacement_are_the_direction(tmp_path):

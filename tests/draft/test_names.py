@@ -107,9 +107,10 @@ def test_a_date_of_a_folder_stands_behind_that_of_the_file():
     assert told(files) == {"started_at": "2024-03-11T10:12:33", "speed_mm_s": 5.0}
 
 
-def test_one_word_stands_for_rubber_that_was_not_aged():
+@pytest.mark.parametrize("word", ["unaged", "neuf"])
+def test_one_word_stands_for_rubber_that_was_not_aged(word):
     aged = made("{d}d_{T}C_{c}pct_{v}mms_r{r}.csv", d=(1, 4), T=(60, 80), c=(80, 60), v=(1, 5), r=(1, 2))
-    unaged = made("unaged_{v}mms_r{r}.csv", v=(1, 5), r=(1, 2))
+    unaged = made(word + "_{v}mms_r{r}.csv", v=(1, 5), r=(1, 2))
     names = read_names([*aged, *unaged])
     assert names.unmatched == ()
     assert told([*unaged, *aged]) == {"aging_days": 0.0, "speed_mm_s": 1.0, "repeat": 1.0}

@@ -121,6 +121,16 @@ def test_gaps_are_told_and_too_much_hidden_time_leaves_the_stroke_out():
     assert (fault.severity, fault.action) == ("error", "stroke left out")
 
 
+def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
+    time = np.arange(0.0, 2.0, 0.01)
+    x = -10.0 * np.cos(0.5 * np.pi * time)
+    force = 20.0 + 0.1 * np.gradient(x, time)
+    (stroke,) = find_strokes(time, x, force, Strokes(min_steady_share=0.6))
+    (fault,) = stroke_faults(stroke, time, force, np.arange(200), Quality())
+    assert (fault.check, fault.fix) == ("too_short", "Drive at a constant speed.")
+    assert fault.reason.startswith("the speed never settles: the steady window is ")
+
+
 def test_a_stroke_too_short_says_what_is_needed():
     time, x, force = trace(n=18)
     (stroke,) = find_strokes(time, x, force, Strokes())

@@ -69,11 +69,37 @@ def test_a_rate_gives_the_time_of_files_without_one(tmp_path):
     assert "rate_Hz" in fault.fix
 
 
+@pytest.mark.parametrize(
+    ("rate", "more"),
+    [
+        ("rate_Hz", ""),
+        ("1000 * rate_kHz", ""),
+        ("1 / _dt", "header_lines = 2\nheader_fields = { _dt = '^dt: (.*)' }"),
+    ],
+)
+def test_a_rate_that_differs_between_files_is_computed_of_what_is_known_of_each(rate, more, tmp_path):
+    content = csv_of([row.partition(",")[2] for row in ROWS], header="displacement_mm,force_N")
+    content = f"dt: 0.02\n{content}" if more else content
+    trace = read(tmp_path, content, f'[trace]\nrate_Hz = "{rate}"\n{more}', rate_Hz=50.0, rate_kHz=0.05)
+    npt.assert_allclose(trace.table["time_s"], np.arange(100) / 50, rtol=1e-15)
+
+
+def test_a_file_without_a_rate_is_left_out_and_says_why(tmp_path):
+    content = csv_of([row.partition(",")[2] for row in ROWS], header="displacement_mm,force_N")
+    fault = refused(tmp_path, content, '[trace]\nrate_Hz = "rate"', raet=50.0)
+    assert (fault.column, "Did you mean 'raet'?" in fault.fix) == ("rate", True)
+    fault = refused(tmp_path, content, '[trace]\nrate_Hz = "rate"', rate=0.0)
+    assert (fault.check, fault.reason) == ("rate", 'rate_Hz = "rate" gives 0 rows per second.')
+    assert (
+        "is text, not a number" in refused(tmp_path, content, '[trace]\nrate_Hz = "rate"', rate="fast").reason
+    )
+
+
 @pytest.mark.parametrize("table", ["columns = { time_s = 1, force_N = 2 }", "compute = { time_s = 'n / 9' }"])
 def test_a_time_and_a_rate_are_refused(table):
     with pytest.raises(ConfigError, match=r"both rate_Hz and (columns|compute)\.time_s give the time"):
         parse_config(f"[trace]\nrate_Hz = 100\n{table}", "rig.toml")
-    for rate in ("0", "-1", "nan", "'fast'"):
+    for rate in ("0", "-1", "nan", "'50 Hz'"):
         with pytest.raises(ConfigError, match="rate_Hz"):
             parse_config(f"[trace]\nrate_Hz = {rate}", "rig.toml")
 

@@ -198,16 +198,44 @@ def test_the_page_prints_on_a4(tmp_path):
 
 
 def test_a_table_of_one_row_stays_on_its_sheet(tmp_path):
+    """Nor does the legend leave its figure, which needs a sheet of its own."""
     sections = """<div style="height: 200mm"></div>
     <section><h3>Table</h3><div class="box">
     <table><thead><tr><th>a</th></tr></thead><tbody><tr><td>1</td></tr></tbody></table></div></section>
     <section><h2>Figure</h2><figure><ul class="legend"><li>b</li></ul>
     <div class="panels"><div class="panel" style="height: 228mm"></div></div></figure></section>"""
+    assert sheets(sections, tmp_path) == 2
+
+
+def test_a_figure_whose_caption_does_not_fit_begins_on_the_sheet_all_the_same(tmp_path):
+    panel = '<div class="panel" style="height: 40mm"></div>'
+    sections = f"""<div style="height: 70mm"></div>
+    <section><h3>Figure</h3><figure><ul class="legend"><li>b</li></ul><div class="panels">{7 * panel}</div>
+    <figcaption>What it shows.</figcaption></figure></section><div style="height: 200mm"></div>"""
+    assert sheets(sections, tmp_path) == 2
+
+
+def test_a_long_name_of_a_file_does_not_scale_the_sheets_down(tmp_path):
+    cells = (60 * "folder/", 30 * "stroke 1, ", "c", "d", 90 * "1,")
+    row = "".join(f'<td class="line">{cell}</td>' for cell in cells)
+    sections = f"""<div class="box tall"><table class="findings"><tbody><tr>{row}</tr></tbody></table></div>
+    <div style="height: 255mm"></div>"""
+    assert sheets(sections, tmp_path) == 2
+
+
+def test_the_residual_by_level_stands_above_its_table(tmp_path):
+    part = '<div style="height: 150mm"></div>'
+    sections = f'<section id="residual"><div class="split">{part}{part}</div></section>'
+    assert sheets(sections, tmp_path) == 2
+
+
+def sheets(sections, folder):
+    """Return how many sheets of A4 sections of the page are printed on."""
     style = Path(report_page.__file__).with_name("style.css").read_text("utf-8")
-    path, printed = tmp_path / "page.html", tmp_path / "page.pdf"
+    path, printed = folder / "page.html", folder / "page.pdf"
     path.write_text(f"<style>{style}</style><div class='page'><main>{sections}</main></div>", "utf-8")
-    browsed(path, tmp_path, f"--print-to-pdf={printed}", "--no-pdf-header-footer")
-    assert len(re.findall(rb"/Type ?/Page\b", printed.read_bytes())) == 2
+    browsed(path, folder, f"--print-to-pdf={printed}", "--no-pdf-header-footer")
+    return len(re.findall(rb"/Type ?/Page\b", printed.read_bytes()))
 
 
 def measured(page, widths, folder):

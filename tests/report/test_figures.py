@@ -221,7 +221,7 @@ def test_a_master_curve_is_called_by_its_quantity(made):
     titles = [
         panel.title for panel in draw_all(made.tables, made.closure, made.config)["master_curve"].panels
     ]
-    assert titles == ["Static friction coefficient μ_s", "Coulomb friction coefficient μ_c"]
+    assert titles == ["Static friction coefficient", "Coulomb friction coefficient"]
 
 
 # ---------------------------------------------------------------- the loop

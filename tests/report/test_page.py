@@ -179,6 +179,18 @@ def test_a_candidate_has_a_panel_that_says_so(small, unsaved):
     assert "candidate: aging" in page.split("candidate, not applied")[1].split("</article>")[0]
 
 
+def test_effects_not_accepted_have_the_residual_along_each_of_their_variables_once(small, unsaved):
+    asked = (["time_s"], ["time_s"], ["direction", "operator"])
+    common = {"label": "smooth", "acts_on": "mu", "p_value": 1e-5, "reason": "it is too small", "weak": False}
+    small.closure["refused"] = [{**common, "channels": channels} for channels in asked]
+    told = build_report(*small.arguments)
+    listed = told.html.split("Significant, but not accepted")[1].split("<h2>")[0]
+    along = re.findall(r'alt="Mean residual along ([a-z ]+):', listed)
+    assert sorted(along) == ["operator", "time"]
+    assert "refused" in told.figures
+    assert "95 % intervals" in listed
+
+
 def test_a_card_shows_the_symbol_of_a_parameter_that_an_effect_is_added_to(small, unsaved):
     small.closure["effects"][0] |= {"acts_on": "v_s", "operation": "add"}
     assert "added to v s : " in Page(build_report(*small.arguments).html).text
@@ -195,8 +207,8 @@ def test_torque_is_never_called_force_nor_its_slot(reports, pages):
 
 def test_without_a_load_effects_act_on_friction_and_the_forces(unsaved):
     made = torque_campaign()
-    why = "would distinguish linear in dust_mg, factor on mu from linear in dust_mg, added to mu_s"
-    wear = {**aging_campaign().closure["effects"][0], "label": "linear in dust_mg, factor on mu"}
+    why = "would distinguish linear in dust_mg, factor on friction from linear in dust_mg, added to F_s"
+    wear = {**aging_campaign().closure["effects"][0], "label": "linear in dust_mg, factor on friction"}
     place = {"variable": "dust_mg", "level": "run"}
     made.closure |= {
         "verdict": "unexplained",

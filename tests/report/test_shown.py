@@ -181,7 +181,7 @@ def test_a_free_shape_is_a_table_of_its_curve_and_has_no_coefficients():
     }  # fmt: skip
     (card,) = effect_cards({"effects": [free]}, shapes, Config())
     assert card["parameters"] == []
-    assert card["curve"]["value"] == "change of μ (%)"
+    assert card["curve"]["value"] == "change of <i>μ</i> (%)"
     assert [row[0] for row in card["curve"]["rows"]] == ["0", "10", "20", "30", "40", "50", "60"]
     assert card["curve"]["rows"][0][1:] == ("10.0", "[9.0, 11.0]")
     (candidate,) = effect_cards({"effects": [free | {"candidate": True}]}, shapes.iloc[:0], Config())

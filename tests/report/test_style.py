@@ -38,6 +38,13 @@ def test_settings_of_the_user_change_nothing():
     assert after.pdf == before.pdf
 
 
+def test_text_is_text_in_files_for_print():
+    drawn = draw(PLOT)
+    assert ">force (N)</text>" in drawn.svg
+    assert b"/TrueType" in drawn.pdf or b"/CIDFontType2" in drawn.pdf
+    assert b"/Type3" not in drawn.pdf
+
+
 def test_a_matplotlibrc_changes_nothing(tmp_path):
     (tmp_path / "matplotlibrc").write_text("font.size: 21\nxtick.labelsize: xx-large\nlines.linewidth: 9\n")
     program = (

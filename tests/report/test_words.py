@@ -216,7 +216,9 @@ def test_how_an_effect_acts(change, words):
 
 def test_a_significant_residual_below_the_scatter_of_repeats_is_said_beside_closed():
     left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005}
-    said = "varies with displacement (mm) along strokes (p &lt; 0.001), by less than repeats scatter."
+    said = (
+        "varies with displacement (mm) along strokes (p\u00a0&lt;\u00a00.001), by less than repeats scatter."
+    )
     assert said in verdict(document(**left, significant=True), shapes(), Config())
     assert said not in verdict(document(**left, significant=False), shapes(), Config())
 
@@ -240,7 +242,7 @@ def test_what_is_left_is_called_scatter_only_if_it_is():
     text = left_over(document("unexplained", **left), Config())
     assert (
         "A significant residual remains: the residual varies with displacement (mm) along strokes "
-        "(p &lt; 0.001)" in text
+        "(p\u00a0&lt;\u00a00.001)" in text
     )
     assert "scatter" not in text
 

@@ -12,6 +12,7 @@ from sealfit.report.figures.residual import (
     before_after,
     effect_shapes,
     finding,
+    refused,
     residual_channels,
     variance_levels,
 )
@@ -35,6 +36,7 @@ def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config
         finding(tables, closure, config),
         before_after(tables, closure, config),
         effect_shapes(tables, closure, config),
+        refused(tables, closure, config),
         variance_levels(tables, config),
         residual_channels(tables, config),
         force_speed(tables, config),

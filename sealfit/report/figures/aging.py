@@ -287,8 +287,8 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 
 MARKERS = "os^Dv<>"
 QUANTITIES = {
-    "mu_s": "static friction coefficient μ_s", "mu_c": "Coulomb friction coefficient μ_c",
-    "F_s": "static friction F_s", "F_c": "Coulomb friction F_c",
+    "mu_s": "static friction coefficient", "mu_c": "Coulomb friction coefficient",
+    "F_s": "static friction", "F_c": "Coulomb friction",
 }  # fmt: skip
 
 

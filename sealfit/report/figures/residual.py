@@ -151,16 +151,33 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config:
     order = channel_order(channels)
     added = [effect for effect in by_gain(closure["effects"]) if not effect["candidate"]]
     own = chain.from_iterable(effect["channels"] for effect in added)
-    name = next((name for name in own if name in order), order[0])
-    rows = channels[channels["channel"] == name]
-    if name == "direction":
-        name, rows = "speed_mm_s", signed_speeds(tables["residuals_before"], tables["residuals_after"])
-    panel = _channel_panel(rows, name, tables, config)
-    if rows["x"].min() < 0 and name == "speed_mm_s":
-        panel = replace(panel, title=f"{panel.title}, negative backward")
+    panel = _own_panel(next((name for name in own if name in order), order[0]), tables, config)
     floor = (key for key in errors.legend if key.mark == "dashed")
     title = "Residual and errors before and after"
     return Plot("finding", title, (panel, errors.panels[0]), (*STAGES, *floor))
+
+
+def _own_panel(name: str, tables: Mapping[str, pd.DataFrame], config: Config) -> Panel:
+    """Return a panel of the residual along a channel, on a scale of its own; see `finding`."""
+    rows = tables["channels"][tables["channels"]["channel"] == name]
+    if name == "direction":
+        name, rows = "speed_mm_s", signed_speeds(tables["residuals_before"], tables["residuals_after"])
+    panel = _channel_panel(rows, name, tables, config)
+    backward = rows["x"].min() < 0 and name == "speed_mm_s"
+    return replace(panel, title=f"{panel.title}, negative backward") if backward else panel
+
+
+def refused(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
+    """Return the residual along the variables of effects that were not accepted, a panel for each variable.
+
+    Beside another variable, the direction has none. None if there is no panel.
+    """
+    drawn = dict.fromkeys(tables["channels"]["channel"])
+    entries = [entry["channels"] for entry in (closure or {}).get("refused") or ()]
+    names = {name for own in entries for name in own if name != "direction" or len(own) == 1}
+    panels = tuple(_own_panel(name, tables, config) for name in drawn if name in names)
+    title = "Residual by variable of effects not accepted"
+    return Plot("refused", title, panels, STAGES) if panels else None
 
 
 def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
