@@ -29,7 +29,7 @@ from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_eff
 from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Term, mean_derivatives, shape_of
 from sealfit.fit.joint.rows import Rows
-from sealfit.fit.steady.fit import FORCES
+from sealfit.fit.steady import FORCES
 from sealfit.tables import CALENDAR
 
 # ---------------------------------------------------------------- forms
