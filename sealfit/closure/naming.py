@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pandas as pd
@@ -136,7 +137,7 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
             kept.append(proposal)
     most = max((p.chi2 for p in found), default=0.0)
     near = [p for p in ranked if p.chi2 >= CONTENDER_SHARE * most and p.named]
-    for part in (lambda p: p.term.target, lambda p: p.term.channels):
+    for part in (attrgetter("term.target"), attrgetter("term.channels")):
         known = {part(p) for p in kept if p.named}
         for own in dict.fromkeys(map(part, near)):
             if own not in known:
