@@ -350,7 +350,7 @@ def _reason_refused(
         )
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
         return "it does not predict held-out settings between those it was fitted to"
-    if vague_between_speeds(fitted, proposal):
+    if not proposal.term.effect.periodic and vague_between_speeds(fitted, proposal):
         return "with it the force between the tested speeds is less certain than the error that it removes"
     return None
 

@@ -149,9 +149,7 @@ def decide(monkeypatch):
         monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: settings)
         monkeypatch.setattr("sealfit.closure.confirm.vague_between_speeds", lambda *args: vague)
         monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
-        monkeypatch.setattr(
-            "sealfit.closure.confirm.unit_of", lambda name, rows: "sample" if name == "time_s" else "run"
-        )
+        monkeypatch.setattr("sealfit.closure.confirm.follows_strokes", lambda name, rows: name == "time_s")
         monkeypatch.setattr(
             "sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen]
         )
@@ -253,6 +251,14 @@ def test_why_a_proposal_is_refused_is_said(decide, given, reason):
 def test_what_just_suffices_is_accepted(decide, given):
     given = {"gains": [GOOD], "p_value": 1e-9} | given
     found, refused, _ = decide([proposal(p_value=given.pop("p_value"))], **given)
+    assert found is not None
+    assert refused == []
+
+
+def test_a_ripple_is_no_curve_between_the_speeds(decide):
+    wave = proposal("ripple", ("displacement_mm",), "force", 1e-9)
+    wave.term.effect.periodic = True
+    found, refused, _ = decide([wave], [GOOD], vague=True)
     assert found is not None
     assert refused == []
 

@@ -3,13 +3,14 @@ import pytest
 from bins_helpers import LOAD_N, TRUE, make_bins
 
 from sealfit.closure.channels import (
-    ALONG_STROKES,
     find_channels,
     flip_level,
+    follows_strokes,
     free_columns,
     run_means,
     searched,
     unit_of,
+    without_trends,
 )
 from sealfit.closure.forms import terms_of
 from sealfit.closure.naming import propose
@@ -17,7 +18,7 @@ from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit_declared
-from sealfit.fit.joint.rows import make_rows
+from sealfit.fit.joint.rows import ALONG, make_rows
 
 CHANNELS = {
     "lab_temperature_C": lambda rng: 22 + rng.normal(),
@@ -52,7 +53,7 @@ def test_effects_along_strokes_are_not_searched_where_strokes_end_before_the_fri
     rows = make_rows(bins, has_aging=True)
     names = {c.name for c in find_channels(rows)}
     assert names - {c.name for c in searched(find_channels(rows), rows)} == (
-        set() if along else names & set(ALONG_STROKES)
+        set() if along else names & set(ALONG)
     )
 
 
@@ -265,6 +266,34 @@ def test_means_of_runs_are_tested_only_where_they_hold_most_of_a_channel():
     assert run_means(channels["repeat"], rows) is None
     assert run_means(channels["time_s"], rows) is None
     assert run_means(channels["speed_mm_s"], rows) is None
+
+
+@pytest.mark.parametrize(("follows", "left"), [(0.0, True), (1.0, False)])
+def test_a_column_of_the_traces_is_searched_less_the_trends_of_its_strokes_unless_it_follows_them(
+    follows, left
+):
+    """Specimens differ in their profiles along strokes, which hide what a column of the traces does."""
+    bins = make_bins(0, days=(1.0, 8.0), speeds=(1.0, 10.0, 100.0), bins=12, noise_N=0.05)
+    rng = np.random.default_rng(0)
+    own = rng.normal(size=len(bins)) + follows * bins["distance_mm"] / bins["distance_mm"].std()
+    slope = rng.normal(0, 0.05, bins["file"].nunique())[bins["file"].factorize()[0]]
+    profile = slope * (bins["distance_mm"] - bins.groupby("file")["distance_mm"].transform("mean"))
+    bins = bins.assign(current_A=own, force_N=bins["force_N"] + profile + 0.1 * own)
+    rows = make_rows(bins, has_aging=True)
+    (channel,) = [c for c in find_channels(rows) if c.name == "current_A"]
+    assert follows_strokes("current_A", rows) == (not left)
+    searched_values = without_trends(channel, rows).values
+    assert (np.abs(searched_values - channel.values).max() > 0.01) == left
+    if left:
+        for power in (0, 1, 2):
+            moments = rows.groups.sums(rows.values("distance_mm") ** power * searched_values, "stroke")
+            assert np.abs(moments).max() < 1e-6 * np.abs(bins["distance_mm"]).max() ** power * len(bins)
+        assert channel_of_least_p(rows) == "current_A"
+
+
+def channel_of_least_p(rows):
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    return min(found, key=lambda c: c.p_value).channels[-1]
 
 
 def test_a_short_part_of_the_campaign_is_found_by_the_finer_shape():
