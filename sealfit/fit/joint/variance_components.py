@@ -42,6 +42,10 @@ LEAST = 1e-5
 # parameters as groups leaves small residuals.
 MOST_SHARE = 30.0
 
+# Least share of a parameter's derivatives that lies in the means of strokes. The length of a ripple has less:
+# it is determined within strokes and explains no difference between them.
+LEAST_BETWEEN = 0.1
+
 KINDS = ("offset", "gain")
 
 
@@ -230,9 +234,12 @@ def estimate_components(
     count = np.diff(np.r_[groups.starts[level], residual.size])
     kinds = usable_components(rows)
     known = {(c.level, c.kind): c.variance for c in scatter.components}
+    between = jacobian.means(groups, level)
+    inside = between.with_values(between.values * np.sqrt(count)[:, None]).norms() ** 2
+    share = inside / np.maximum(jacobian.norms() ** 2, 1e-300)
     components = reml(
         GroupMeans(means[:, 0], noise * scatter.design_effect / count, means[:, 1], groups.at(level)),
-        jacobian.means(groups, level),
+        between.columns(share >= LEAST_BETWEEN),
         kinds,
         [known.get(kind, 0.0) for kind in kinds] if known else None,
     )
