@@ -3,12 +3,16 @@ import numpy.testing as npt
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.effects import EFFECTS
-from sealfit.fit.joint import fit, fit_declared
-from sealfit.fit.joint.model import Term
+from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import Groups, make_rows
 from sealfit.fit.joint.tangent import Tangent
-from sealfit.fit.joint.variance_components import GroupMeans, RestrictedLikelihood, orthonormal, reml
+from sealfit.fit.joint.variance_components import (
+    GroupMeans,
+    RestrictedLikelihood,
+    estimate_components,
+    orthonormal,
+    reml,
+)
 
 
 def nested(files_per_run, runs_per_specimen, specimens):
@@ -152,9 +156,13 @@ def test_next_to_no_noise_beside_the_scatter_of_files_with_one_stroke_is_no_erro
 def test_a_ripple_explains_no_difference_between_files():
     """Its length and phase are determined within strokes, although the means of strokes change a little."""
     bins = make_bins(0, temperatures=(), days=(), speeds=(0.1, 1.0, 10.0, 100.0), repeats=2, gain=0.02)
-    rows = make_rows(bins, has_aging=False)
-    wave = Term(EFFECTS["ripple"], ("displacement_mm",), "force", "add", {"x_ref": 0.0})
-    model = fit_declared(rows).model.with_term(wave, {"A": 0.1, "lambda_": 2.0, "phi": 0.3})
-    fitted = fit(model, rows)
-    (gain,) = [c for c in fitted.scatter.components if (c.level, c.kind) == ("file", "gain")]
-    assert 0.003 < np.sqrt(gain.variance) < 0.06
+    fitted = fit_declared(make_rows(bins, has_aging=False))
+    start = np.random.default_rng(0).uniform(0.0, 2.3, bins["file"].nunique())[bins["file"].factorize()[0]]
+    turn = 2 * np.pi * (bins["displacement_mm"].to_numpy() + start) / 2.3
+    waves = fitted.jacobian.append(np.sin(turn)).append(np.cos(turn)).append(turn * np.cos(turn))
+    with_waves, without = (
+        estimate_components(fitted.rows, fitted.residual, fitted.friction, tangent, fitted.scatter)
+        for tangent in (waves, fitted.jacobian)
+    )
+    npt.assert_allclose(*([c.variance for c in s.components] for s in (with_waves, without)))
+    assert sum(c.variance for c in without.components) > 0
