@@ -116,9 +116,12 @@ FLAT = {
 
 
 def digits(found, certified):
-    """Agreeing significant digits, the fewest over all numbers (NIST's log relative error), at most 11."""
+    """Agreeing significant digits, the fewest over all numbers (NIST's log relative error), at most 11.
+
+    To a tenth of a digit: further ones depend on how a machine rounds.
+    """
     with np.errstate(divide="ignore"):
-        return np.min(np.minimum(11, -np.log10(np.abs(np.asarray(found) / certified - 1))))
+        return np.min(np.minimum(11, -np.log10(np.abs(np.asarray(found) / certified - 1)))).round(1)
 
 
 # From these starting points Levenberg-Marquardt ends elsewhere; nothing in the program starts from a guess
