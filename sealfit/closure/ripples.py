@@ -61,6 +61,8 @@ AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 LONG_WAVES = np.linspace(1.5, 4.5, 16)
 # Sums with random phases with which that of the files is compared.
 RANDOM_PHASES = 9_999
+# Phases of all files that are drawn at once: 67 MB.
+MOST_PHASES = 1 << 22
 # Periods per stroke about a wave in the model within which what is left of it is found again.
 MAIN_LOBE = 2
 # Degree of the Legendre series of a curve of the position; it resolves six periods.
@@ -127,16 +129,16 @@ def _with_shared_phase(peak: Peak, samples: pd.DataFrame) -> Peak:
     waves = waves_of(samples, np.array([peak.wavelength]), peak.axis)
     own = waves.amplitudes[:, 0] @ np.array([1, 1j])
     files, file = np.unique(waves.unit, return_inverse=True)
-    turned = np.exp(2j * np.pi * np.random.default_rng(0).random((RANDOM_PHASES, files.size)))
-    tests = []
-    for signs in (np.ones_like(waves.direction), waves.direction):
-        of_file = np.zeros(files.size, dtype=complex)
-        np.add.at(of_file, file, signs * own)
-        random = np.abs(turned @ np.abs(of_file))
-        tests.append((1 + int((random >= np.abs(of_file.sum())).sum())) / (1 + RANDOM_PHASES))
-    if len(tests) * min(tests) > SHARED_PHASE:
+    sums = np.zeros((files.size, 2), dtype=complex)  # the same force in both directions, or with their sign
+    np.add.at(sums, file, np.column_stack([own, waves.direction * own]))
+    rng, alike, part = np.random.default_rng(0), np.zeros(2), max(1, MOST_PHASES // files.size)
+    for first in range(0, RANDOM_PHASES, part):
+        turned = np.exp(2j * np.pi * rng.random((min(part, RANDOM_PHASES - first), files.size)))
+        alike += (np.abs(turned @ np.abs(sums)) >= np.abs(sums.sum(axis=0))).sum(axis=0)
+    p_values = (1 + alike) / (1 + RANDOM_PHASES)
+    if p_values.size * p_values.min() > SHARED_PHASE:
         return peak
-    return replace(peak, common_phase=True, sign_symmetric=tests[0] <= tests[1])
+    return replace(peak, common_phase=True, sign_symmetric=bool(p_values[0] <= p_values[1]))
 
 
 def _coherent(spectrum: Spectrum) -> list[Peak]:
