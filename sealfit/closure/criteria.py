@@ -92,6 +92,8 @@ LEAST_ERROR_DF_OF_RUNS = 3
 # ---------------------------------------------------------------- ripples
 # A ripple has one phase in all files if the p-value of that is below this.
 SHARED_PHASE = 1e-3
+# Largest p-value, times the number of channels tried, of a change of a ripple's amplitude with a channel.
+CHANGE_P = 1e-3
 # Least ratio of the power of a peak to the median of its neighbours. A smooth trend has no such peak.
 ABOVE_BACKGROUND = 4.0
 # Fewest files of a sign test at 0.5 %: eight equal signs have p = 0.004; one file may have a weak ripple.

@@ -163,7 +163,7 @@ def _terms_of_pair(
         return
     for x, z in ((one, other), (other, one)):
         for effect in effects.values():
-            if effect.reads != (CHANNEL, SECOND) or target not in effect.acts_on:
+            if effect.reads != (CHANNEL, SECOND) or target not in effect.acts_on or effect.periodic:
                 continue
             if len(effect.linear) > 1 and not alone:
                 continue

@@ -13,9 +13,11 @@ from operator import attrgetter
 
 import numpy as np
 import pandas as pd
+from scipy.special import stdtr
 
 from sealfit.closure.channels import Channel
 from sealfit.closure.criteria import (
+    CHANGE_P,
     CONTENDER_SHARE,
     EQUAL_BIC,
     HALF_OF_CALENDAR,
@@ -28,7 +30,7 @@ from sealfit.closure.criteria import (
     SCATTER_FALL,
 )
 from sealfit.closure.errors_and_intervals import robust_covariance
-from sealfit.closure.forms import periodic_terms, terms_of
+from sealfit.closure.forms import CHANGES_A_WAVE, periodic_terms, terms_of
 from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
 from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate
@@ -92,8 +94,19 @@ def propose_ripples(
     """
     linearised = Linearised(fitted)
     found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
-    best, *others = named_among(fitted, found)
+    refitted = _refitted(fitted, _best_few(found), found)
+    best, *others = _ordered(fitted, [p for p in refitted if len(p.term.channels) == 1 or _changes(p)])
     return [best, *(p for p in others if len(p.term.channels) == 1)]
+
+
+def _changes(proposal: Proposal) -> bool:
+    """Whether the amplitude of a wave changes with its channel: a Wald test with files as the units."""
+    fitted = proposal.fitted
+    place = fitted.model.term_slice(len(fitted.model.terms) - 1).start
+    place += [p.name for p in proposal.term.effect.parameters].index("B")
+    variance = max(fitted.covariance[place, place], robust_covariance(fitted, proposal.unit)[place, place])
+    ratio = abs(fitted.model.values[-1]["B"]) / np.sqrt(variance)
+    return len(CHANGES_A_WAVE) * 2 * stdtr(proposal.units - 1, -ratio) <= CHANGE_P
 
 
 def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:

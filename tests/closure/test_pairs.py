@@ -103,3 +103,14 @@ def test_of_many_columns_those_that_explain_most_are_paired(monkeypatch):
     own = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in columns))
     assert {name for name in paired if name in columns} == set(own[:3])
     assert "speed_mm_s" in paired
+
+
+def test_waves_are_forms_of_ripples_alone():
+    fitted = fit_declared(make_rows(make_bins(0, bins=4, repeats=2), has_aging=True))
+    channels = {c.name: c for c in find_channels(fitted.rows)}
+    result = ScoreTestResult(0.0, 1, 9, 0.0)
+    for names in (("repeat",), ("repeat", "time_s")):
+        candidate = Candidate(names, "mu", "multiply", "run", np.empty((0, 0)), result, pair=len(names) > 1)
+        forms = [term.effect for term, _ in terms_of(candidate, channels, fitted, EFFECTS)]
+        assert forms
+        assert not any(effect.periodic for effect in forms)
