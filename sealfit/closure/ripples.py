@@ -61,6 +61,9 @@ AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 LONG_WAVES = np.linspace(1.5, 4.5, 16)
 # Sums with random phases with which that of the files is compared.
 RANDOM_PHASES = 9_999
+# Least ratio of the sum of all files to that of the directions each by itself if they share the phase: a
+# backlash shifts one against the other, and the phases of either direction agree.
+SAME_BOTH_WAYS = 0.98
 # Phases of all files that are drawn at once: 67 MB.
 MOST_PHASES = 1 << 22
 # Periods per stroke about a wave in the model within which what is left of it is found again.
@@ -136,9 +139,12 @@ def _with_shared_phase(peak: Peak, samples: pd.DataFrame) -> Peak:
         turned = np.exp(2j * np.pi * rng.random((min(part, RANDOM_PHASES - first), files.size)))
         alike += (np.abs(turned @ np.abs(sums)) >= np.abs(sums.sum(axis=0))).sum(axis=0)
     p_values = (1 + alike) / (1 + RANDOM_PHASES)
-    if p_values.size * p_values.min() > SHARED_PHASE:
+    whole = np.abs(sums.sum(axis=0))
+    best = int(whole.argmax())
+    each_way = sum(abs(own[waves.direction == way].sum()) for way in np.unique(waves.direction))
+    if p_values.size * p_values[best] > SHARED_PHASE or whole[best] < SAME_BOTH_WAYS * each_way:
         return peak
-    return replace(peak, common_phase=True, sign_symmetric=bool(p_values[0] <= p_values[1]))
+    return replace(peak, common_phase=True, sign_symmetric=best == 0)
 
 
 def _coherent(spectrum: Spectrum) -> list[Peak]:

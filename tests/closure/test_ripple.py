@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 
 from sealfit.closure.ripple_selection import turns_joined
-from sealfit.closure.ripples import find_ripple
+from sealfit.closure.ripples import Peak, _with_shared_phase, find_ripple
 
 
 def make_samples(
@@ -69,6 +69,16 @@ def test_a_ripple_of_some_files_has_one_phase_if_theirs_agree(phase):
     assert peak.wavelength == pytest.approx(3.0, rel=0.02)
     assert peak.p_value < 1e-3
     assert peak.common_phase == (phase == "common")
+
+
+def test_a_backlash_between_the_directions_leaves_no_common_phase():
+    samples = make_samples(amplitude=0.4, files=24, noise_N=0.7)
+    place, back = samples["displacement_mm"], samples["direction"] < 0
+    moved = np.sin(2 * np.pi * (place - 0.75) / 3.0 + 0.4) - np.sin(2 * np.pi * place / 3.0 + 0.4)
+    shifted = samples.assign(residual_N=samples["residual_N"] + 0.4 * moved.where(back, 0.0))
+    peak = Peak("displacement_mm", 3.0, True, False, 9.0, 1e-9, 0.4, 1.0)  # of the mean power
+    assert _with_shared_phase(peak, samples).common_phase
+    assert not _with_shared_phase(peak, shifted).common_phase
 
 
 def test_hum_in_time_is_not_taken_for_position():
