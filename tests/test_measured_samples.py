@@ -55,9 +55,11 @@ def test_screw_drives_lack_an_offset_between_directions_and_ripple_once_a_turn(t
     offset = effects["zero_offset"]["parameters"][0]
     assert offset["unit"] == "mN m"
     assert offset["ci95"][1] < 0  # -0.35 by itself; what friction differs by direction shares it
-    ripple = {p["name"]: p for p in effects["ripple"]["parameters"]}
+    ripple = {p["name"]: p for p in effects["sinusoid_changing"]["parameters"]}
     assert ripple["lambda"]["value"] == pytest.approx(1.0, rel=0.01)
     assert 0.11 <= ripple["A"]["value"] <= 0.32
+    assert ripple["B"]["ci95"][0] > 0  # stronger in one direction
+    assert effects["ripple"]["parameters"][1]["value"] == pytest.approx(0.5, rel=0.01)
     assert document["units"]["force_N"] == "mN m"
     assert document["after"]["heldout_rmse_N"] < 0.6 * document["before"]["heldout_rmse_N"]
     assert document["after"]["lack_of_fit_p"] is None  # no repeats
