@@ -54,8 +54,7 @@ sys.path += [str(HERE), str(HERE.parent)]
 from faulty_disk import KILLED, SPACE, Disk
 from process_tree import tree
 
-import sealfit.store
-from sealfit import cli
+from sealfit import cli, store
 from sealfit.errors import SealfitError
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.report import page
@@ -149,8 +148,8 @@ def sealfit(words: Sequence[object]) -> int:
 def hold_time() -> None:
     """Hold the time of day that OUT keeps, for the rest of this process."""
     held = datetime(2026, 1, 1, tzinfo=UTC)
-    sealfit.store.datetime = SimpleNamespace(now=lambda _: held)
-    sealfit.store.time = SimpleNamespace(monotonic=lambda: 0.0)
+    store.datetime = SimpleNamespace(now=lambda _: held)
+    store.time = SimpleNamespace(monotonic=lambda: 0.0)
 
 
 # ---------------------------------------------------------------- remembered computations
@@ -729,7 +728,7 @@ def clock_set_back(scene: Scene, folder: Path) -> str:
 
     def earlier() -> int:
         past = datetime(2001, 9, 9, tzinfo=UTC)
-        sealfit.store.datetime = SimpleNamespace(now=lambda _: past)
+        store.datetime = SimpleNamespace(now=lambda _: past)
         time.time, time.time_ns = (lambda: 1e9), (lambda: 10**18)
         return sealfit(scene.words(work))
 
