@@ -208,14 +208,14 @@ def follows_strokes(name: str, rows: Rows) -> bool:
     return bool(left @ left < (1 - COMMON_PROFILE) * (own @ own))
 
 
-def without_trends(channel: Channel, rows: Rows) -> Channel:
+def without_trends(channel: Channel, rows: Rows) -> Channel | None:
     """Return a column of the traces that does not follow the strokes, less a parabola along each of them.
 
-    Specimens differ in their profiles along strokes, which would hide what the column does. Other channels
-    are returned as they are.
+    Specimens differ in their profiles along strokes, which would hide what the column does. None for other
+    channels.
     """
     if not channel.numeric or channel.unit != "sample" or follows_strokes(channel.name, rows):
-        return channel
+        return None
     place, code = rows.values("distance_mm"), rows.codes("stroke")
     left = np.column_stack([place, place**2, channel.values])
     left -= rows.groups.means(left, "stroke")[code]

@@ -73,7 +73,6 @@ def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Genera
 def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
     """Yield the candidates of one channel, with p-values that are not adjusted."""
     rows = tests.fitted.rows
-    channel = without_trends(channel, rows)
     if channel.name == "direction":
         yield from _shape_candidates(tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
@@ -82,6 +81,8 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
     shapes = free_columns(channel, FEW_DF if few_units else FREE_DF)
     widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
     yield from _shape_candidates(tests, channel, shapes, TARGETS, widths)
+    if (own := without_trends(channel, rows)) is not None:
+        yield from _shape_candidates(tests, own, free_columns(own, FREE_DF), TARGETS, widths)
     if few_units:
         for kink in kinks(channel).T:
             yield from _shape_candidates(tests, channel, kink[:, None], MAIN_TARGETS)
