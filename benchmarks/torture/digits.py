@@ -418,7 +418,7 @@ def _compare(name: str, one: pd.DataFrame, other: pd.DataFrame, scatter_N: float
             allowed = np.where(one["quantity"] == "statistics", STEEP, allowed)
         beyond = known & (away > allowed * scale + ZERO)
         se = known_se if known_se is not None else np.full(a.size, np.nan)
-        if column.endswith("_N") or name == "shapes":
+        if column.endswith("_N") or name in ("shapes", "shape_points"):
             se = np.where(np.isfinite(se) & (se > ZERO), se, scatter_N)
         if column not in STEEP_COLUMNS:
             of_se = np.divide(away, se, out=np.full_like(away, np.inf), where=np.isfinite(se) & (se > 0))
