@@ -210,7 +210,7 @@ class _Loop:
     def open_candidates(self) -> list[Candidate]:
         """Return the significant candidates not refused; if there are none, those of masked pairs."""
         found = self.found
-        if not (self.masked or found.significant):
+        if not self.masked:  # pairs are searched at a level below the p-values of the others
             self.masked = [pair for pair in found.masked if self.refused.isdisjoint(pair.keys)]
         significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs)) or list(
             found.significant

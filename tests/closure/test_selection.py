@@ -1,7 +1,12 @@
 from dataclasses import dataclass
 from types import SimpleNamespace
 
+import numpy as np
+
 from sealfit.closure import selection
+from sealfit.closure.score_test import Candidate, ScoreTestResult
+from sealfit.closure.search import MaskedPair
+from sealfit.config import Config
 
 PENALTY = 5.0
 DEVIANCE = {"abc": 0.0, "bc": 20.0, "ac": 1.0, "c": 2.0}
@@ -58,3 +63,19 @@ def test_effects_that_take_the_place_of_others_in_turn_end_the_loop(monkeypatch)
     monkeypatch.setattr(selection, "_related_candidates", lambda *given: [])
     assert not loop.run_round(2)
     assert loop.refused == {"c"}
+
+
+def test_effects_that_mask_each_other_come_before_a_weaker_single_one():
+    def candidate(name, p_value):
+        test = ScoreTestResult(50.0, 1, 20, -30.0)
+        return Candidate((name,), "mu", "multiply", "run", np.ones((9, 1)), test, p_value=p_value)
+
+    speed, time, distance = (candidate(*c) for c in (("speed_mm_s", 1e-3), ("time_s", 1), ("distance_mm", 1)))
+    pair = MaskedPair(1e-9, 60.0, (time.key, distance.key))
+    loop = selection._Loop.__new__(selection._Loop)
+    loop.found = selection._SearchResult([speed, time, distance], [], [], [speed], [pair])
+    loop.masked, loop.refused, loop.negligible, loop.ripple = [], set(), set(), None
+    loop.tests, loop.channels, loop.context = None, {}, SimpleNamespace(config=Config())
+    assert {c.key for c in loop.open_candidates()} == set(pair.keys)
+    loop.masked, loop.refused = [], {time.key}
+    assert [c.key for c in loop.open_candidates()] == [speed.key]
