@@ -74,7 +74,7 @@ def propose(
         and others
         and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)
     ):
-        return named_among(fitted, found)
+        return _ordered(fitted, _refitted(fitted, _best_few(found), found))
     # Conditions are tested one after the other, so the calendar is correlated with them: other channels come
     # first, unless a named form along the calendar fits much better.
     others = _refitted(fitted, _best_few(others), others)
@@ -110,8 +110,8 @@ def _changes(proposal: Proposal) -> bool:
 
 
 def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return the best proposals, fitted jointly with the model: first the one to report."""
-    return _ordered(fitted, _refitted(fitted, _best_few(found), found))
+    """Return proposals, fitted jointly with the model from their start values: first the one to report."""
+    return _ordered(fitted, _refitted(fitted, found))
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:

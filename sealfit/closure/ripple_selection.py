@@ -104,9 +104,10 @@ def without_ripples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
             shifts[ids] = passes(strokes).map(shift).to_numpy(dtype=float)
             place = place + shifts[own]
         given = {term.effect.reads[0]: place, **term.fixed}
+        inputs = term.inputs(rows)
         for name in term.effect.reads[1:]:
             second = np.zeros_like(level)
-            second[ids] = term.inputs(rows)[name][rows.groups.starts["stroke"]]
+            second[ids] = inputs[name][rows.groups.starts["stroke"]]
             given[name] = second[own]
         shape = term.effect.shape(given, **values)
         residual = residual - shape * (1.0 if term.operation == "add" else level[own])

@@ -63,7 +63,7 @@ def proposal(
 @pytest.fixture
 def first_of(monkeypatch):
     """Say which proposal is reported of some that are refitted already, on a model with some effects."""
-    monkeypatch.setattr(naming, "_refitted", lambda fitted, found, more: list(found))
+    monkeypatch.setattr(naming, "_refitted", lambda fitted, found: list(found))
 
     def first(*found, before=()):
         fitted = SimpleNamespace(
