@@ -81,6 +81,17 @@ def test_ramps_between_steady_speeds_are_in_no_window(ramp):
     assert_parts(found_in(time, x, force), time, speed, [10.0, 30.0, 20.0])
 
 
+@pytest.mark.parametrize("last", [0.16, 0.18])
+def test_a_last_speed_that_is_too_short_takes_no_other_along(last):
+    time, x, force, speed = moved([10.0, 30.0], 100, ramp=0.02)
+    kept = time <= 0.3 + 0.02 + 2.0 + 0.02 + last
+    first, short = found_in(time[kept], x[kept], force[kept])
+    assert np.all(speed[first.rows] == 10.0)
+    assert len(first.rows) > 150
+    assert first.short is None
+    assert "samples; at least 20 are needed" in short.short
+
+
 def test_distance_and_time_of_a_later_speed_count_from_the_start_of_the_motion():
     time, x, force, _ = moved([10.0, 30.0])
     assert {stroke.origin for stroke in found_in(time, x, force)} == {found_in(time, x, force)[0].origin}
