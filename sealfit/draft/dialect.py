@@ -74,7 +74,7 @@ class Dialect:
     is False where the reader cuts the line of names in another way, as names hold the separator. `numbers`
     are the positions (from 0) that hold numbers, `first` is the first line of data, `odd_lines` counts lines
     between the data without any of these numbers, `footer` are the lines below. `decimal` is "" where no
-    number has one.
+    number has one. `grouped` is a cell with marks between thousands, "" where there is none.
     """
 
     delimiter: str
@@ -92,6 +92,7 @@ class Dialect:
     names_are_cells: bool = True
     odd_lines: int = 0
     footer: tuple[str, ...] = ()
+    grouped: str = ""
 
 
 def sniff(text: str, *, likely: str | None = None) -> Dialect | None:
@@ -193,6 +194,10 @@ def _first_of_many(data: Sequence[bool]) -> int | None:
 # What stands above and below the data.
 
 
+# A number with marks between its thousands: 1.120,000 or 12'500.5.
+_GROUPED = re.compile(r"[+-]?\d{1,3}([., '\u00a0\u202f\u2019])\d{3}(?:\1\d{3})*(?:[.,]\d*)?")
+
+
 def _dialect(lines: list[str], delimiter: str, block: _Block) -> Dialect:
     core, start = frozenset(block.numbers), block.start
     numeric = [_numeric(line, delimiter, block.decimal) for line in lines[start:]]
@@ -207,10 +212,11 @@ def _dialect(lines: list[str], delimiter: str, block: _Block) -> Dialect:
     rows = [_header_cells(line, delimiter, width) for line in header]
     units_at = _units_line(rows)
     names_at = _names_line(rows, units_at, max(core), len(core))
-    fractions = any(block.decimal in cell for line in data for cell in split_line(line, delimiter))
+    cells = [cell.strip() for line in data for cell in split_line(line, delimiter)]
+    in_groups = (c for c in cells if _GROUPED.fullmatch(c) and as_number(c, block.decimal) is None)
     return Dialect(
         delimiter=delimiter,
-        decimal=block.decimal if fractions else "",
+        decimal=block.decimal if any(block.decimal in cell for cell in cells) else "",
         header=tuple(header),
         names=tuple(rows[names_at]) if names_at is not None else (),
         names_back=len(header) - names_at if names_at is not None else None,
@@ -224,6 +230,7 @@ def _dialect(lines: list[str], delimiter: str, block: _Block) -> Dialect:
         names_are_cells=names_at is None or rows[names_at] == _cells_of(header[names_at], delimiter),
         odd_lines=odd,
         footer=tuple(below),
+        grouped=next(in_groups, ""),
     )
 
 

@@ -98,6 +98,9 @@ def dialect_keys(found: Found, notes: Notes) -> None:
         evidence = f"lines of data end in separators in {trailing} of {len(sniffed)} files"
         notes.guess("trace.trailing_separator", True, evidence)
     _footer_key([other.footer for other in sniffed if other.footer], len(sniffed), notes)
+    if grouped := next((other.grouped for other in sniffed if other.grouped), ""):
+        reason = f"some numbers have marks between thousands, such as '{grouped}'. They cannot be read."
+        notes.doubt("trace.columns", reason, "Export the files again without these marks.")
     odd = [other.odd_lines for other in sniffed if other.odd_lines]
     if odd:
         reason = f"in {len(odd)} of {len(sniffed)} files up to {max(odd)} lines between the data are none."
@@ -284,9 +287,7 @@ def _clock_or_rate(found: Found, notes: Notes) -> str | None:
 def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:
     wanted = {
         "time": "no column of numbers rises evenly: there is no time.",
-        "displacement": (
-            "no column goes along strokes: there is no displacement, and no speed to make it from."
-        ),
+        "displacement": "no column goes along strokes: there is no displacement, nor a speed.",
         "force": "no column follows the motion: there is no force.",
     }
     for role, reason in wanted.items():

@@ -371,3 +371,16 @@ def test_files_of_which_one_has_no_rate_are_a_doubt_that_names_the_key(tmp_path)
         exports.write(tmp_path, f"T80_d{one.days}_v{one.speed:g}_r{one.repeat}.txt", head + columns)
     (doubt,) = (one for one in draft(tmp_path).doubts if "there is no time" in one.reason)
     assert "rate_Hz" in doubt.fix
+
+
+@pytest.mark.parametrize(("mark", "decimal"), [(".", ","), ("'", "."), (" ", ",")])
+def test_marks_between_thousands_are_named_with_what_to_do(mark, decimal, tmp_path):
+    for one in exports.records(speeds=(5.0,)):
+        rows = zip(1000.0 * one.time_s, one.displacement_mm, one.force_N, strict=True)
+        swapped = str.maketrans({",": mark, ".": decimal})
+        lines = [";".join(f"{value:,.3f}" for value in row).translate(swapped) for row in rows]
+        text = "\n".join(["Zeit [ms];Weg [mm];Kraft [N]", *lines, ""])
+        exports.write(tmp_path, f"T80_d{one.days}_r{one.repeat}.txt", text)
+    (doubt,) = (one for one in draft(tmp_path).doubts if "marks between thousands" in one.reason)
+    assert f"'1{mark}" in doubt.reason
+    assert "without these marks" in doubt.fix
