@@ -226,6 +226,15 @@ def test_a_claim_stands_for_one_effect_and_the_rest_is_extra():
     assert scored([], [claim()], np.zeros((0, 1)))["extra"] == 1
 
 
+def test_of_several_effects_of_one_variable_the_claim_is_for_the_one_it_names():
+    night = Target(("elapsed_h",), (), ("run",), ("sinusoid", "day_and_night"), False)
+    recalibrated = Target(("elapsed_h",), (), ("run",), ("step",), True)
+    steps = [claim("step", ("elapsed_h",), "run")]
+    for targets in ([night, recalibrated], [recalibrated, night]):
+        graded = [e["grade"] for e in scored(targets, steps, np.zeros((2, 1)))["effects"]]
+        assert graded == [RIGHT if "step" in t.names else NONE for t in targets]
+
+
 def test_channels_that_order_the_rows_alike_are_one():
     hours = np.array([0.1, 0.5, 3.0, 9.0])
     table = pd.DataFrame({"elapsed_h": hours, "run_order": [1, 2, 3, 4], "oil_ppm": [3.0, 1.0, 2.0, 4.0]})

@@ -103,7 +103,8 @@ def match(
     grades = np.array(
         [[grade(t, c, explained[j, k]) for k, c in enumerate(claims)] for j, t in enumerate(targets)]
     )
-    names = np.array([[named_rightly(t, c) for c in claims] for t in targets])
+    # Of several effects of one variable, the claim is for the one that it names.
+    names = np.array([[named_rightly(t, c) + 0.1 * (c["id"] in t.names) for c in claims] for t in targets])
     chosen = dict(zip(*linear_sum_assignment(-(grades + 0.1 * names * (grades > 0))), strict=True))
     pairs = [(chosen.get(j), int(grades[j, chosen[j]]) if j in chosen else NONE) for j in range(len(targets))]
     return [(int(k), g) if g else (None, NONE) for k, g in pairs]
