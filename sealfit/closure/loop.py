@@ -331,13 +331,12 @@ def _only_gains(
 ) -> tuple[Selection, BeforeAfter]:
     """Return the result without the last effects that do not lower the error in sample and held out.
 
-    A removed effect was significant. It is recorded as refused; the verdict is `unexplained` or, if its
-    evidence is weak, `cannot_tell`.
+    What is asked of the error depends on the evidence for the last effect alone. A removed effect was
+    significant. It is recorded as refused; the verdict is `unexplained` or, if its evidence is weak,
+    `cannot_tell`.
     """
     refused = []
-    while selection.added and not models.gains(
-        _level_of(selection.added), weak=any(a.weak for a in selection.added)
-    ):
+    while selection.added and not models.gains(_level_of(selection.added), weak=selection.added[-1].weak):
         last = selection.added[-1].proposal
         label = describe(last.term, selection.after.rows)
         say(f"removed, because it does not lower the error: {label}")

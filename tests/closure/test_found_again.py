@@ -6,7 +6,7 @@ from bins_helpers import make_bins
 
 from sealfit.closure.confirm import AcceptedEffect, silent
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.loop import _all_refused, _found_in_folds
+from sealfit.closure.loop import _all_refused, _found_in_folds, _only_gains
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit, fit_declared
@@ -64,3 +64,19 @@ def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selec
     assert [r.term.channels[0] for r in own.refused] == list(OIL)
     assert all(r.weak and "no fold" in r.reason for r in own.refused)
     assert own.worse == ()
+
+
+@pytest.mark.parametrize("strong", [0, 1])
+def test_the_evidence_for_the_last_effect_says_what_is_asked_of_the_error(selection, strong, monkeypatch):
+    monkeypatch.setattr("sealfit.closure.loop._level_of", lambda added: "run")
+
+    class Models:
+        def gains(self, around, *, weak):
+            self.weak = weak
+            return True
+
+    added = list(selection.added)
+    added[strong] = replace(added[strong], proposal=replace(added[strong].proposal, p_value=1e-9))
+    kept, models = _only_gains(replace(selection, added=tuple(added)), Models(), None, silent)
+    assert kept.added == tuple(added)
+    assert models.weak == (strong == 0)
