@@ -29,6 +29,8 @@ LEAST_TRAVEL = 0.01
 # tolerance, and share that may be faster. Of those of a ramp 38 % are slower and 38 % faster, of those at the
 # top of a sine wave 33 and 24 %.
 OFF_SPEED = 0.2
+# The same of a stretch so short that its ends, smoothed with what is beside, are a large part of it.
+MOST_OFF_SPEED = 0.3
 # Samples of a steady speed among several, at least. One with fewer than `min_samples` is left out as a stroke
 # of its own, and is no part of the stroke before it. With 6, ramps of 50 samples held steady speeds.
 FEWEST_SAMPLES = 10
@@ -260,7 +262,8 @@ def _flat_parts(
         return []
     rows, here = near[longest], here[longest]
     off = speed[rows] / np.median(speed[rows]) - 1.0
-    ends = np.quantile(off, OFF_SPEED), np.quantile(off, 1.0 - OFF_SPEED)
+    share = min(OFF_SPEED + 0.5 * settings.smooth_samples / len(off), MOST_OFF_SPEED)
+    ends = np.quantile(off, share), np.quantile(off, 1.0 - share)
     found = []
     if len(off) >= FEWEST_SAMPLES and max(map(abs, ends)) <= 0.5 * tolerance:
         first, after = (int(np.argmax(np.sign(end[0]) * end <= SAME_SPEED)) for end in (off, off[::-1]))

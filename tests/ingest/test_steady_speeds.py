@@ -81,10 +81,11 @@ def test_ramps_between_steady_speeds_are_in_no_window(ramp):
     assert_parts(found_in(time, x, force), time, speed, [10.0, 30.0, 20.0])
 
 
-@pytest.mark.parametrize("last", [0.16, 0.18])
-def test_a_last_speed_that_is_too_short_takes_no_other_along(last):
-    time, x, force, speed = moved([10.0, 30.0], 100, ramp=0.02)
-    kept = time <= 0.3 + 0.02 + 2.0 + 0.02 + last
+@pytest.mark.parametrize("ramp", [0.02, 0.1])
+@pytest.mark.parametrize("last", [0.15, 0.18])
+def test_a_last_speed_that_is_too_short_takes_no_other_along(last, ramp):
+    time, x, force, speed = moved([10.0, 30.0], 100, ramp=ramp)
+    kept = time <= 0.3 + ramp + 2.0 + ramp + last
     first, short = found_in(time[kept], x[kept], force[kept])
     assert np.all(speed[first.rows] == 10.0)
     assert len(first.rows) > 150
