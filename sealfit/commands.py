@@ -144,7 +144,7 @@ class LifetimeRequest:
     threshold: float | None = None
     loss_pct: float | None = None
     temperature_C: float | None = None
-    compression_pct: float | None = None
+    compression_ratio_pct: float | None = None
     years: float | None = None
     law: str | None = None
     model: str = "after"
@@ -168,7 +168,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
         raise RequestError(f"there is no model '{asked.model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
     goal, years = goal_of(asked.threshold, asked.loss_pct), asked.years
     laws, taken_out = _laws_of(store, asked, asked.model)
-    place = {"temperature_C": asked.temperature_C, "compression_pct": asked.compression_pct}
+    place = {"temperature_C": asked.temperature_C, "compression_ratio_pct": asked.compression_ratio_pct}
     chosen, rivals = answer(laws[0], goal, years, resample=True, **place), []
     if asked.law is None:
         rivals = [answer(rival, goal, years, **place) for rival in rivals_of(laws)]

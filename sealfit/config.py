@@ -533,7 +533,9 @@ def parse_config(text: str, name: str) -> Config:
         line = _line_of(found[0], text) if len(found) == 1 else None
         raise ConfigError(explain(error, Config), file=name, line=line, fix=fix) from error
     except (ValueError, RecursionError) as error:  # a number of thousands of digits, or lists in lists
-        raise ConfigError(f"is not TOML: {error}.", file=name, fix="See configs/ for examples.") from error
+        raise ConfigError(
+            f"is not TOML: {error}.", file=name, fix="docs/reference/config.md has every key."
+        ) from error
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:

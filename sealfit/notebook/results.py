@@ -309,7 +309,7 @@ class Results:
         temperature_C : float, optional
             Temperature of use, in degrees Celsius; needed where several were tested.
         **options
-            `compression_pct`, `years` (find the temperature that lasts so long), `law` and `model`.
+            `compression_ratio_pct`, `years` (find the temperature that lasts so long), `law` and `model`.
 
         Raises
         ------

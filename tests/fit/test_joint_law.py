@@ -158,7 +158,7 @@ def test_the_interval_over_one_law_is_its_own():
 def test_the_interval_over_laws_reaches_over_rivals_that_cannot_be_told_apart():
     series = campaign(scatter=0.02, seed=3)
     laws = fit_laws(
-        series.part((series.days == 0) | ((series.temperature_C > 50) & (series.compression_pct == 80)))
+        series.part((series.days == 0) | ((series.temperature_C > 50) & (series.compression_ratio_pct == 80)))
     )
     goal = Goal(0.55)  # beyond the tests, where the laws part
     own = lifetime(laws[0], goal, 60.0)
@@ -313,7 +313,7 @@ def test_without_unaged_rubber_there_is_no_share_of_the_start():
     series = campaign(scatter=0.005)
     law = fit_joint_law(series.part(series.days > 0), "log", "rate")
     with pytest.raises(RequestError, match="no unaged rubber"):
-        answer(law, Goal(loss=0.2), temperature_C=50.0, compression_pct=85.0)
+        answer(law, Goal(loss=0.2), temperature_C=50.0, compression_ratio_pct=85.0)
 
 
 def test_limits_of_the_temperature_that_the_tests_do_not_set_are_open():
@@ -342,13 +342,13 @@ def test_what_a_request_lacks_is_said():
         ({"years": 10.0, "temperature_C": 40.0}, "asks for the temperature"),
         ({"temperature_C": -400.0}, "no temperature of use"),
         ({"temperature_C": np.nan}, "no temperature of use"),
-        ({"temperature_C": 40.0, "compression_pct": 0.0}, "no compression of use"),
+        ({"temperature_C": 40.0, "compression_ratio_pct": 0.0}, "no compression of use"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(asked, why):
     law = fit_joint_law(campaign(), "log", "rate")
     with pytest.raises(RequestError, match=why):
-        answer(law, Goal(0.7), **({"compression_pct": 80.0} | asked))
+        answer(law, Goal(0.7), **({"compression_ratio_pct": 80.0} | asked))
 
 
 def test_a_temperature_is_refused_where_the_tests_had_one():

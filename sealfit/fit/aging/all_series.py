@@ -340,7 +340,7 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     loss, losses are divided by k.
     """
     aged = law.aged
-    tested = (aged.temperature_C, aged.compression_pct)
+    tested = (aged.temperature_C, aged.compression_ratio_pct)
     scaled, start = law.tested_days(), law.x[0]
     value = aged.value if law.acts_on == "rate" else start + (aged.value - start) / law.rate(aged)
     points = {"kind": "value", "scaled_days": scaled, "value": value, "aging_days": aged.days}

@@ -41,7 +41,7 @@ def _plain(percent):
 
 # Variables that change the rate of aging: coefficient in ln k (kJ/mol, 1/%), attribute, and the function of
 # the attribute that the coefficient multiplies.
-DRIVERS = (("E", "temperature_C", _inverse), ("kappa", "compression_pct", _plain))
+DRIVERS = (("E", "temperature_C", _inverse), ("kappa", "compression_ratio_pct", _plain))
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Aged:
     ----------
     days, value : ndarray, shape (n,)
         Aging time in days, and the value measured.
-    temperature_C, compression_pct : ndarray, shape (n,), or None
+    temperature_C, compression_ratio_pct : ndarray, shape (n,), or None
         Temperature in degrees Celsius and height in percent during aging; not used for unaged specimens. None
         if unknown.
     variance : ndarray, shape (n,) or (n, n), sparse array, shape (n, n), or None
@@ -68,7 +68,7 @@ class Aged:
     days: np.ndarray
     value: np.ndarray
     temperature_C: np.ndarray | None = None
-    compression_pct: np.ndarray | None = None
+    compression_ratio_pct: np.ndarray | None = None
     variance: np.ndarray | None = None
     size: np.ndarray | None = None
     replicates_df: float = 0.0
@@ -78,7 +78,7 @@ class Aged:
         """Return the values in a mask, shape (n,)."""
         taken = {
             name: None if getattr(self, name) is None else getattr(self, name)[keep]
-            for name in ("temperature_C", "compression_pct", "size")
+            for name in ("temperature_C", "compression_ratio_pct", "size")
         }
         variance = self.variance
         if variance is not None:
@@ -128,7 +128,7 @@ class Aged:
 
     def series(self) -> np.ndarray:
         """Return the number of each value's series, shape (n,); -1 for unaged specimens."""
-        keys = [at for at in (self.temperature_C, self.compression_pct) if at is not None]
+        keys = [at for at in (self.temperature_C, self.compression_ratio_pct) if at is not None]
         number, aged = np.full(self.days.size, -1), self.days > 0
         number[aged] = 0
         if keys:

@@ -66,7 +66,7 @@ class Lifetime:
 
 
 def lifetime(
-    law: JointLaw, goal: Goal, temperature_C: float | None = None, compression_pct: float | None = None
+    law: JointLaw, goal: Goal, temperature_C: float | None = None, compression_ratio_pct: float | None = None
 ):
     """Return the `Lifetime` of rubber aged at a temperature and compression.
 
@@ -74,7 +74,7 @@ def lifetime(
     ----------
     law, goal : JointLaw, Goal
         Fitted law, and end of life.
-    temperature_C, compression_pct : float, optional
+    temperature_C, compression_ratio_pct : float, optional
         Temperature in degrees Celsius and height in percent in use; needed if the tests varied them.
 
     Raises
@@ -83,7 +83,7 @@ def lifetime(
         If one is missing that the law needs, given though the tests did not vary it, or out of the range of
         use.
     """
-    place = _place(law, temperature_C, compression_pct)
+    place = _place(law, temperature_C, compression_ratio_pct)
     days = _days(law, law.x, goal, place)
     low, high = days, days
     if 0 < days < FOREVER:
@@ -94,14 +94,14 @@ def lifetime(
         low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
     asked = days * (float(law.rate(place)[0]) if law.acts_on == "rate" else 1.0)
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
-    return Lifetime(days, low, high, threshold, beyond, _outside(law, temperature_C, compression_pct))
+    return Lifetime(days, low, high, threshold, beyond, _outside(law, temperature_C, compression_ratio_pct))
 
 
 def over_laws(
     laws: Sequence[JointLaw],
     goal: Goal,
     temperature_C: float | None = None,
-    compression_pct: float | None = None,
+    compression_ratio_pct: float | None = None,
 ) -> tuple[float, float]:
     """Return the ends of the model-averaged 95 % interval of the lifetime, 0 or inf if open.
 
@@ -113,11 +113,11 @@ def over_laws(
     ----------
     laws : sequence of JointLaw
         Laws fitted to the same values.
-    goal, temperature_C, compression_pct
+    goal, temperature_C, compression_ratio_pct
         As `lifetime`.
     """
     weights = np.exp(-0.5 * np.array([law.bic - min(one.bic for one in laws) for law in laws]))
-    lives = [lifetime(law, goal, temperature_C, compression_pct) for law in laws]
+    lives = [lifetime(law, goal, temperature_C, compression_ratio_pct) for law in laws]
     found = list(zip(weights / weights.sum(), laws, lives, strict=True))
 
     def share(log_days: float) -> float:
@@ -144,19 +144,21 @@ def over_laws(
     return ends[0], ends[1]
 
 
-def _asked(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Iterator[tuple]:
+def _asked(
+    law: JointLaw, temperature_C: float | None, compression_ratio_pct: float | None
+) -> Iterator[tuple]:
     """Yield per driver of aging: name, option's name and value, tested values, allowed range, and unit."""
-    asked = (temperature_C, compression_pct)
+    asked = (temperature_C, compression_ratio_pct)
     spans = (("temperature", SPAN_C, "degC"), ("compression", SPAN_PCT, "percent"))
     for (name, column, _), value, (what, span, unit) in zip(DRIVERS, asked, spans, strict=True):
         yield name, what, value, getattr(law.aged, column), span, unit
 
 
-def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> Aged:
+def _place(law: JointLaw, temperature_C: float | None, compression_ratio_pct: float | None) -> Aged:
     """Return the condition of use after checks; see `lifetime` for the errors raised."""
-    for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_pct):
+    for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_ratio_pct):
         if name in law.names and value is None:
-            argument = "temperature_C" if what == "temperature" else "compression_pct"
+            argument = "temperature_C" if what == "temperature" else "compression_ratio_pct"
             raise RequestError(
                 f"the rubber was aged at more than one {what}.",
                 fix=f"Say which: --{what}, in Python {argument}.",
@@ -171,7 +173,10 @@ def _place(law: JointLaw, temperature_C: float | None, compression_pct: float | 
             raise RequestError(
                 f"the rubber was aged {where}.", fix=f"Leave --{what} away, or test at another {what}."
             )
-    at = (None if value is None else np.array([float(value)]) for value in (temperature_C, compression_pct))
+    at = (
+        None if value is None else np.array([float(value)])
+        for value in (temperature_C, compression_ratio_pct)
+    )
     return Aged(np.ones(1), np.zeros(1), *at)
 
 
@@ -187,9 +192,11 @@ def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
     return days if days < FOREVER else np.inf
 
 
-def _outside(law: JointLaw, temperature_C: float | None, compression_pct: float | None) -> tuple[str, ...]:
+def _outside(
+    law: JointLaw, temperature_C: float | None, compression_ratio_pct: float | None
+) -> tuple[str, ...]:
     found = []
-    for _, what, value, tested, *_ in _asked(law, temperature_C, compression_pct):
+    for _, what, value, tested, *_ in _asked(law, temperature_C, compression_ratio_pct):
         aged = np.array([np.nan]) if tested is None else tested[law.aged.days > 0]
         if value is not None and (value < aged.min() or value > aged.max()):
             found.append(what)
@@ -200,7 +207,7 @@ def resampled(
     law: JointLaw,
     goal: Goal,
     temperature_C: float | None = None,
-    compression_pct: float | None = None,
+    compression_ratio_pct: float | None = None,
     *,
     draws: int = 500,
     seed: int = 1,
@@ -210,7 +217,7 @@ def resampled(
     Quantiles of the logarithm are multiplied by Student's over the normal quantile, as the scatter is an
     estimate. `seed` is that of the random numbers.
     """
-    rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_pct)
+    rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_ratio_pct)
     mean = law.at(law.aged)
     covariance = law.aged.covariance(law.scatter, mean)
     drawn = mean + rng.standard_normal((draws, mean.size)) @ blockwise(np.linalg.cholesky, covariance).T
@@ -223,7 +230,7 @@ def resampled(
 
 
 def temperature_for(
-    law: JointLaw, goal: Goal, years: float, compression_pct: float | None = None
+    law: JointLaw, goal: Goal, years: float, compression_ratio_pct: float | None = None
 ) -> tuple[float, float, float]:
     """Return the temperature of use at which the lifetime is a number of years, and its 95 % interval.
 
@@ -248,11 +255,11 @@ def temperature_for(
     wanted = years * DAYS_PER_YEAR
 
     def longer(celsius: float) -> float:
-        days = _days(law, law.x, goal, _place(law, celsius, compression_pct))
+        days = _days(law, law.x, goal, _place(law, celsius, compression_ratio_pct))
         return float(np.log(np.clip(days, 1e-12, 1e12) / wanted))
 
     def contains(celsius: float) -> bool:
-        life = lifetime(law, goal, celsius, compression_pct)
+        life = lifetime(law, goal, celsius, compression_ratio_pct)
         return life.low <= wanted <= life.high
 
     ends = [longer(celsius) for celsius in SPAN_C]
@@ -306,7 +313,7 @@ def answer(
     years: float | None = None,
     *,
     temperature_C: float | None = None,
-    compression_pct: float | None = None,
+    compression_ratio_pct: float | None = None,
     resample: bool = False,
 ) -> dict:
     """Return a law's answer as plain values: the lifetime with its interval, or temperature for a lifetime.
@@ -332,7 +339,7 @@ def answer(
     found |= {"parameters": {name: value for name, value, *_ in law.parameters()}}
     found["lack_of_fit_p"] = _finite(law.lack_of_fit_p())
     if years is not None:
-        celsius, *ends = temperature_for(law, goal, years, compression_pct)
+        celsius, *ends = temperature_for(law, goal, years, compression_ratio_pct)
         tested = law.aged.temperature_C[law.aged.days > 0]
         low, high = float(tested.min()), float(tested.max())
         return found | {
@@ -344,7 +351,7 @@ def answer(
             "tested_C": [low, high],
             "sought_C": list(SPAN_C),
         }
-    life = lifetime(law, goal, temperature_C, compression_pct)
+    life = lifetime(law, goal, temperature_C, compression_ratio_pct)
     found |= {
         "threshold": life.threshold,
         "days": _finite(life.days),
@@ -354,7 +361,7 @@ def answer(
         "outside": list(life.outside),
     }
     if resample and 0 < life.days < FOREVER:
-        found["ci95_resampled"] = finite_ends(resampled(law, goal, temperature_C, compression_pct))
+        found["ci95_resampled"] = finite_ends(resampled(law, goal, temperature_C, compression_ratio_pct))
     return found
 
 
