@@ -572,7 +572,7 @@ def main() -> int:
     parser.add_argument(
         "--heal", type=int, default=4, help="`report` and `run` are asked after every so many"
     )
-    parser.add_argument("--step", type=int, default=8, help="of the forgeries every so many")
+    parser.add_argument("--step", type=int, default=20, help="of the forgeries every so many")
     parser.add_argument("--jobs", type=int, default=2)
     asked = parser.parse_args()
     work = Path(tempfile.mkdtemp(prefix="fuzzing-"))
