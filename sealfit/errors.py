@@ -79,8 +79,13 @@ def printable(text: str) -> str:
     >>> printable("caf\\udce9\\x1b[2J")
     'caf\\\\xe9\\\\x1b[2J'
     """
-    text = text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+    return "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    if "\udc80" <= character <= "\udcff":  # stands for a byte
+        return f"\\x{ord(character) - 0xDC00:02x}"
+    return character.encode("unicode_escape").decode()
 
 
 # ---------------------------------------------------------------- groups
@@ -297,7 +302,10 @@ class WorkerError(SealfitError):
 
 # ---------------------------------------------------------------- memory
 
-_NO_MEMORY = ("failed to map segment from shared object", "annot allocate memory", "can't start new thread")
+_NO_MEMORY = (
+    "failed to map segment from shared object", "annot allocate memory", "can't start new thread",
+    "Failed to launch worker thread",
+)  # fmt: skip
 MEMORY = "memory ran out; what was complete before is kept."
 MORE_MEMORY = "Use fewer workers (--workers 1), or a computer with more memory."
 
@@ -306,7 +314,7 @@ def memory_ran_out(error: BaseException) -> bool:
     """Whether an error, or one that led to it, says that the system had no memory left.
 
     Libraries say so in several ways: a shared object that cannot be mapped is an ImportError, a mapped file
-    an OSError, a thread a RuntimeError.
+    an OSError, a thread a RuntimeError, or an exception of Arrow's own.
 
     Examples
     --------
@@ -317,7 +325,8 @@ def memory_ran_out(error: BaseException) -> bool:
     """
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
-    said_by_library = isinstance(error, ImportError | OSError | RuntimeError)
+    arrows = type(error).__module__ == "pyarrow.lib"
+    said_by_library = arrows or isinstance(error, ImportError | OSError | RuntimeError)
     if said_by_library and any(sign in str(error) for sign in _NO_MEMORY):
         return True
     before = error.__cause__ or error.__context__

@@ -310,15 +310,28 @@ def _report(store: Store, staged: Staged, options: Options, progress: Silent) ->
 
     progress.say("drawing the report")
     with timed("reading tables"):
-        tables = report_tables(store)
+        tables, closure = reported(store)
     with timed("page"):
-        closure = store.read_json("closure") if store.state.properties is None else None
         report = build_report(tables, closure, manifest.provenance(store.state), store.seen_config("report"))
     with timed("writing plots", rows=len(report.figures), of="plots"):
         for name, figure in report.figures.items():
             staged.figure(name, figure)
     staged.text("report.html", report.html)
     return sum(len(table) for table in tables.values()), "rows of tables"
+
+
+def reported(store: Store) -> tuple[dict[str, pd.DataFrame], dict | None]:
+    """Return the tables of the report and closure.json, None of properties.
+
+    OutError if closure.json lacks an effect whose shape is in the tables.
+    """
+    tables = report_tables(store)
+    if store.state.properties is not None:
+        return tables, None
+    closure = store.read_json("closure")
+    if tables["shapes"]["effect"].nunique() > len(closure["effects"]):
+        raise store.not_ours("closure")
+    return tables, closure
 
 
 def report_tables(store: Store) -> dict[str, pd.DataFrame]:

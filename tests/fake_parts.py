@@ -40,6 +40,11 @@ EFFECT = {
     "acts_on": "force",
     "operation": "add",
     "channels": ["displacement_mm"],
+    "level": "trace",
+    "p_value": 0.001,
+    "heldout_gain_N": 0.1,
+    "heldout_rmse_N": 0.2,
+    "alternatives": [],
     "named": True,
     "candidate": False,
     "parameters": [
@@ -50,7 +55,13 @@ EFFECT = {
 CLOSURE = {
     "schema": 1,
     "verdict": "closed",
-    "units": {"force_N": "N"},
+    "units": {
+        "force_N": "N",
+        "displacement_mm": "mm",
+        "speed_mm_s": "mm/s",
+        "load_N": "N",
+        "time_s": "s",
+    },
     "noise_floor_N": 0.11,
     "fit_quality": {"state": "within_scatter", "ratio": 1.0, "p_value": 0.5},
     "sensitivity": [],
@@ -60,9 +71,32 @@ CLOSURE = {
     "heldout_unit": "run",
     "effects": [EFFECT],
     "scatter": [],
-    "left": {"rmse_N": 0.2, "level": None, "channel": None, "p_value": None},
+    "left": {"rmse_N": 0.2, "level": None, "channel": None, "p_value": None, "significant": False},
+    "incomplete_channels": [],
     "outlier_files": [],
     "next_runs": [{"why": "a second load would separate them", "conditions": {"load_N": 98.0}}],
+}
+FITTED = {"theta": [], "terms": []}
+MODEL = {
+    "schema": 1,
+    "config": {},
+    "conditions": {"condition": ["a"], "series": ["a"], "rubber": ["rubber"], "aging_days": [0.0]},
+    "has_load": True,
+    "has_aging": True,
+    "declared": {
+        "parameters": [],
+        "index": {name: [-1] for name in ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")},
+        "stribeck": {"a": "full"},
+        "law": {"a": False},
+    },
+    "before": FITTED,
+    "after": FITTED,
+    "covariance": [],
+    "sandwiches": [],
+    "df": 3.0,
+    "scatter": {"s0": 0.1, "g": 0.0, "components": []},
+    "ranges": {"load_N": [49.0, 49.0]},
+    "speeds_mm_s": {"a": [1.0, 5.0]},
 }
 
 
@@ -133,10 +167,13 @@ class Parts:
         self._called("close-loop", config)
         self.workers = workers
         on_progress("trying ripple along displacement_mm")
+        tables = {name: small(name) for name in CLOSED}
+        if not self.closure["effects"]:
+            tables["shapes"] = tables["shapes"].iloc[:0]
         return SimpleNamespace(
             document=self.closure,
-            model={"ready": True},
-            tables={name: small(name) for name in CLOSED},
+            model=MODEL,
+            tables=tables,
             after=None,
         )
 
@@ -153,7 +190,7 @@ class Parts:
 
     def predict(self, model, points, own):
         self._called("predict", own)
-        assert model["ready"]
+        assert model["covariance"] == []
         answers = {name: 1.0 for name in ("force_before_N", "force_after_N", "force_after_lo95_N")}
         answers |= {name: 2.0 for name in ("force_after_hi95_N", "meas_lo95_N", "meas_hi95_N")}
         made = points.assign(**answers, extrapolated=False, note="")

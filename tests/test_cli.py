@@ -9,6 +9,7 @@ from pathlib import Path
 
 import fake_parts
 import pandas as pd
+import pyarrow as pa
 import pytest
 
 from sealfit import cli
@@ -230,6 +231,7 @@ def test_a_bug_under_json_leaves_one_object(sealfit, monkeypatch, arguments, at)
         OSError(errno.ENOMEM, "Cannot allocate memory"),
         RuntimeError("can't start new thread"),
         ImportError("a.so: failed to map segment from shared object"),
+        pa.ArrowException("Unknown error: Failed to launch worker thread: Resource temporarily unavailable"),
     ],
 )
 def test_no_memory_is_one_line_and_1(sealfit, monkeypatch, error):
@@ -436,6 +438,7 @@ def test_an_effect_that_is_not_named_or_not_applied_is_said_so(sealfit, parts, c
 def test_the_verdict_is_a_sentence(sealfit, parts, campaign, out, verdict, effects, left, expected):
     level, channel, p_value = left
     left = {"rmse_N": 0.2, "level": level, "channel": channel, "p_value": p_value}
+    left["significant"] = verdict == "unexplained"
     parts.closure = {**fake_parts.CLOSURE, "verdict": verdict, "effects": effects, "left": left}
     assert f"verdict     {verdict}: {expected}" in sealfit("run", campaign, "--out", out).stdout
 

@@ -93,6 +93,13 @@ VARIANTS = ("nothing", "names", "some", "some")  # of what a power loss leaves
 # ---------------------------------------------------------------- commands in forked processes
 
 
+# Lines of libraries, after which they end the process: of OpenBLAS, and of the C library that loads others.
+OF_LIBRARY = (
+    "OpenBLAS error: Memory allocation still failed",
+    "cannot allocate memory for thread-local data: ABORT",
+)
+
+
 @dataclass(frozen=True)
 class Ended:
     """How a command ended: its exit code, negative for a signal, and what it printed."""
@@ -105,6 +112,10 @@ class Ended:
     def lines(self) -> list[str]:
         """The messages, without the lines of progress."""
         return [line for line in self.err.splitlines() if line.startswith("sealfit: ")]
+
+    def of_library(self) -> bool:
+        """Whether a library without memory has ended the process, with a line of its own."""
+        return self.code in (1, 127) and any(line in self.err for line in OF_LIBRARY)
 
     def fault(self) -> str:
         """Return why this is no proper end: not 0, not killed by a fault, and not 1 with one line."""
@@ -602,7 +613,6 @@ def lines(verdicts: Sequence[Verdict]) -> list[str]:
 
 MEMORY_MB = (80, 2000)  # from where the program cannot load to where it has enough
 NOBODY = 65534
-OF_LIBRARY = "OpenBLAS error: Memory allocation still failed"  # its own line, after which it ends the process
 
 
 def memory(scene: Scene, folder: Path, count: int) -> tuple[Counter, list[str]]:
@@ -618,7 +628,7 @@ def memory(scene: Scene, folder: Path, count: int) -> tuple[Counter, list[str]]:
             resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
         end = subprocess_ended([*words[:-3], "--workers", "2"], preexec_fn=limited)
-        fault = "" if end.code == 1 and OF_LIBRARY in end.err else end.fault()
+        fault = "" if end.of_library() else end.fault()
         ends["done" if end.code == 0 else "wrong" if fault else "one line"] += 1
         wrong += [f"{limit >> 20} MB: {fault}"] if fault else []
     end = forked(lambda: sealfit(scene.words(folder / "work")), folder)

@@ -23,6 +23,7 @@ from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import SECOND, Effect
 from sealfit.effects.free import FREE, LEVELS, SMOOTH, WIDE, free_effect
+from sealfit.errors import ParameterError
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
 from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
@@ -137,6 +138,8 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
     ------
     RequestError
         If the model has an effect that is neither in the catalogue nor in `own`.
+    ParameterError
+        If the values of an effect are not those that it has.
     """
     raw = record["declared"]
     declared = Declared(
@@ -158,9 +161,18 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
             fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in raw_term["fixed"].items()}
             effect = free_effect(raw_term["id"], fixed) if raw_term["id"] in FREE else effects[raw_term["id"]]
             own = (raw_term["acts_on"], raw_term["operation"], fixed, raw_term.get("smoothness"))
-            model = model.with_term(Term(effect, tuple(raw_term["channels"]), *own), raw_term["values"])
+            term = Term(effect, tuple(raw_term["channels"]), *own)
+            model = model.with_term(_fitting(term, raw_term["values"]), raw_term["values"])
         models.append(model)
     return models[0], models[1], pd.DataFrame(record["conditions"])
+
+
+def _fitting(term: Term, values: Mapping[str, float]) -> Term:
+    """Return the term; ParameterError unless its channels and parameters are those of its effect."""
+    effect = term.effect
+    if len(term.channels) != len(effect.reads) or values.keys() != {p.name for p in effect.parameters}:
+        raise ParameterError(f"effect {effect.id}: its channels or parameters are others.")
+    return term
 
 
 # ---------------------------------------------------------------- plot tables

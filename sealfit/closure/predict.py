@@ -140,7 +140,7 @@ def _with_derived(table: pd.DataFrame, model: dict) -> pd.DataFrame:
 
 
 def _is_range(tested: object) -> bool:
-    return isinstance(tested, list) and len(tested) == 2 and all(isinstance(x, float) for x in tested)
+    return isinstance(tested, list) and len(tested) == 2 and not any(isinstance(x, str) for x in tested)
 
 
 def _conditions(

@@ -185,6 +185,8 @@ def _slopes(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
 
 def shares(means: Sequence[float] | None, count: int) -> tuple[float, ...]:
     """Return the means to subtract from the functions of a shape: `means` over the campaign, or zeros."""
+    if means is not None and len(means) != count:
+        raise ParameterError(f"{len(means)} means of {count} functions.", fix="Give one mean per function.")
     return (0.0,) * count if means is None else tuple(float(m) for m in means)
 
 

@@ -16,6 +16,7 @@ from sealfit.errors import BadFile, Fault
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import bad_file, read_marked
 from sealfit.ingest.quality import (
+    beginnings,
     equal_neighbours,
     load_faults,
     rising_faults,
@@ -425,7 +426,8 @@ def _means(stroke: Stroke, samples: Mapping[str, np.ndarray]) -> dict[str, objec
     }
     window["force_N"] = force = window["force_N"] - window["presliding_N"]
     place, n = window["displacement_mm"], len(rows)
-    size = np.abs(samples["force_N"][stroke.start : stroke.stop])
+    whole = slice(stroke.start, stroke.stop)
+    size = np.abs(samples["force_N"][whole])
     return {name: _mean_or_label(values) for name, values in window.items()} | {
         "force_sd_N": float(force.std(ddof=1)) if n > 1 else np.nan,
         "force_se_N": standard_error(force),
@@ -435,6 +437,7 @@ def _means(stroke: Stroke, samples: Mapping[str, np.ndarray]) -> dict[str, objec
         "left": float(window["presliding_N"][-1]) if n else np.nan,
         "equal": equal_neighbours(force),
         "extreme": bool(n and size[stroke.steady].max() >= size.max()),
+        **beginnings(samples["force_N"][whole], samples["displacement_mm"][whole]),
     }
 
 

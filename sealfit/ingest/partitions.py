@@ -27,7 +27,10 @@ from sealfit.tables import BINS, BOOL, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, T
 # ---------------------------------------------------------------- shaped
 
 # Columns that serve the ingest only.
-INNER = ("several", "several_speeds", "left", "equal", "extreme", "run", "sliding", "row", "by_itself")
+INNER = (
+    "several", "several_speeds", "left", "equal", "extreme", "begins", "begins_half", "run", "sliding", "row",
+    "by_itself",
+)  # fmt: skip
 IN_PANDAS = {FLOAT: float, INT: np.int64, TEXT: "str", BOOL: bool}
 STEADY_ONLY = tuple(
     {column.name for column in STEADY.columns}

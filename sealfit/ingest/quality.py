@@ -7,6 +7,7 @@ taken for a stuck one, nor a slow rig for a gappy one. Single samples and the co
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Sequence
 
 import numpy as np
@@ -20,6 +21,7 @@ from sealfit.ingest.trace_checks import resolution
 from sealfit.tables import CALENDAR, QUALITY, STEADY
 from sealfit.units import conversion
 
+LEAST_DIFFERENT = 10  # forces at the beginning of a stroke that tell it from others
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
 # Of a load: standard deviation over mean, along a trace. Friction follows its load, so a force that varies by
 # less than the second times as much may be the load itself. In 25 files (exports of tests, microtribo) the
@@ -118,6 +120,21 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
 def equal_neighbours(force_N: np.ndarray) -> float:
     """Return the share of samples that equal the one before; near 0 if noise exceeds the sensor's steps."""
     return float(np.mean(np.diff(force_N) == 0.0)) if len(force_N) > 1 else 0.0
+
+
+def beginnings(force_N: np.ndarray, displacement_mm: np.ndarray) -> dict[str, str | None]:
+    """Return hashes of the first samples of a stroke, which a copy without its last rows has in common.
+
+    They are of the largest power of two of its samples, and of half as many; None with few different forces,
+    which two measurements may have in common. Of two strokes of which one is at most twice as long, one such
+    number is the same.
+    """
+    most, found = 1 << (len(force_N).bit_length() - 1) if len(force_N) else 0, {}
+    for name, count in (("begins", most), ("begins_half", most // 2)):
+        several = len(np.unique(force_N[:count])) >= LEAST_DIFFERENT
+        first = np.stack([force_N[:count], displacement_mm[:count]]).astype(float)
+        found[name] = hashlib.sha256(first.tobytes()).hexdigest()[:20] if several else None
+    return found
 
 
 def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:

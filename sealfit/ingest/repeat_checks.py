@@ -190,6 +190,8 @@ def _outliers(
 
 # Share of its peers' force by which a force against its motion is of the wrong sign, not an offset.
 AGAINST = -0.5
+# What is the same to the last digit only in copies of a stroke.
+SAMPLES = ["n", "force_N", "force_sd_N", "displacement_from_mm", "displacement_to_mm"]
 # A smaller force was not measured; the square of its square would be 0.
 NOTHING = 1e-24
 
@@ -288,19 +290,24 @@ def _constant(row: pd.Series, dead: bool) -> Fault:
 def copied_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     """Return which strokes to keep, shape (n,), and findings on files that hold the samples of another.
 
-    Two measurements never have the same mean, scatter and positions to the last digit. A copy, or a second
-    link to one file, would count one measurement twice; the first is kept.
+    Two measurements never have the same mean, scatter and positions to the last digit, or the same samples
+    from their start on. A copy, a copy without its last rows, or a second link to one file, would count one
+    measurement twice; the first is kept.
     """
-    samples = ["n", "force_N", "force_sd_N", "displacement_from_mm", "displacement_to_mm"]
     own = strokes[strokes["used"].to_numpy(bool) & (strokes["force_sd_N"] > 0.0)]
-    first = own.groupby(samples)["file"].transform("first")
-    copied = own[own["file"] != first]
-    keep = ~strokes.index.isin(copied.index)
-    return keep, [_copied(row, first[i]) for i, row in copied.iterrows()]
+    first = own.groupby(SAMPLES)["file"].transform("first")
+    whole = own["file"] != first
+    found = {i: _copied(own.loc[i], f"holds the samples of {first[i]}") for i in own.index[whole]}
+    starts = own.loc[~whole, ["file", "begins", "begins_half"]].melt(id_vars="file", ignore_index=False)
+    starts = starts.dropna(subset="value").sort_index(kind="stable")
+    first = starts.groupby("value")["file"].transform("first")
+    for i, file in first[starts["file"] != first].items():
+        found.setdefault(i, _copied(own.loc[i], f"begins with the samples of {file}"))
+    return ~strokes.index.isin(list(found)), [found[i] for i in sorted(found)]
 
 
-def _copied(row: pd.Series, first: str) -> Fault:
-    reason = f"holds the samples of {first}: a copy is no second measurement."
+def _copied(row: pd.Series, what: str) -> Fault:
+    reason = f"{what}: a copy is no second measurement."
     fix = "Export the right test, or take the file out of the campaign."
     return Fault("copy", reason, **_place(row), fix=fix, **STROKE_OUT)
 

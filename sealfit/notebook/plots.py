@@ -9,7 +9,7 @@ from collections.abc import Callable
 from matplotlib.figure import Figure
 
 from sealfit.errors import RequestError
-from sealfit.pipeline import report_tables
+from sealfit.pipeline import reported
 from sealfit.report.figures import draw_all
 from sealfit.report.page import answered
 from sealfit.report.style import compose, look
@@ -87,8 +87,7 @@ class Plots:
 
     def _drawn(self, name: str) -> Figure:
         store = self._answered()
-        closure = store.read_json("closure") if store.state.properties is None else None
-        plots = draw_all(*answered(report_tables(store), closure), store.config)
+        plots = draw_all(*answered(*reported(store)), store.config)
         if name not in plots:
             raise RequestError(
                 f"these results have nothing to draw in the figure '{name}'.",

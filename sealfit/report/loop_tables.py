@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 
 import pandas as pd
@@ -102,7 +103,10 @@ def _labels(channels: Sequence[str], config: Config) -> str:
 
 
 def _change(before: float, after: float) -> str:
-    percent = round(100 * (after / before - 1))
+    ratio = 100 * (after / before - 1)
+    if not math.isfinite(ratio):
+        return NOTHING
+    percent = round(ratio)
     return f"{percent:+d}\u00a0%".replace("-", "−") if percent else "0\u00a0%"
 
 

@@ -282,6 +282,23 @@ def test_a_copy_is_no_second_measurement(tmp_path, how):
     assert used == ["a.csv", "c.csv"]
 
 
+@pytest.mark.parametrize("left", [99, 98, 65, 60])
+def test_a_copy_without_its_last_rows_is_no_second_measurement(tmp_path, left):
+    campaign(tmp_path, RUNS)
+    for number, name in enumerate("abc"):
+        rows = [
+            row.rpartition(",")[0] + f",{2 + 0.01 * ((i + 5 * number) % 37)}" for i, row in enumerate(ROWS)
+        ]
+        (tmp_path / f"{name}.csv").write_text(csv_of(rows))
+    whole = (tmp_path / "a.csv").read_text().splitlines()
+    assert not ingest_campaign(tmp_path, config('condition = ["aging_days"]')).faults
+    (tmp_path / "b.csv").write_text("\n".join(whole[: 1 + left]) + "\n")
+    made = ingest_campaign(tmp_path, config('condition = ["aging_days"]'))
+    (fault,) = [fault for fault in made.faults if fault.check == "copy"]
+    assert (fault.file, fault.action) == ("b.csv", "stroke left out")
+    assert fault.reason.startswith("begins with the samples of a.csv")
+
+
 FIVE = "file,aging_days,temperature_C,compression_ratio_pct,speed_mm_s\n" + "".join(
     f"{name}.csv,{day},60,80,5\n" for day, name in enumerate("abcde")
 )

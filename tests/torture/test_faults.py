@@ -146,5 +146,4 @@ def test_a_run_without_memory_is_one_line(tmp_path, limit_MB):
     campaign = SCRIPT.parents[2] / "sample_data" / "simulated"
     words = ["run", str(campaign), "--out", str(tmp_path / "out"), "--workers", "2"]
     ended = faults.subprocess_ended([sys.executable, "-m", "sealfit", *words], preexec_fn=limited)
-    assert ended.code == 1
-    assert faults.OF_LIBRARY in ended.err or not ended.fault()
+    assert ended.of_library() or (ended.code == 1 and not ended.fault())

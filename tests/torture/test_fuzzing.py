@@ -2,6 +2,7 @@
 
 import fuzzing
 import pytest
+from forged import forged
 from fuzzing import BAD, INPUTS, crafted, drawn, fuzzed_input, fuzzed_results, limited
 
 
@@ -57,3 +58,9 @@ def test_no_python_is_run_from_crafted_results(tmp_path):
     found = crafted(tmp_path, 1)
     assert len(found) > 50
     assert [one for one in found if one.verdict in BAD] == []
+
+
+def test_forged_results_with_right_checksums_end_in_an_answer_or_a_line(tmp_path):
+    found = forged(tmp_path, 1, 150)
+    assert len(found) > 60
+    assert {"read", "refused"} == {one.verdict for one in found}
