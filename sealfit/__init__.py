@@ -8,8 +8,8 @@ are first asked for, so that the command line starts at once.
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sealfit.notebook.results import Lifetime, Results, fit_properties, run
-    from sealfit.notebook.results import open as open
+    from sealfit.notebook import Lifetime, Results, fit_properties, run
+    from sealfit.notebook import open as open
 
 __version__ = "0.1.0"
 # Without `open`: `from sealfit import *` is not to hide Python's own.
@@ -20,9 +20,9 @@ _LOADED = (*__all__, "open")
 
 def __getattr__(name: str) -> object:
     if name in _LOADED:
-        from sealfit.notebook import results
+        from sealfit import notebook
 
-        return getattr(results, name)
+        return getattr(notebook, name)
     raise AttributeError(f"module 'sealfit' has no attribute '{name}'")
 
 

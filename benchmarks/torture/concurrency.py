@@ -50,7 +50,7 @@ from faults import (
 )
 
 from sealfit.errors import SealfitError
-from sealfit.notebook.results import open as open_results
+from sealfit.notebook import open as open_results
 from sealfit.store import Store
 
 READ_S = 1.0  # how long the readers read before and after a write
