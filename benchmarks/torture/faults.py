@@ -832,7 +832,7 @@ def main() -> int:
     parser.add_argument("--points", type=int, default=1000, help="how many, drawn at random; 0 for all")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=SCENES, metavar="NAME")
     parser.add_argument("--limits", type=int, default=20, help="limits of memory; needs the scene run")
-    parser.add_argument("--kills", type=int, default=20, help="workers killed, 12 s each")
+    parser.add_argument("--kills", type=int, default=50, help="workers killed, 5 s each on two free cores")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--work", type=Path, help="folder to work in; else one for temporary files")
     given = parser.parse_args()
