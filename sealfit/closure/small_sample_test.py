@@ -115,10 +115,11 @@ def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest 
 def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
     """Return the degrees of freedom of CR2 variances of contrasts, shape (m,), from leverages, (units, m).
 
-    The leverages of a contrast add up to 1.
+    The leverages of a contrast add up to 1, or are all 0: its variance is 0 then, and known.
     """
     shared = leverage**2 / (1 - np.minimum(leverage, LARGEST_LEVERAGE))
-    return 1 / ((leverage**2).sum(axis=0) + shared.sum(axis=0) ** 2 - (shared**2).sum(axis=0))
+    inverse = (leverage**2).sum(axis=0) + shared.sum(axis=0) ** 2 - (shared**2).sum(axis=0)
+    return 1 / np.maximum(inverse, 1e-300)
 
 
 def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:

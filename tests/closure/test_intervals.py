@@ -50,6 +50,14 @@ def test_what_rounding_leaves_of_groups_that_tell_nothing_is_no_information():
     np.testing.assert_allclose(half, t_quantile(1e6))  # the first decides alone
 
 
+def test_a_point_that_no_group_tells_anything_of_has_no_interval_from_them():
+    groups = [(np.array([0]), np.array([[1.0]]))] * 4
+    tangent = Tangent.dense(np.array([[0.0], [1.0]]))
+    with np.errstate(all="raise", under="ignore"):
+        half = mean_half_width(tangent, np.array([[0.25]]), 1e6, [Sandwich(np.array([[4.0]]), groups)])
+    np.testing.assert_allclose(half, [0.0, 2 * t_quantile(3)])
+
+
 def test_files_runs_and_specimens_are_asked_down_to_the_first_of_which_there_are_many():
     rows = make_rows(make_bins(bins=4), has_aging=True)
     counts = [rows.groups.starts[level].size for level in ("specimen", "run", "file")]
