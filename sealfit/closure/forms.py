@@ -45,6 +45,10 @@ NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1
 PHASES = tuple(np.arange(4) * np.pi / 4)
 """Phases of a ripple that are tried, in rad."""
 
+# Distance from 0, in ranges of the positions, beyond which the phase of a wave is that at a place near them.
+# Phase and wavelength have a correlation of 1 - 4e-6 there; at 25,000 ranges the fit cannot tell them apart.
+FAR = 100.0
+
 # Channels along which the amplitude of a wave may change.
 CHANGES_A_WAVE = (
     "direction", "speed_mm_s", "load_N", "temperature_C", "compression_ratio_pct", "aging_days"
@@ -223,7 +227,9 @@ def periodic_terms(
     targets = [ADDED] if peak.sign_symmetric else []
     if not both or not peak.sign_symmetric:
         targets += [("mu", "multiply"), ("force", "multiply")]
-    fixed: dict = {"x_ref": 0.0}
+    places = rows.values(peak.axis)
+    far = peak.common_phase and np.abs(places).min() > FAR * np.ptp(places)
+    fixed: dict = {"x_ref": reference(places) if far else 0.0}
     phases, lengths = PHASES, (peak.wavelength,)
     if not peak.common_phase:
         length, error = common_wavelength(samples, peak.wavelength, peak.axis)

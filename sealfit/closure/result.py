@@ -276,6 +276,8 @@ def form_of(term: Term) -> str:
     text = term.effect.form.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
     for name in ("x_ref", "z_ref"):
         if name in term.fixed:
+            if term.fixed[name] == 0.0:
+                text = text.replace(f"({name[0]} - {name})", name[0])
             text = text.replace(name, f"{term.fixed[name]:g}")
     return text
 

@@ -321,23 +321,24 @@ BUMP = closed_form(
 def sinusoid_shape(inputs, *, A, lambda_, phi):
     r"""Sine of any channel; along time it may be due to the mains, a servo or a pump.
 
-    Along the position the same form is the physical effect `ripple`.
+    Along the position the same form is the physical effect `ripple`. x_ref is 0, or near the channel's values
+    where these are far from 0.
     """
-    angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_ + phi
+    angle = 2 * np.pi * deviation(inputs, CHANNEL) / lambda_ + phi
     return A * np.sin(angle) * sine_attenuation(inputs, CHANNEL, lambda_)
 
 
 SINUSOID = closed_form(
     id="sinusoid",
     label="periodic in {x}",
-    equation=r"h = A \sin(2 \pi x / \lambda + \varphi)",
-    form="A sin(2 pi x / lambda + phi)",
+    equation=r"h = A \sin(2 \pi (x - x_{ref}) / \lambda + \varphi)",
+    form="A sin(2 pi (x - x_ref) / lambda + phi)",
     reference="mean over a wavelength",
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(
         Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude", linear=True),
         Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
-        Parameter("phi", "rad", 0.0, PHASE, "phase at 0", search=PHASES),
+        Parameter("phi", "rad", 0.0, PHASE, "phase at 0, or x_ref", search=PHASES),
     ),
     shape=sinusoid_shape,
     source="Form: ours. The first Fourier term of anything periodic.",
@@ -359,8 +360,8 @@ def sinusoid_changing_shape(inputs, *, A, B, lambda_, phi):
 SINUSOID_CHANGING = closed_form(
     id="sinusoid_changing",
     label="periodic in {x}, with an amplitude that changes with {z}",
-    equation=r"h = (A + B (z - z_{ref})) \sin(2 \pi x / \lambda + \varphi)",
-    form="(A + B (z - z_ref)) sin(2 pi x / lambda + phi)",
+    equation=r"h = (A + B (z - z_{ref})) \sin(2 \pi (x - x_{ref}) / \lambda + \varphi)",
+    form="(A + B (z - z_ref)) sin(2 pi (x - x_ref) / lambda + phi)",
     reference="mean over a wavelength",
     reads=(CHANNEL, SECOND),
     acts_on=SINUSOID.acts_on,

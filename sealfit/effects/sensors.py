@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, CHANNEL, PHASE, PHASES, Effect, Parameter, deviation
+from sealfit.effects.contract import (
+    AMPLITUDE,
+    CHANNEL,
+    PHASE,
+    PHASES,
+    Effect,
+    Parameter,
+    deviation,
+    reference,
+)
 from sealfit.effects.free import sine_attenuation
 
 
@@ -16,17 +25,17 @@ def ripple_shape(inputs, *, A, lambda_, phi):
     starts. It is an added force, the same in both directions, if the drive strains the sensor, and a factor
     on friction if the pressure or the surface of the contact is periodic along the track. A harmonic is a
     further ripple of half or a third of the wavelength. Positions beyond the tested ones are extrapolated in
-    phase.
+    phase. x_ref is 0, or near the positions of a rig that counts from far away.
     """
-    angle = 2 * np.pi * np.asarray(inputs["displacement_mm"], dtype=float) / lambda_ + phi
-    return A * np.sin(angle) * sine_attenuation(inputs, "displacement_mm", lambda_)
+    x = np.asarray(inputs["displacement_mm"], dtype=float) - reference(inputs, CHANNEL, 0.0)
+    return A * np.sin(2 * np.pi * x / lambda_ + phi) * sine_attenuation(inputs, "displacement_mm", lambda_)
 
 
 RIPPLE = Effect(
     id="ripple",
     label="ripple along the rig's position",
-    equation=r"h = A \sin(2 \pi x / \lambda + \varphi)",
-    form="A sin(2 pi x / lambda + phi)",
+    equation=r"h = A \sin(2 \pi (x - x_{ref}) / \lambda + \varphi)",
+    form="A sin(2 pi (x - x_ref) / lambda + phi)",
     reference="mean over a wavelength",
     reads=("displacement_mm",),
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
@@ -40,7 +49,7 @@ RIPPLE = Effect(
             "wavelength: pitch of the screw, or its whole fraction",
             search="span",
         ),
-        Parameter("phi", "rad", 0.0, PHASE, "phase at position 0", search=PHASES),
+        Parameter("phi", "rad", 0.0, PHASE, "phase at position 0, or x_ref", search=PHASES),
     ),
     shape=ripple_shape,
     source="Form: ours. A cyclic error of a screw is periodic in its angle; "

@@ -241,6 +241,21 @@ def test_a_ripple_of_one_direction_has_an_amplitude_that_changes_with_the_direct
         assert values["B"] == pytest.approx(values["A"], rel=0.2)
 
 
+def test_a_ripple_far_from_position_0_has_its_phase_near_the_positions():
+    bins = numbered(make_bins(days=(), repeats=2, noise_N=0.05))
+    bins["force_N"] += 0.3 * np.sin(2 * np.pi * bins["displacement_mm"] / 8.0)
+    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0, 1.0)
+    near, far = (
+        naming.propose_ripples(fit_declared(make_rows(moved, has_aging=True)), peak, bins.iloc[:0], EFFECTS)[
+            0
+        ]
+        for moved in (bins, bins.assign(displacement_mm=bins["displacement_mm"] + 1e6))
+    )
+    assert (near.term.fixed["x_ref"], far.term.fixed["x_ref"]) == (0.0, 1e6)
+    values, same = (p.fitted.model.values[-1] for p in (near, far))
+    assert [same[name] for name in values] == pytest.approx(list(values.values()), rel=1e-4)
+
+
 def test_proposals_of_one_term_are_compared_by_identity():
     one, other = (proposal("linear", column=np.array([1.0, 2.0])) for _ in range(2))
     assert one in [one]

@@ -251,3 +251,7 @@ def test_units_of_parameters_are_those_of_the_rig(term, unit, expected):
 def test_an_equation_is_written_with_its_reference():
     term = Term(EFFECTS["linear"], ("oil_ppm",), "mu", "multiply", {"x_ref": 50.25})
     assert form_of(term) == "A (x - 50.25)"
+    ripple = Term(EFFECTS["ripple"], ("displacement_mm",), "force", "add", {"x_ref": 0.0})
+    assert form_of(ripple) == "A sin(2 pi x / lambda + phi)"
+    far = Term(EFFECTS["ripple"], ("displacement_mm",), "force", "add", {"x_ref": 1e6})
+    assert form_of(far) == "A sin(2 pi (x - 1e+06) / lambda + phi)"
