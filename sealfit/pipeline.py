@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -199,7 +200,9 @@ def _ingest(store: Store, staged: Staged, options: Options, progress: Silent) ->
     # As they were when the reading began.
     runs_before = {name: fingerprint(campaign / name) for name in paths.possible_tables(config)}
     done = store.state.steps.get("ingest")
-    known = known_parts(store.out, done.files) if done and not options.force else {}
+    known = {}
+    if done and not options.force:
+        known = known_parts(store.out, done.files, partial(store.is_whole, done=done))
     place = Place(staged.folder(), known, store.marks)
     with progress.counting("reading trace files") as on_file:
         ingested = ingest_campaign(campaign, config, workers=options.workers, on_file=on_file, place=place)

@@ -208,6 +208,19 @@ def test_a_changed_file_is_found_and_everything_after_it_redone(first, campaign,
     assert sealfit("check", copy, code=1).stdout.endswith("1 fault found.\n")
 
 
+def test_a_damaged_part_of_a_table_is_made_again(first, campaign, tmp_path):
+    out = tmp_path / "out"
+    subprocess.run(["cp", "-r", first[0], out], check=True)
+    part = next((out / "traces.parquet").iterdir())
+    whole = part.read_bytes()
+    part.write_bytes(whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:])
+    assert (
+        f"its traces.parquet/{part.name} is missing or was changed" in sealfit("report", out, code=1).stderr
+    )
+    assert "ingest" in json.loads(sealfit("run", campaign, "--out", out, "--json").stdout)["done"]
+    assert part.read_bytes() == whole
+
+
 def locked(out):
     until = time.monotonic() + 20
     while not (out / ".lock").exists() and time.monotonic() < until:

@@ -59,8 +59,7 @@ from pollution import (
 
 from sealfit.cli import app, exit_code
 from sealfit.config import load_config
-from sealfit.errors import OutError, SealfitError
-from sealfit.store import parquet
+from sealfit.errors import SealfitError
 from sealfit.store.staged_writes import LOCK
 
 LIMIT_S = 10
@@ -371,15 +370,7 @@ class Folder:
         return ("same", name) if same else ("wrong", f"{name}: {text[:300]}")
 
     def _healed(self) -> tuple[str, str]:
-        """Return whether all tables are as they were, or are after --force where the one line asks for it.
-
-        Parts of large tables have a checksum in every page and none in state.json: whoever reads a damaged
-        one is told to run with --force.
-        """
         other = self._others()
-        if other and all(_is_refused(self.out / name) for name in other):
-            command("run", str(self.campaign), "--out", str(self.out), "--workers", "1", "--force")
-            other = self._others()
         return ("not healed", f"run: {', '.join(other[:5])} differ") if other else ("healed", "run")
 
     def _others(self) -> list[str]:
@@ -389,15 +380,6 @@ class Folder:
             if name.endswith((".parquet", ".arrow")) or name in ("closure.json", "model.json")
             if not (self.out / name).is_file() or _differ((self.out / name).read_bytes(), raw)
         ]
-
-
-def _is_refused(path: Path) -> bool:
-    """Whether reading a part of a table ends in the one line that asks for `run --force`."""
-    try:
-        parquet.read(path)
-    except OutError as error:
-        return "--force" in error.fix
-    return False
 
 
 def _differ(raw: bytes, other: bytes) -> bool:

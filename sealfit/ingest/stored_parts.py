@@ -22,7 +22,7 @@ from sealfit.errors import Fault
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, Asked, Columns, Part, read_part
 from sealfit.store import parquet
-from sealfit.store.staged_writes import PARQUET, disk, file_size, sync
+from sealfit.store.staged_writes import PARQUET, disk, sync
 
 # ---------------------------------------------------------------- trace access
 
@@ -179,14 +179,14 @@ def _file_name(key: str | None, asked: Asked) -> str:
     return f"{key or uuid.uuid4().hex[:20]}-{variant[:8]}{PARQUET}"
 
 
-def known_parts(out: Path, files: Mapping[str, int]) -> dict[str, Path]:
+def known_parts(out: Path, files: Iterable[str], is_whole: Callable[[str], bool]) -> dict[str, Path]:
     """Return the stored parts that are whole, by their keys.
 
-    `files` are those that the last ingest left in the folder `out`, and their sizes in bytes.
+    `files` are those that the last ingest left in the folder `out`; `is_whole` says whether one is as it was.
     """
     whole = {Path(name).stem: out / name for name in files if name.startswith(f"{PARTS}/")}
-    for name, size in files.items():
-        if "/" in name and file_size(f"{out}/{name}") != size:
+    for name in files:
+        if "/" in name and not is_whole(name):
             whole.pop(Path(name).stem, None)
     return {name.split("-", 1)[0]: path for name, path in whole.items()}
 

@@ -179,8 +179,8 @@ class Store:
                 return f"{name} has not been done"
             if done.key != self._keys[name]:
                 return f"{name} is stale: {self._what_changed(name, done)}"
-            for file, size in done.files.items():
-                if file_size(f"{self.out}/{file}") != size or self._damaged(file, done):
+            for file in done.files:
+                if not self.is_whole(file, done):
                     return f"{name} is stale: its {file} is missing or was changed"
         return ""
 
@@ -196,13 +196,24 @@ class Store:
             raise RequestError(f"{self.out} holds {laws}: there is no {step}.", fix=fix)
         return order[: order.index(step) + 1]
 
-    def _damaged(self, file: str, done: manifest.Done) -> bool:
-        """Whether a file is not what its step wrote; it is read once by this process."""
-        if file not in done.checksums:
+    def is_whole(self, file: str, done: manifest.Done) -> bool:
+        """Whether a file is what its step wrote; it is read once by this process.
+
+        Parts of large tables are read only if they were touched since state.json was written.
+        """
+        if file_size(f"{self.out}/{file}") != done.files[file]:
             return False
+        if file not in done.checksums or (file.endswith(PARQUET) and "/" in file and not self._touched(file)):
+            return True
         if file not in self._checksums:
             self._checksums[file] = fingerprint(self.out / file).sha256
-        return self._checksums[file] != done.checksums[file]
+        return self._checksums[file] == done.checksums[file]
+
+    def _touched(self, file: str) -> bool:
+        try:
+            return (self.out / file).stat().st_ctime_ns > (self.out / STATE).stat().st_ctime_ns
+        except OSError:
+            return True
 
     def _what_changed(self, step: str, done: manifest.Done) -> str:
         if done.version != __version__:

@@ -251,7 +251,7 @@ class Done:
     finished_at: str  # ISO 8601, UTC
     seconds: float
     files: dict[FileOfOut, int]  # with their sizes in bytes
-    checksums: dict[str, str | None]  # SHA-256 of those that are not parts of a table
+    checksums: dict[str, str | None]  # SHA-256
 
 
 @dataclass(frozen=True, slots=True)

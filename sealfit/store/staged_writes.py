@@ -75,7 +75,7 @@ class Staged:
     def adopt(self, files: Mapping[str, int]) -> None:
         """Add files with sizes to this step: those other processes wrote into `folder`, and those in OUT."""
         self.files |= files
-        for file in (file for file in files if not file.endswith(PARQUET)):  # whose pages have checksums
+        for file in files:
             here = self._folder / file
             self.checksums[file] = fingerprint(here if here.exists() else self._out / file).sha256
 
