@@ -208,8 +208,11 @@ def test_a_changed_file_is_found_and_everything_after_it_redone(first, campaign,
     assert sealfit("check", copy, code=1).stdout.endswith("1 fault found.\n")
 
 
-def test_a_damaged_part_of_a_table_is_made_again(first, campaign, tmp_path):
-    out = tmp_path / "out"
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_damaged_part_of_a_table_is_made_again(first, campaign, tmp_path, moved):
+    out, copy = tmp_path / "out", tmp_path / "campaign"
+    if moved:  # then state.json is written before anything is read
+        subprocess.run(["cp", "-r", campaign, copy], check=True)
     subprocess.run(["cp", "-r", first[0], out], check=True)
     part = next((out / "traces.parquet").iterdir())
     whole = part.read_bytes()
@@ -217,7 +220,8 @@ def test_a_damaged_part_of_a_table_is_made_again(first, campaign, tmp_path):
     assert (
         f"its traces.parquet/{part.name} is missing or was changed" in sealfit("report", out, code=1).stderr
     )
-    assert "ingest" in json.loads(sealfit("run", campaign, "--out", out, "--json").stdout)["done"]
+    again = sealfit("run", copy if moved else campaign, "--out", out, "--json")
+    assert "ingest" in json.loads(again.stdout)["done"]
     assert part.read_bytes() == whole
 
 

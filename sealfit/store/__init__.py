@@ -42,6 +42,8 @@ class Store:
         self._checksums: dict[str, str | None] = {}  # of files that this process has read
         self._keys: dict[str, str] | None = None  # of every step for the present campaign
         self._opened: tuple | None = None  # status of state.json when it was opened for reading
+        found = _status_of(out)
+        self._written_ns = found[-1] if found else 0  # when state.json was last written before this process
         self._changed: Mapping[str, Fingerprint] = {}  # inputs that are new or changed since the stored state
         if state.campaign.is_dir():
             files = self.config.files if state.properties is None else Files()
@@ -211,7 +213,7 @@ class Store:
 
     def _touched(self, file: str) -> bool:
         try:
-            return (self.out / file).stat().st_ctime_ns > (self.out / STATE).stat().st_ctime_ns
+            return (self.out / file).stat().st_ctime_ns > self._written_ns
         except OSError:
             return True
 
