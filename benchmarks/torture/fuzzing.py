@@ -370,16 +370,13 @@ class Folder:
         return ("same", name) if same else ("wrong", f"{name}: {text[:300]}")
 
     def _healed(self) -> tuple[str, str]:
-        other = self._others()
-        return ("not healed", f"run: {', '.join(other[:5])} differ") if other else ("healed", "run")
-
-    def _others(self) -> list[str]:
-        return [
+        other = [
             name
             for name, raw in self.files.items()
             if name.endswith((".parquet", ".arrow")) or name in ("closure.json", "model.json")
             if not (self.out / name).is_file() or _differ((self.out / name).read_bytes(), raw)
         ]
+        return ("not healed", f"run: {', '.join(other[:5])} differ") if other else ("healed", "run")
 
 
 def _differ(raw: bytes, other: bytes) -> bool:
@@ -563,7 +560,7 @@ def main() -> int:
         parts = asked.jobs  # each makes results of its own
         jobs = [("results", work, asked.seed, asked.results, (i, parts), asked.heal) for i in range(parts)]
         jobs += [("crafted", work, asked.seed), ("forged", work, asked.seed, asked.step)]
-        jobs += [*((name, work, asked.inputs, asked.seed) for name in INPUTS)]
+        jobs += ((name, work, asked.inputs, asked.seed) for name in INPUTS)
         with ProcessPoolExecutor(asked.jobs, mp_context=get_context("fork")) as pool:
             found = [one for part in pool.map(_part, jobs) for one in part]
     finally:

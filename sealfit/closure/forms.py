@@ -45,7 +45,7 @@ NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1
 PHASES = tuple(np.arange(4) * np.pi / 4)
 """Phases of a ripple that are tried, in rad."""
 
-# Distance from 0, in ranges of the positions, beyond which the phase of a wave is that at a place near them.
+# Distance from 0, in ranges of the positions, beyond which the phase of a wave is given near the positions.
 # Phase and wavelength have a correlation of 1 - 4e-6 there; at 25,000 ranges the fit cannot tell them apart.
 FAR = 100.0
 

@@ -29,10 +29,10 @@ LEAST_TRAVEL = 0.01
 # tolerance, and share that may be faster. Of those of a ramp 38 % are slower and 38 % faster, of those at the
 # top of a sine wave 33 and 24 %.
 OFF_SPEED = 0.2
-# The same of a stretch so short that its ends, smoothed with what is beside, are a large part of it.
+# The same where the stretch is so short that its smoothed ends are a large part of it.
 MOST_OFF_SPEED = 0.3
 # Samples of a steady speed among several, at least. One with fewer than `min_samples` is left out as a stroke
-# of its own, and is no part of the stroke before it. With 6, ramps of 50 samples held steady speeds.
+# of its own, and is no part of the stroke before it. With 6, steady speeds are found on ramps of 50 samples.
 FEWEST_SAMPLES = 10
 # Share of a turn below which what comes before the first or after the last whole turn is no turn of its own.
 PART_OF_TURN = 0.05

@@ -50,7 +50,7 @@ def test_what_rounding_leaves_of_groups_that_tell_nothing_is_no_information():
     np.testing.assert_allclose(half, t_quantile(1e6))  # the first decides alone
 
 
-def test_a_point_that_no_group_tells_anything_of_has_no_interval_from_them():
+def test_a_point_without_information_from_groups_has_no_interval_from_them():
     groups = [(np.array([0]), np.array([[1.0]]))] * 4
     tangent = Tangent.dense(np.array([[0.0], [1.0]]))
     with np.errstate(all="raise", under="ignore"):
