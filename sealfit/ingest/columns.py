@@ -220,7 +220,7 @@ def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict
             place = {"line": layout.names_line, "column": theirs}
             faults += bad_file(file, "duplicate_column", reason, fix, **place).faults
         elif ours not in settings.optional:
-            faults.append(_missing(theirs, layout, width, settings, file))
+            faults.append(_missing(ours, layout, width, settings, file))
     if faults:
         raise BadFile(*faults)
     if settings.other_columns == "channels":
@@ -256,8 +256,11 @@ def suggestion(name: str, known: Sequence[str]) -> str:
     return f"The columns are {shortened(names, LONGEST_LIST)}." if names else ""
 
 
-BY_RATE = "give the rows per second as rate_Hz under [trace]"
-BY_SPEED = "integrate it from a speed column"
+# What a file without this column can be read by, when it is neither named nor computed.
+INSTEAD = {
+    "time_s": "give the rows per second as rate_Hz under [trace]",
+    "displacement_mm": "name a column of speed as integrate_displacement under [trace]",
+}
 
 
 def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
@@ -265,8 +268,9 @@ def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
     found = []
     for name in SLOTS[:3]:
         if name not in table:
-            last = BY_RATE if name == "time_s" else BY_SPEED
-            fix = f"Name it under [trace.columns], compute it under [trace.compute], or {last}."
+            fix = "Name it under [trace.columns], or compute it under [trace.compute]."
+            if other := INSTEAD.get(name):
+                fix = f"Name it under [trace.columns], compute it under [trace.compute], or {other}."
             found.append(missing_column(name, layout, file, fix))
     if found:
         raise BadFile(*found)
@@ -278,7 +282,8 @@ def missing_column(column: str | int, layout: Layout, file: str, fix: str, reaso
     return bad_file(file, "missing_column", reason, fix, **place).fault
 
 
-def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceFormat, file: str) -> Fault:
+def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat, file: str) -> Fault:
+    theirs = settings.their_columns[ours]
     if isinstance(theirs, int):
         reason = f"there is no column {theirs}: the lines have {width}."
         fix = "Check delimiter and positions in the rig config."
@@ -286,6 +291,8 @@ def _missing(theirs: str | int, layout: Layout, width: int, settings: TraceForma
     fix = "Columns without names go by position, from 1."
     if layout.names:
         fix = suggestion(theirs, layout.names)
+        if ours in INSTEAD and not nearest(theirs, layout.names):
+            fix += f" Name it under [trace.columns], or {INSTEAD[ours]}."
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
         for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), ("|", '"|"'), (" ", '"whitespace"')):

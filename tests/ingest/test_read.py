@@ -69,6 +69,30 @@ def test_a_rate_gives_the_time_of_files_without_one(tmp_path):
     assert "rate_Hz" in fault.fix
 
 
+RATE = "give the rows per second as rate_Hz under [trace]."
+SPEED = "name a column of speed as integrate_displacement under [trace]."
+NAMED = "The columns are {}. Name it under [trace.columns], or "
+EITHER = "Name it under [trace.columns], compute it under [trace.compute], or "
+FORCE = "Name it under [trace.columns], or compute it under [trace.compute]."
+
+
+@pytest.mark.parametrize(
+    ("header", "text", "column", "fix"),
+    [
+        ("displacement_mm,force_N", "", "time_s", NAMED.format("'displacement_mm', 'force_N'") + RATE),
+        ("time_s,force_N", "", "displacement_mm", NAMED.format("'time_s', 'force_N'") + SPEED),
+        ("time_s,displacement_mm", "", "force_N", "The columns are 'time_s', 'displacement_mm'."),
+        ("x,F", "displacement_mm = 1\nforce_N = 2", "time_s", EITHER + RATE),
+        ("t,F", "time_s = 1\nforce_N = 2", "displacement_mm", EITHER + SPEED),
+        ("t,x", "time_s = 1\ndisplacement_mm = 2", "force_N", FORCE),
+    ],
+)
+def test_a_missing_column_is_answered_with_the_ways_to_give_it(tmp_path, header, text, column, fix):
+    content = csv_of([row.rpartition(",")[0] for row in ROWS], header)
+    fault = refused(tmp_path, content, f"[trace.columns]\n{text}" if text else "")
+    assert (fault.check, fault.column, fault.fix) == ("missing_column", column, fix)
+
+
 @pytest.mark.parametrize(
     ("rate", "more"),
     [
