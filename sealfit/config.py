@@ -27,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from sealfit.errors import ConfigError, did_you_mean, nearest
+from sealfit.errors import ConfigError, did_you_mean, nearest, shortened
 from sealfit.units import Conversion, Units, conversion
 
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
@@ -529,9 +529,8 @@ def parse_config(text: str, name: str) -> Config:
     try:
         return Config.model_validate(tomllib.loads(text))
     except ValidationError as error:
-        fix, found = "docs/reference/config.md has every key.", error.errors()
-        line = _line_of(found[0], text) if len(found) == 1 else None
-        raise ConfigError(explain(error, Config), file=name, line=line, fix=fix) from error
+        fix = "docs/reference/config.md has every key."
+        raise ConfigError(explain(error, Config), file=name, line=line_of(error, text), fix=fix) from error
     except (ValueError, RecursionError) as error:  # a number of thousands of digits, or lists in lists
         raise ConfigError(
             f"is not TOML: {error}.", file=name, fix="docs/reference/config.md has every key."
@@ -548,12 +547,25 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str
             lines.append(f"unknown key '{key}'." + (f" Did you mean '{meant}'?" if meant else ""))
             continue
         end = "" if text.endswith(("?", ".")) else "."
-        lines.append(f"key '{key}': {text}{end}" if key else f"{text}{end}")
+        lines.append(f"key '{key}': {_given(fault)}{text}{end}" if key else f"{text}{end}")
     return " ".join(lines)
 
 
-def _line_of(fault: Mapping, text: str) -> int | None:
-    """Return the line of the last key of a fault that a config has; None where it has it in several."""
+def _given(fault: Mapping) -> str:
+    """Return the value that a type or a range refuses, to stand before the reason; our reasons have it."""
+    own = fault["type"] in ("value_error", "assertion_error", "missing")
+    return (
+        ""
+        if own or not isinstance(fault["input"], str | int | float)
+        else f"{shortened(repr(fault['input']))}: "
+    )
+
+
+def line_of(error: ValidationError, text: str) -> int | None:
+    """Return the line of the last key of the one fault that a config has; None of several keys or lines."""
+    if error.error_count() > 1:
+        return None
+    (fault,) = error.errors()
     said = fault["msg"].removeprefix("Value error, ").partition(":")[0]  # of a fault of the whole config
     for part in reversed(fault["loc"] or said.split(".")):
         key = re.compile(rf"(?<![\w-]){re.escape(str(part))}['\"]?\s*[]=.]")

@@ -151,6 +151,27 @@ def test_a_mistyped_key_is_answered_with_the_nearest(text, said):
 
 
 @pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "[strokes]\nmin_samples = 'many'",
+            "toml:2: key 'strokes.min_samples': 'many': Input should be a valid integer",
+        ),
+        ("[strokes]\nmin_samples = -4", "key 'strokes.min_samples': -4: Input should be greater than"),
+        ("[trace]\nintegrate_per = 'h'", "key 'trace.integrate_per': 'h': Input should be 's' or 'min'."),
+        ("[trace.columns]\nforce_N = [1]", "key 'trace.columns.force_N': Input should be"),
+        ("[trace.columns]\nforce_N = {name = 'F', unit = 'kgff'}", "force_N: 'kgff' is no known unit"),
+        (f"name = ['a']\ncondition = '{'x' * 500}'", "xxx...: Input should be a valid list."),
+    ],
+)
+def test_a_value_that_is_refused_is_named(text, said):
+    with pytest.raises(ConfigError) as caught:
+        config(text)
+    assert said in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize(
     ("text", "line"),
     [
         ("name = 'a'\n[trace]\n# delimeter\ndelimeter = ';'", 4),

@@ -104,9 +104,9 @@ def test_an_effect_that_gives_no_number_is_said_and_nothing_written(tmp_path):
     ("text", "words"),
     [
         ("sed = 1", "unknown key 'sed'"),
-        ("[design]\nspeed = 3", r"unknown key 'design\.speed'"),
+        ("[design]\nspeed = 3", r"toml:2: unknown key 'design\.speed'"),
         ("[design\n", "is not TOML"),
-        ("seed = -1", "key 'seed': Input should be greater than or equal to 0"),
+        ("seed = -1", "toml:1: key 'seed': -1: Input should be greater than or equal to 0"),
         ("[design]\nstroke_mm = 2.0", "too short for stiffness_mm"),
         ("[design]\nstrokes_per_file = 2", "needs directions"),
         ("[design]\nsampling_Hz = 10", "samples in the fastest stroke"),

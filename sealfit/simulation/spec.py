@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, ValidationError, model_validator
 
-from sealfit.config import Strict, explain
+from sealfit.config import Strict, explain, line_of
 from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import parse
@@ -296,9 +296,8 @@ def load_spec(path: Path) -> Spec:
             f"is not TOML: {error}.", file=path, fix="See sample_data/simulated.spec.toml for an example."
         ) from error
     except ValidationError as error:
-        raise ConfigError(
-            explain(error, Spec), file=path, fix="sample_data/README.md lists every key."
-        ) from error
+        fix = "sample_data/README.md lists every key."
+        raise ConfigError(explain(error, Spec), file=path, line=line_of(error, text), fix=fix) from error
     except ConfigError as error:
         raise ConfigError(error.message, file=path, fix=error.fix) from error
     return spec
