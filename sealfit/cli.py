@@ -112,13 +112,20 @@ def exit_code(app: typer.Typer) -> int:
         # can do.
         if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
             return _bug(error)
-        text = error.format_message()
+        text = _usage_fault(error)
         if "NoArgs" in type(error).__name__:  # `sealfit` alone: its message is the help
             return _fail(text, [_error("no command was given.")], error.exit_code)
         usage = error.ctx.get_usage() if getattr(error, "ctx", None) else ""
         hint = f"Try: {error.ctx.command_path} --help" if usage else ""
         shown = "\n".join(part for part in (usage, hint, f"sealfit: {text}") if part)
         return _fail(shown, [_error(text)], error.exit_code)
+
+
+def _usage_fault(error: Exception) -> str:
+    """Return the message of a fault of usage, with the refused value where the typer in use leaves it out."""
+    if refused := getattr(error.__cause__, "errors", lambda: ())():
+        error.message = f"{shortened(repr(refused[0]['input']))}: {error.message}"
+    return error.format_message()
 
 
 def _fail(message: str, errors: list[dict], code: int) -> int:

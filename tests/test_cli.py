@@ -160,6 +160,14 @@ def test_wrong_usage_is_2(sealfit, arguments):
     assert len(ended.json["errors"]) == 1
 
 
+@pytest.mark.parametrize("value", ["two", "2.5", "0"])
+def test_a_refused_value_of_an_option_is_named(sealfit, value):
+    ended = sealfit("run", "c", "--out", "o", "--workers", value)
+    assert ended.code == 2
+    assert ended.stderr.splitlines()[-1].startswith("sealfit: Invalid value for '--workers': ")
+    assert value in ended.stderr.splitlines()[-1]
+
+
 def test_a_campaign_at_fault_is_1_and_leaves_no_out(sealfit, parts, campaign, out):
     parts.raises["ingest"] = CampaignError(
         [Fault("twice", "is listed twice.", "runs.csv", None, 3, fix="Drop one.")]
