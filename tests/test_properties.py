@@ -1,9 +1,11 @@
 """`fit-aging --values`: results that belong to a table, beside those of campaigns."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from typer.testing import CliRunner
@@ -39,6 +41,13 @@ def test_the_simulated_hardness_comes_back(table, tmp_path):
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "hardness.csv: aging report" in page
     assert "Force against speed" not in page
+    assert '<span class="badge within_scatter">The law fits<' in page
+    (said,) = re.findall(r'<p class="verdict">(.*)</p>', page)
+    assert said.startswith(
+        "hardness_shore_A: the law <i>μ</i><sub>0</sub> - <i>a</i> ln(1 + <i>t</i>/<i>b</i>), "
+    )
+    assert "changes the rate, <i>E</i>&nbsp;= 86.6 kJ/mol [" in said
+    assert "mu_" not in said
     stored = pd.read_parquet(tmp_path / "out" / "property_values.parquet")
     assert len(stored) == one["values"] == 96
 
@@ -125,3 +134,21 @@ def test_json_and_the_summary_say_the_same(table, tmp_path):
     assert "standard deviation of replicates 0.491, of batches 0.609" in said
     missing = CliRunner().invoke(app, ["fit-aging", "--values", "hardnes.csv", "--out", "out"])
     assert "there is no table of values" in str(missing.exception)
+
+
+def test_the_page_says_at_its_top_that_a_law_does_not_fit(tmp_path):
+    rng = np.random.default_rng(3)
+    rows = [
+        f"{temperature},{days},{70.0 + 6.0 * (days in (2, 8)) + rng.normal(0.0, 0.4):.3f}"
+        for temperature in (60, 80, 100)
+        for days in (0, 1, 2, 4, 8, 16, 32)
+        for _ in range(4)
+    ]
+    table = tmp_path / "steps.csv"
+    table.write_text("\n".join(["temperature_C,aging_days,hardness", *rows]) + "\n", "utf-8")
+    (one,) = pipeline.fit_properties(table, tmp_path / "out")["fit_aging"]["properties"]
+    assert one["lack_of_fit_p"] < 1e-6
+    pipeline.single("report", tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert '<span class="badge above_scatter">The law does not fit<' in page
+    assert "does not fit (lack of fit, p = " in page

@@ -12,7 +12,7 @@ from pathlib import PurePath
 
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
@@ -42,8 +42,8 @@ from sealfit.report.notation import (
 from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
 from sealfit.report.style import WIDTH, Plot
 from sealfit.report.summary import of_properties
-from sealfit.report.summary_lines import LACKING, property_sentences, values_clause
-from sealfit.report.words import left_over, undecided, verdict, with_left_channels, without_load
+from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
+from sealfit.report.words import left_over, undecided, verdict, with_left_channels, with_symbols, without_load
 from sealfit.tables import SCHEMAS
 
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
@@ -229,9 +229,18 @@ def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
     return {
         "of_properties": True,
         "badge": "Fit: not known" if not known else "The law fits" if fits else "The law does not fit",
-        "verdict": " ".join(map(property_sentences, properties)),
+        "tone": "" if not known else "within_scatter" if fits else "above_scatter",
+        "verdict": Markup(" ").join(map(_of_property, properties)),
         "facts": [f"{one['quantity']}: {values_clause(one)}" for one in properties],
     }
+
+
+def _of_property(one: Mapping) -> Markup:
+    """Return the sentences of a property, with the equations of its laws and the energy as symbols."""
+    said = escape(property_sentences(one))
+    for law in sorted({PER_SERIES, one["law"]["form"] if one["law"] else PER_SERIES}, key=len, reverse=True):
+        said = said.replace(escape(law), with_symbols(law, formula=True))
+    return said.replace(", E ", Markup(", <i>E</i>&nbsp;"))
 
 
 def answered(
@@ -276,6 +285,7 @@ def _content(
         "of_properties": False,
         "closure": closure,
         "badge": VERDICTS[closure["verdict"] if closure else None],
+        "tone": closure["verdict"] if closure else "",
         "fit": fit_badge(closure),
         "verdict": verdict(closure, tables["shapes"], config),
         "undecided": undecided(closure, config),

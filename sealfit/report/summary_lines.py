@@ -96,11 +96,15 @@ def values_clause(one: Mapping) -> str:
     return f"{_count(one['values'], 'value')} in {_count(one['conditions'], 'condition')}; {scatter}"
 
 
+PER_SERIES = "mu_0 - a ln(1 + t/b)"
+"""The aging law of a series, in the words of an equation."""
+
+
 def property_sentences(one: Mapping) -> str:
     """Return in sentences whether the law per series fits a property, and the law for all series."""
     clause = lack_of_fit_clause(one["lack_of_fit_p"]) or "has no replicates to be judged by"
     law = f" One law for all series: {_property_law(one['law'])}." if one["law"] else ""
-    return f"{one['quantity']}: the law mu_0 - a ln(1 + t/b), series by series, {clause}.{law}"
+    return f"{one['quantity']}: the law {PER_SERIES}, series by series, {clause}.{law}"
 
 
 def _property_law(law: Mapping) -> str:
