@@ -151,4 +151,4 @@ def test_the_page_says_at_its_top_that_a_law_does_not_fit(tmp_path):
     pipeline.single("report", tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert '<span class="badge above_scatter">The law does not fit<' in page
-    assert "does not fit (lack of fit, p = " in page
+    assert "does not fit (lack of fit, p &lt; 0.001): do not rely" in page

@@ -131,7 +131,8 @@ def lack_of_fit_clause(p: float | None) -> str:
     if p is None or p != p:
         return ""
     if p < LACKING:
-        return f"does not fit (lack of fit, p = {p:.2g}): do not rely on it between or beyond the tests"
+        shown = f"p = {p:.2g}" if p >= 0.001 else "p < 0.001"
+        return f"does not fit (lack of fit, {shown}): do not rely on it between or beyond the tests"
     return f"fits within the scatter of replicates (lack of fit, p = {p:.2g})"
 
 
