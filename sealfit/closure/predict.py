@@ -26,7 +26,8 @@ from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import LEVELS, POWER, point_rows, sliding_power
 from sealfit.fit.joint.whitening import Component, Scatter
 from sealfit.ingest.cells import OVERLOAD
-from sealfit.ingest.columns import add_keys
+from sealfit.ingest.columns import add_keys, condition_columns
+from sealfit.ingest.derived_columns import with_day_0
 from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # Relative tolerance of the tested range.
@@ -92,7 +93,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
 def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -> pd.DataFrame:
     """Return the points with every column that the model reads: given, derived, or the only tested value."""
     ranges = model["ranges"]
-    table = _with_derived(points.assign(file=""), model)
+    table = _with_derived(_with_unaged(points, config).assign(file=""), model)
     needed = [*config.condition, *([] if not config.rubber else config.rubber)]
     if any(form != "constant" for form in after.declared.stribeck.values()) or "speed_mm_s" in points:
         needed.append("speed_mm_s")
@@ -121,6 +122,13 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
     if "speed_mm_s" not in table:
         table["speed_mm_s"] = ranges["speed_mm_s"][0]
     return table
+
+
+def _with_unaged(points: pd.DataFrame, config: Config) -> pd.DataFrame:
+    """Return the points with the days of unaged rubber as 0, where a word says so, as in a runs table."""
+    cells = points.astype(object).where(points.notna(), None)
+    columns = with_day_0({name: cells[name].tolist() for name in cells}, config)
+    return points.assign(**{name: columns[name] for name in condition_columns(config) if name in columns})
 
 
 def _with_derived(table: pd.DataFrame, model: dict) -> pd.DataFrame:

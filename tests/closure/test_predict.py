@@ -29,3 +29,15 @@ def test_a_point_with_an_infinite_number_has_no_answer():
             answer = predict(model, points.assign(**{name: value}))
             assert answer["force_after_N"].isna().all()
             assert answer["note"].str.contains(f"{name} must be a").all()
+
+
+def test_unaged_rubber_may_be_named_as_in_a_runs_table():
+    bins = make_bins(bins=6)
+    model = close_loop(bins, make_traces(bins), Config()).model
+    points = bins[bins["aging_days"] == 0].head(2)
+    answer = predict(model, points)
+    assert np.isfinite(answer["force_after_N"]).all()
+    for word in ("unaged", "Fresh"):
+        other = predict(model, points.assign(aging_days=word, temperature_C="RT", compression_ratio_pct=None))
+        assert other["force_after_N"].tolist() == answer["force_after_N"].tolist()
+        assert (other["aging_days"] == word).all()
