@@ -15,6 +15,10 @@ FREE_DF = 4
 FINE_DF = 9
 # Number of units from which the finer shape is tested.
 FINE_UNITS = 50
+# Fewest units on either side of a step in time. With fewer, outliers would do.
+LEAST_BESIDE_STEP = 4
+# Largest number of places at which a step is tested.
+MOST_STEPS = 40
 # Share of strokes that end before the friction is steady from which effects along strokes are not searched.
 # In 68 worlds drawn at random with strokes of three to five bristle lengths no effect along the strokes was
 # found except ripples, and in eight one was invented or the verdict was `unexplained`.

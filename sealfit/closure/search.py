@@ -19,6 +19,7 @@ from sealfit.closure.channels import (
     run_means,
     scatter_level,
     shifted_from_zero,
+    steps,
     unit_of,
     without_trends,
 )
@@ -79,13 +80,14 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
     specimens = rows.groups.starts["specimen"].size
     few_units = channel.numeric and channel.unit == "specimen" and specimens < JACKKNIFE_UNITS
     shapes = free_columns(channel, FEW_DF if few_units else FREE_DF)
-    widths = (1, shapes.shape[1]) if channel.numeric else (shapes.shape[1],)
-    yield from _shape_candidates(tests, channel, shapes, TARGETS, widths)
+    parts = [slice(0, 1), slice(None)] if channel.numeric and shapes.shape[1] > 1 else [slice(None)]
+    yield from _shape_candidates(tests, channel, shapes, TARGETS, parts)
     if (own := without_trends(channel, rows)) is not None:
-        yield from _shape_candidates(tests, own, free_columns(own, FREE_DF), TARGETS, widths)
+        yield from _shape_candidates(tests, own, free_columns(own, FREE_DF), TARGETS, parts)
     if few_units:
-        for kink in kinks(channel).T:
-            yield from _shape_candidates(tests, channel, kink[:, None], MAIN_TARGETS)
+        yield from _each_column(tests, channel, kinks(channel))
+    if channel.name == "elapsed_h":
+        yield from _each_column(tests, channel, steps(channel, rows))
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
     if channel.numeric and units >= FINE_UNITS and np.unique(channel.values).size > 2 * FINE_DF:
         yield from _shape_candidates(tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
@@ -96,14 +98,21 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
         yield from channel_candidates(tests, means)
 
 
+def _each_column(tests: ScoreTests, channel: Channel, shapes: np.ndarray) -> Iterator[Candidate]:
+    """Yield candidates of every single column of a channel on the main targets."""
+    if shapes.shape[1]:
+        parts = [slice(k, k + 1) for k in range(shapes.shape[1])]
+        yield from _shape_candidates(tests, channel, shapes, MAIN_TARGETS, parts)
+
+
 def _shape_candidates(
     tests: ScoreTests,
     channel: Channel,
     shapes: np.ndarray,
     targets: Sequence[tuple[str, str]],
-    widths: Sequence[int] = (),
+    parts: Sequence[slice] = (slice(None),),
 ) -> Iterator[Candidate]:
-    """Yield candidates of a channel's columns on every target, one for each number of columns in `widths`."""
+    """Yield candidates of a channel's columns on every target, one for each part of the columns."""
     fitted, rows = tests.fitted, tests.fitted.rows
     if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
         return  # with few speeds a dependence on speed may be the Stribeck curve
@@ -124,6 +133,7 @@ def _shape_candidates(
         if number % together == 0:
             variants = tests.variants(np.column_stack(slopes[number : number + together]), channel.unit)
         first = number % together * own.shape[1]
+        left = [v[:, first : first + own.shape[1]] for v in variants]
         unit = channel.unit
         names = (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
@@ -133,11 +143,10 @@ def _shape_candidates(
             unit = min(unit, _direction_unit(rows), key=FINER.get)
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
-        for width in dict.fromkeys(widths or (own.shape[1],)):
-            parts = [v[:, first : first + width] for v in variants]
-            test_result = tests(parts, between, level, (acts_on, operation))
+        for part in parts:
+            test_result = tests([v[:, part] for v in left], between, level, (acts_on, operation))
             if test_result is not None:
-                yield Candidate(names, acts_on, operation, level, own[:, :width], test_result)
+                yield Candidate(names, acts_on, operation, level, own[:, part], test_result)
 
 
 def _direction_unit(rows: Rows) -> str:

@@ -303,10 +303,29 @@ def test_a_short_part_of_the_campaign_is_found_by_the_finer_shape():
     four = (50.0, 60.0, 70.0, 80.0)
     bins = make_bins(bins=4, setup=0.005, temperatures=four, run_channels=WEEK, effect=hours_off)
     rows = make_rows(bins, has_aging=True)
-    best = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))[0]
-    assert best.channels == ("elapsed_h",)
-    assert best.p_value < 0.001
-    assert best.columns.shape[1] > 6
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    assert found[0].channels == ("elapsed_h",)
+    finer = next(c for c in found if c.columns.shape[1] > 6)
+    assert finer.channels == ("elapsed_h",)
+    assert finer.p_value < 0.001
+    assert finer.chi2 > 1.5 * max(c.chi2 for c in found if c.columns.shape[1] == 1)
+
+
+def test_a_step_in_time_is_found_in_a_few_files_that_repeat_well():
+    """A spline of four columns does not follow a step, and what it leaves hides it in 20 files."""
+
+    def recalibrated(table, force):
+        return force * np.where(table["elapsed_h"] > 30.0, 0.98, 1.0)
+
+    bins = make_bins(
+        bins=8, temperatures=(60.0,), days=(8.0,), speeds=np.geomspace(1.0, 60.0, 10), repeats=1,
+        gain=0.001, noise_N=0.03, run_channels=WEEK, effect=recalibrated,
+    )  # fmt: skip
+    rows = make_rows(bins, has_aging=True)
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    assert found[0].channels == ("elapsed_h",)
+    assert found[0].p_value < 1e-6
+    assert min(c.p_value for c in found if c.columns.shape[1] > 1) > 0.005
 
 
 def test_a_speed_effect_shows_where_sigma_2_could_take_it_up_only_below_zero():
