@@ -1,24 +1,27 @@
-"""Forged results: every key of closure.json and model.json is changed, and their checksums are made again.
+"""Forged results: closure.json, model.json and the tables are changed, and their checksums are made again.
 
-Somebody who sends results can make their checksums right. So every value is deleted or replaced: by another
-type, by a number that is not finite or far too large, a list of another length, a matrix of another size, an
-unknown word. Each command that reads the document then answers, or says in one line that sealfit did not
-write it; none ends in a traceback.
-
-    forged(work, seed, step)        # step: every so many of the forgeries, of some 10,000
+Somebody who sends results can make their checksums right. So every value of the documents is deleted or
+replaced: by another type, by a number that is not finite or far too large, a list of another length, a matrix
+of another size, an unknown word.
+    forged(work, seed, step)            # step: every so many of the forgeries, of some 10,000
+    forged_tables(work, seed, step)     # of some 1,500
 """
 
 from __future__ import annotations
 
 import copy
 import hashlib
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 from fuzzing import Folder, Found, TooSlow, results_folder
 
 READERS = {"closure": ("predict", "lifetime", "effects", "report", "run"), "model": ("predict",)}
+TABLE_READERS = ("predict", "lifetime", "report")
 DELETED = object()
 OTHERS = (
     None, True, -1, 0, 7, 2**70, 10**400, 0.5, 1e308, float("nan"), float("inf"), "", "x", "a b, c", "\ud800",
@@ -75,15 +78,15 @@ def forgeries(document: dict) -> Iterator[tuple[str, object]]:
             yield f"{'.'.join(map(str, at))} {how}", forgery
 
 
-def put(folder: Folder, name: str, document: object) -> None:
-    """Write a document into OUT, with its size and checksum in state.json."""
-    raw = json.dumps(document).encode()
-    (folder.out / f"{name}.json").write_bytes(raw)
+def put(folder: Folder, name: str, raw: bytes) -> None:
+    """Write a file into OUT, with its size and checksum in state.json."""
+    (folder.out / name).write_bytes(raw)
     state = json.loads(folder.files["state.json"])
     del state["steps"]["report"]  # which is drawn again
-    done = state["steps"]["close-loop"]
-    done["files"][f"{name}.json"] = len(raw)
-    done["checksums"][f"{name}.json"] = hashlib.sha256(raw).hexdigest()
+    for done in state["steps"].values():
+        if name in done["files"]:
+            done["files"][name] = len(raw)
+            done["checksums"][name] = hashlib.sha256(raw).hexdigest()
     (folder.out / "state.json").write_text(json.dumps(state))
 
 
@@ -93,9 +96,37 @@ def forged(work: Path, seed: int, step: int = 1) -> list[Found]:
     for name, readers in READERS.items():
         document = json.loads(folder.files[f"{name}.json"])
         for what, forgery in list(forgeries(document))[seed % step :: step]:
-            put(folder, name, forgery)
+            put(folder, f"{name}.json", json.dumps(forgery).encode())
             found += [Found(f"forged {name}.json", what, *_asked(folder, reader)) for reader in readers]
     folder.restore()
+    return found
+
+
+def changed_tables(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
+    """Yield what was changed, and the changed table."""
+    rows = table.num_rows
+    for at, field in enumerate(table.schema):
+        yield f"{field.name} deleted", table.remove_column(at)
+        for what, column in {"text": pa.array(["x"] * rows), "flags": pa.array([True] * rows)}.items():
+            if column.type != field.type:
+                own = field.with_type(column.type)
+                yield f"{field.name} {what}", table.set_column(at, own, column)
+    yield "no metadata", table.replace_schema_metadata(None)
+    yield "another table's name", table.replace_schema_metadata({"sealfit": '{"table": "no"}'})
+
+
+def forged_tables(work: Path, seed: int, step: int = 1) -> list[Found]:
+    """Return what every reader says of every `step`-th forgery of all tables."""
+    folder, found, forgeries = results_folder(work, seed), [], []
+    for name, raw in folder.files.items():
+        if ".parquet" in name:
+            forgeries += [(name, *one) for one in changed_tables(pq.read_table(io.BytesIO(raw)))]
+    for name, what, table in forgeries[seed % step :: step]:
+        raw = io.BytesIO()
+        pq.write_table(table, raw)
+        put(folder, name, raw.getvalue())
+        found += [Found(f"forged {name}", what, *_asked(folder, reader)) for reader in TABLE_READERS]
+        folder.restore()
     return found
 
 

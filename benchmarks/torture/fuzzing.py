@@ -520,10 +520,10 @@ INPUTS = ("trace", "runs.csv", "config", "points", "values", "xlsx", "tdms", "ma
 
 def _part(job: tuple) -> list[Found]:
     name, *rest = job
-    if name == "forged":
-        from forged import forged
+    if name.startswith("forged"):
+        import forged
 
-        return forged(*rest)
+        return getattr(forged, name)(*rest)
     if name == "crafted":
         return crafted(*rest)
     return fuzzed_results(*rest) if name == "results" else fuzzed_input(name, *rest)
@@ -560,6 +560,7 @@ def main() -> int:
         parts = asked.jobs  # each makes results of its own
         jobs = [("results", work, asked.seed, asked.results, (i, parts), asked.heal) for i in range(parts)]
         jobs += [("crafted", work, asked.seed), ("forged", work, asked.seed, asked.step)]
+        jobs += [("forged_tables", work, asked.seed, asked.step)]
         jobs += ((name, work, asked.inputs, asked.seed) for name in INPUTS)
         with ProcessPoolExecutor(asked.jobs, mp_context=get_context("fork")) as pool:
             found = [one for part in pool.map(_part, jobs) for one in part]

@@ -14,8 +14,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sealfit import __version__
+from sealfit.config import AGING_CONDITION
 from sealfit.errors import OutError
-from sealfit.tables import TEXT, Column, Schema
+from sealfit.tables import SCHEMAS, TEXT, Column, Schema
 from sealfit.units import Units
 
 CHANNEL = "channel of the campaign"
@@ -152,16 +153,27 @@ def read(
         try:
             # A tenth of what read_table takes for a small file.
             with pq.ParquetFile(one, read_dictionary=list(coded), page_checksum_verification=True) as file:
+                _check_schema(file.schema_arrow)
                 part = file.read(columns=columns)
             for name, values in (where or {}).items():
                 part = part.filter(pc.is_in(part[name], pa.array(values, TEXT)))
         except MemoryError:  # Arrow's own is an ArrowException, too
             raise
-        except (OSError, KeyError, pa.ArrowException) as error:
+        except (OSError, KeyError, ValueError, pa.ArrowException) as error:
             fix = "Make all results again: sealfit run CAMPAIGN --out OUT --force"
             raise OutError("is missing or damaged.", file=one, fix=fix) from error
         parts.append(part)
     return pa.concat_tables(parts).to_pandas(self_destruct=True)
+
+
+def _check_schema(found: pa.Schema) -> None:
+    """Raise KeyError or ValueError for a table that has not the columns and types of its schema."""
+    schema = SCHEMAS[json.loads((found.metadata or {})[b"sealfit"])["table"]]
+    numbers = [Column(name, CHANNEL) for name in AGING_CONDITION if name in found.names]
+    for column in (*schema.columns, *numbers):
+        dtype = spelled_out(found).field(column.name).type
+        if column.dtype not in (None, dtype):
+            raise ValueError(f"column {column.name} has the type {dtype}")
 
 
 def _array(values: pd.Series | np.ndarray | pa.Array, column: Column, table: str) -> pa.Array:

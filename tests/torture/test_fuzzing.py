@@ -2,7 +2,7 @@
 
 import fuzzing
 import pytest
-from forged import forged
+from forged import forged, forged_tables
 from fuzzing import BAD, INPUTS, crafted, drawn, fuzzed_input, fuzzed_results, limited
 
 
@@ -63,4 +63,10 @@ def test_no_python_is_run_from_crafted_results(tmp_path):
 def test_forged_results_with_right_checksums_end_in_an_answer_or_a_line(tmp_path):
     found = forged(tmp_path, 1, 150)
     assert len(found) > 60
+    assert {"read", "refused"} == {one.verdict for one in found}
+
+
+def test_forged_tables_with_right_checksums_end_in_an_answer_or_a_line(tmp_path):
+    found = forged_tables(tmp_path, 1, 150)
+    assert len(found) > 20
     assert {"read", "refused"} == {one.verdict for one in found}
