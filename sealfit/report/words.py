@@ -197,13 +197,14 @@ def with_symbols(text: object, *, formula: bool = False) -> Markup:
     --------
     >>> str(with_symbols("a mu_0 > 0"))
     'a <i>μ</i><sub>0</sub> &gt; 0'
-    >>> str(with_symbols("A exp(-s / s_0)", formula=True))
-    '<i>A</i> exp(-<i>s</i> / <i>s</i><sub>0</sub>)'
+    >>> str(with_symbols("A exp(-s / s_0) + t^2", formula=True))
+    '<i>A</i> exp(-<i>s</i> / <i>s</i><sub>0</sub>) + <i>t</i><sup>2</sup>'
     """
     words = re.split(r"(\w+)", str(text))
     named = ("_" in word or word in GREEK or (formula and len(word) == 1) for word in words)
     pairs = zip(words, named, strict=True)
-    return Markup("").join(symbol_html(word) if symbol else escape(word) for word, symbol in pairs)
+    html = Markup("").join(symbol_html(word) if symbol else escape(word) for word, symbol in pairs)
+    return Markup(re.sub(r"\^(<i>\w</i>|\d+)", r"<sup>\1</sup>", str(html))) if formula else html
 
 
 def acts(effect: Mapping, config: Config) -> Markup:
