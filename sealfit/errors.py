@@ -304,7 +304,7 @@ class WorkerError(SealfitError):
 
 _NO_MEMORY = (
     "failed to map segment from shared object", "annot allocate memory", "can't start new thread",
-    "Failed to launch worker thread",
+    "Failed to launch worker thread", "returned NULL without setting an exception",
 )  # fmt: skip
 MEMORY = "memory ran out; what was complete before is kept."
 MORE_MEMORY = "Use fewer workers (--workers 1), or a computer with more memory."
@@ -314,7 +314,8 @@ def memory_ran_out(error: BaseException) -> bool:
     """Whether an error, or one that led to it, says that the system had no memory left.
 
     Libraries say so in several ways: a shared object that cannot be mapped is an ImportError, a mapped file
-    an OSError, a thread a RuntimeError, or an exception of Arrow's own.
+    an OSError, a thread a RuntimeError, or an exception of Arrow's own; a module in C that is loaded and
+    gives up is a SystemError.
 
     Examples
     --------
@@ -326,7 +327,7 @@ def memory_ran_out(error: BaseException) -> bool:
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
     arrows = type(error).__module__ == "pyarrow.lib"
-    said_by_library = arrows or isinstance(error, ImportError | OSError | RuntimeError)
+    said_by_library = arrows or isinstance(error, ImportError | OSError | RuntimeError | SystemError)
     if said_by_library and any(sign in str(error) for sign in _NO_MEMORY):
         return True
     before = error.__cause__ or error.__context__

@@ -239,6 +239,7 @@ def test_a_bug_under_json_leaves_one_object(sealfit, monkeypatch, arguments, at)
         OSError(errno.ENOMEM, "Cannot allocate memory"),
         RuntimeError("can't start new thread"),
         ImportError("a.so: failed to map segment from shared object"),
+        SystemError("<function _find_and_load at 0x7f> returned NULL without setting an exception"),
         pa.ArrowException("Unknown error: Failed to launch worker thread: Resource temporarily unavailable"),
     ],
 )

@@ -232,11 +232,11 @@ def test_a_death_of_the_server_that_starts_workers_is_a_clear_error(tmp_path):
 
 NO_ROOM = """
 import resource
-from sealfit.engine import BUFFERS, claim_memory, one_thread
+from sealfit.engine import LEAST_MEMORY, claim_memory, one_thread
 one_thread()
 import scipy.linalg
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (used + BUFFERS // 2, used + BUFFERS // 2))
+resource.setrlimit(resource.RLIMIT_AS, (used + LEAST_MEMORY // 2, used + LEAST_MEMORY // 2))
 try:
     claim_memory()
 except MemoryError:

@@ -18,20 +18,25 @@ def one_thread() -> None:
         os.environ.setdefault(name, "1")
 
 
-BUFFERS = 256 << 20  # bytes; OpenBLAS takes 32 MB for numpy and for scipy each, and more where it has threads
+# Bytes of address space that a run of a small campaign takes once the libraries are loaded. With less,
+# libraries in C would end the process with messages of their own.
+LEAST_MEMORY = 512 << 20
 
 
 def claim_memory() -> None:
-    """Let linear algebra take its buffers now; MemoryError if there is no room for them.
+    """Let linear algebra take its buffers and Arrow its thread now; MemoryError if there is no room.
 
-    OpenBLAS takes a buffer at its first product. If there is none, it tries again for ever.
+    OpenBLAS takes a buffer at its first product. If there is none, it tries again for ever. Arrow starts a
+    thread when it reads its first text, and aborts the process if it cannot.
     """
-    try:
-        mmap.mmap(-1, BUFFERS).close()
-    except OSError as error:
-        raise MemoryError("no room for the buffers of linear algebra") from error
     import numpy as np
+    from pyarrow import BufferReader, csv
     from scipy.linalg import solve_triangular
 
+    try:
+        mmap.mmap(-1, LEAST_MEMORY).close()
+    except OSError as error:
+        raise MemoryError("less than a small campaign needs") from error
+    csv.read_csv(BufferReader(b"x\n1\n"), csv.ReadOptions(use_threads=False))
     one = np.eye(64)
     solve_triangular(one @ one, one)
