@@ -304,7 +304,7 @@ class WorkerError(SealfitError):
 
 _NO_MEMORY = (
     "failed to map segment from shared object", "annot allocate memory", "can't start new thread",
-    "Failed to launch worker thread", "returned NULL without setting an exception",
+    "Failed to launch worker thread", "without setting an exception", "without exception set",
 )  # fmt: skip
 MEMORY = "memory ran out; what was complete before is kept."
 MORE_MEMORY = "Use fewer workers (--workers 1), or a computer with more memory."

@@ -18,9 +18,9 @@ def one_thread() -> None:
         os.environ.setdefault(name, "1")
 
 
-# Bytes of address space that a run of a small campaign takes once the libraries are loaded. With less,
-# libraries in C would end the process with messages of their own.
-LEAST_MEMORY = 512 << 20
+# Bytes of address space that a run of a small campaign takes. With less, libraries in C would end the process
+# with messages of their own, or wait for memory for ever.
+LEAST_MEMORY = 640 << 20
 
 
 def claim_memory() -> None:
@@ -29,14 +29,14 @@ def claim_memory() -> None:
     OpenBLAS takes a buffer at its first product. If there is none, it tries again for ever. Arrow starts a
     thread when it reads its first text, and aborts the process if it cannot.
     """
-    import numpy as np
-    from pyarrow import BufferReader, csv
-    from scipy.linalg import solve_triangular
-
     try:
         mmap.mmap(-1, LEAST_MEMORY).close()
     except OSError as error:
         raise MemoryError("less than a small campaign needs") from error
+    import numpy as np
+    from pyarrow import BufferReader, csv
+    from scipy.linalg import solve_triangular
+
     csv.read_csv(BufferReader(b"x\n1\n"), csv.ReadOptions(use_threads=False))
     one = np.eye(64)
     solve_triangular(one @ one, one)
