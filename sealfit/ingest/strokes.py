@@ -267,7 +267,7 @@ def _flat_parts(
     found = []
     if len(off) >= FEWEST_SAMPLES and max(map(abs, ends)) <= 0.5 * tolerance:
         first, after = (int(np.argmax(np.sign(end[0]) * end <= SAME_SPEED)) for end in (off, off[::-1]))
-        found = [slice(rows.start + first, rows.stop - after)]
+        found = [slice(rows.start + first, rows.stop - after)] if first + after < len(off) else []
     before, behind = (
         _flat_parts(speed, step_mm, part, least_mm, settings)
         for part in (slice(within.start, here.start), slice(here.stop, within.stop))

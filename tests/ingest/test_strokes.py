@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from sealfit.config import Strokes
 from sealfit.ingest.presliding import Start, rise_of
-from sealfit.ingest.strokes import displacement_noise_mm, find_strokes, turning_rows
+from sealfit.ingest.strokes import displacement_noise_mm, find_strokes, steady_speeds, turning_rows
 from sealfit.ingest.window import slope
 
 
@@ -333,3 +333,13 @@ def test_a_stroke_hardly_longer_than_its_rise_keeps_its_plateau():
     # a margin.
     assert 0.1 < x[found.rows[0]] < 0.147
     assert found.rows[-1] == 198
+
+
+def test_a_noisy_speed_of_a_few_samples_gives_no_empty_window():
+    rng = np.random.default_rng(906)
+    samples = int(rng.integers(12, 60))
+    speed = np.repeat(rng.uniform(0.5, 5, 3), 20)[:samples] * (1 + 0.02 * rng.normal(size=samples))
+    place = np.cumsum(speed) / 10 + 0.003 * rng.normal(size=samples)
+    parts = steady_speeds(np.arange(samples) / 10, place, 0.003, Strokes())
+    assert all(rows.stop > rows.start for rows, _ in parts)
+    assert [parts[0][0].start, parts[-1][0].stop] == [0, samples]
