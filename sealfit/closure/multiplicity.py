@@ -153,7 +153,8 @@ def _least_small_sample(
     """Return the smallest log p-value of all small-sample tests of one level in each of many draws."""
     drawn = units.draws(draws, rng)
     return np.min(
-        [small_sample_test.log_p_of(drawn[test.target], test.basis, test.known) for test in tests], axis=0
+        [small_sample_test.log_p_of(drawn[test.target], test.basis, test.known, test.d) for test in tests],
+        axis=0,
     )
 
 

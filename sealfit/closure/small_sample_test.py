@@ -296,6 +296,11 @@ class SmallSampleTest(NamedTuple):
     level: str = "specimen"  # of the units
 
     @property
+    def d(self) -> int:
+        """Number of independent numbers."""
+        return self.error_df + self.basis.shape[1]
+
+    @property
     def enough_df(self) -> bool:
         """Whether there are enough residual degrees of freedom between units."""
         return self.error_df >= (LEAST_ERROR_DF if self.level == "specimen" else LEAST_ERROR_DF_OF_RUNS)
@@ -412,7 +417,8 @@ class ClusterTests:
 
         def covariance(one: Numbers, other: Numbers) -> np.ndarray:
             shared = np.diag(groups.sums(one.direction * other.direction, self.level))
-            return one.root @ (shared - one.taken @ other.taken.toarray().T) @ other.root.T
+            half = one.root @ (shared - one.taken @ other.taken.toarray().T)
+            return (other.root @ half.T).T  # a `Root` multiplies from the left only
 
         blocks = [[covariance(one, other) for other in known] for one in known]
         size, axes = np.linalg.eigh(np.block(blocks))

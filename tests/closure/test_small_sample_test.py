@@ -3,6 +3,7 @@ import pytest
 from bins_helpers import make_bins
 from scipy import stats
 
+from sealfit.closure import small_sample_test
 from sealfit.closure.channels import find_channels
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
@@ -41,6 +42,19 @@ def test_draws_have_the_covariance_of_the_numbers():
     assert np.cov(drawn[mu].T) == pytest.approx(np.eye(d), abs=0.05)
     between = np.corrcoef(drawn[mu].T, drawn[force].T)[:d, d:]
     assert np.abs(between).max() > 0.8  # both scale the friction of a specimen
+
+
+def test_draws_of_many_units_have_the_covariance_of_the_numbers(monkeypatch):
+    monkeypatch.setattr(small_sample_test, "MANY", 5)
+    units = ClusterTests(fit_declared(rows_of(specimen=0.05)))
+    mu = ("mu", "multiply")
+    numbers = units.numbers(mu)
+    assert isinstance(numbers.root, Root)
+    units.numbers(("force", "multiply"))
+    covariance = np.cov(units.draws(20_000, np.random.default_rng(0))[mu].T)
+    size = np.linalg.eigvalsh(covariance)[::-1]
+    assert size[: numbers.df] == pytest.approx(np.ones(numbers.df), abs=0.08)
+    assert np.abs(size[numbers.df :]).max(initial=0.0) < 1e-9
 
 
 def test_many_units_are_made_independent_as_few_are():
