@@ -14,6 +14,9 @@ from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.rows import make_rows, thin
 from sealfit.ingest.stored_parts import StoredTraces, a_part_at_a_time
+from sealfit.store import parquet
+from sealfit.tables import TRACES
+from sealfit.units import Units
 
 
 def stored(traces: pd.DataFrame, folder, files: list[list[str]]) -> list[StoredTraces]:
@@ -21,7 +24,9 @@ def stored(traces: pd.DataFrame, folder, files: list[list[str]]) -> list[StoredT
     paths = []
     for number, own in enumerate(files):
         paths.append(folder / f"{number}.parquet")
-        traces[traces["file"].isin(own)].to_parquet(paths[-1])
+        part = traces[traces["file"].isin(own)]
+        absent = {name: None for name in TRACES.names() if name not in part}
+        parquet.write(part.assign(**absent), TRACES, Units(), paths[-1])
     return [StoredTraces(frozenset("a"), tuple(paths[:1])), StoredTraces(frozenset("b"), tuple(paths[1:]))]
 
 

@@ -151,11 +151,12 @@ def _least_small_sample(
     units: ClusterTests, tests: Sequence[SmallSampleTest], rng: np.random.Generator, draws: int
 ) -> np.ndarray:
     """Return the smallest log p-value of all small-sample tests of one level in each of many draws."""
-    drawn = units.draws(draws, rng)
-    return np.min(
-        [small_sample_test.log_p_of(drawn[test.target], test.basis, test.known, test.d) for test in tests],
-        axis=0,
-    )
+    drawn, least = units.draws(draws, rng), np.zeros(draws)
+    for test in tests:
+        d = test.error_df + test.basis.shape[1]
+        own = small_sample_test.log_p_of(drawn[test.target], test.basis, test.known, d)
+        least = np.minimum(least, own)
+    return least
 
 
 def adjust_slopes(results: Sequence[ScoreTestResult]) -> np.ndarray:

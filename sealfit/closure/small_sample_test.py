@@ -296,11 +296,6 @@ class SmallSampleTest(NamedTuple):
     level: str = "specimen"  # of the units
 
     @property
-    def d(self) -> int:
-        """Number of independent numbers."""
-        return self.error_df + self.basis.shape[1]
-
-    @property
     def enough_df(self) -> bool:
         """Whether there are enough residual degrees of freedom between units."""
         return self.error_df >= (LEAST_ERROR_DF if self.level == "specimen" else LEAST_ERROR_DF_OF_RUNS)
