@@ -126,9 +126,9 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
 
 def _with_unaged(points: pd.DataFrame, config: Config) -> pd.DataFrame:
     """Return the points with the days of unaged rubber as 0, where a word says so, as in a runs table."""
-    cells = points.astype(object).where(points.notna(), None)
-    columns = with_day_0({name: cells[name].tolist() for name in cells}, config)
-    return points.assign(**{name: columns[name] for name in condition_columns(config) if name in columns})
+    own = points[[name for name in condition_columns(config) if name in points]]
+    cells = own.astype(object).where(own.notna(), None)
+    return points.assign(**with_day_0({name: cells[name].tolist() for name in cells}, config))
 
 
 def _with_derived(table: pd.DataFrame, model: dict) -> pd.DataFrame:
