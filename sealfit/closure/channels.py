@@ -329,10 +329,9 @@ def steps(channel: Channel, rows: Rows) -> np.ndarray:
     """
     start = rows.groups.starts[flip_level(channel.unit, rows)]
     values = np.sort(channel.values[start])
-    before, after = values[:-1], values[1:]
-    inner = np.arange(1, values.size)
-    inner = (inner >= LEAST_BESIDE_STEP) & (values.size - inner >= LEAST_BESIDE_STEP) & (after > before)
-    places = ((before + after) / 2)[inner]
+    inner = slice(LEAST_BESIDE_STEP - 1, max(values.size - LEAST_BESIDE_STEP, 0))
+    before, after = values[:-1][inner], values[1:][inner]
+    places = ((before + after) / 2)[after > before]
     if places.size > MOST_STEPS:
         places = places[np.linspace(0, places.size - 1, MOST_STEPS).round().astype(int)]
     columns = (channel.values[:, None] > places).astype(float)
