@@ -2,7 +2,9 @@
 
 Somebody who sends results can make their checksums right. So every value of the documents is deleted or
 replaced: by another type, by a number that is not finite or far too large, a list of another length, a matrix
-of another size, an unknown word.
+of another size, an unknown word. Of every table each column is deleted or has another type. Each command
+that reads it then answers, or says in one line that sealfit did not write it; none ends in a traceback.
+
     forged(work, seed, step)            # step: every so many of the forgeries, of some 10,000
     forged_tables(work, seed, step)     # of some 1,500
 """
