@@ -554,11 +554,9 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str
 def _given(fault: Mapping) -> str:
     """Return the value that a type or a range refuses, to stand before the reason; our reasons have it."""
     own = fault["type"] in ("value_error", "assertion_error", "missing")
-    return (
-        ""
-        if own or not isinstance(fault["input"], str | int | float)
-        else f"{shortened(repr(fault['input']))}: "
-    )
+    if own or not isinstance(fault["input"], str | int | float):
+        return ""
+    return f"{shortened(repr(fault['input']))}: "
 
 
 def line_of(error: ValidationError, text: str) -> int | None:
