@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.testing as npt
 import pytest
-from bins_helpers import make_bins, make_traces
+from bins_helpers import TWO_FOLDS, make_bins, make_traces
 from scipy import stats
 
 from sealfit.closure.channels import find_channels, level_values, scatter_level, settings, unit_of
@@ -17,7 +17,6 @@ from sealfit.closure.small_sample_test import (
     slope_log_p,
     specimens_agree,
 )
-from sealfit.config import Config
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 
@@ -195,7 +194,7 @@ def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():
         return force * (1 + 0.03 * (table["displacement_mm"].to_numpy() - 20) / 40)
 
     bins = make_bins(3, days=(1.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=5, bins=8, effect=slope)
-    document = close_loop(bins, make_traces(bins), Config()).document
+    document = close_loop(bins, make_traces(bins), TWO_FOLDS).document
     assert document["verdict"] == "cannot_tell"
     (candidate,) = document["effects"]
     assert candidate["candidate"]

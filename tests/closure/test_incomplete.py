@@ -55,7 +55,8 @@ def ingested(campaign, tmp_path, blank):
 
 
 def closed(campaign, out):
-    made = run(campaign, out, steps=STEPS[:-1])
+    (campaign / "rig.toml").write_text("[loop]\nfolds = 2\n")
+    made = run(campaign, out, campaign / "rig.toml", steps=STEPS[:-1], workers=1)
     return made, json.loads((out / "closure.json").read_text())
 
 

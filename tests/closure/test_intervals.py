@@ -1,11 +1,10 @@
 import numpy as np
-from bins_helpers import make_bins, make_traces
+from bins_helpers import TWO_FOLDS, make_bins, make_traces
 
 from sealfit.closure.criteria import FEW_UNITS
 from sealfit.closure.errors_and_intervals import Sandwich, mean_half_width, sandwiches, t_quantile
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
-from sealfit.config import Config
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.tangent import Tangent
@@ -18,7 +17,7 @@ def width(model: dict, points) -> np.ndarray:
 
 def test_the_interval_of_the_mean_is_the_widest_of_several():
     bins = make_bins(2, bins=6, setup=0.005)
-    model = close_loop(bins, make_traces(bins), Config()).model
+    model = close_loop(bins, make_traces(bins), TWO_FOLDS).model
     points = bins.groupby("condition").head(1)
     narrow = width({**model, "sandwiches": []}, points)
     assert np.all(width(model, points) >= narrow * (1 - 1e-12))

@@ -25,8 +25,8 @@ CHANNELS = {
 SCATTER = {"setup": 0.005, "specimen": 0.01, "run_channels": CHANNELS}
 
 
-def close(bins, config=None):
-    return close_loop(bins, make_traces(bins), config or Config())
+def close(bins, config=TWO_FOLDS):
+    return close_loop(bins, make_traces(bins), config)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def null():
 @pytest.fixture(scope="module")
 def warming():
     bins = make_bins(3, temperatures=(60.0,), bins=8, effect=warm, **SCATTER)
-    return bins, close(bins)
+    return bins, close(bins, Config())
 
 
 def test_nothing_is_claimed_where_nothing_is_missing(null):
@@ -173,7 +173,7 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     bins["force_N"] += 15 * (np.exp(-((speed / (15 * slower)) ** 2)) - np.exp(-((speed / 15) ** 2)))
     # Three degrees of freedom are left: however strong, F says no more than 0.004 to 0.009 after all that is
     # searched.
-    made = close_loop(bins, make_traces(bins), Config(loop={"family_error": 0.02}))
+    made = close_loop(bins, make_traces(bins), Config(loop={"family_error": 0.02, "folds": 2}))
     document = made.document
     assert document["verdict"] == "cannot_tell"
     (effect,) = document["effects"]
@@ -266,7 +266,7 @@ def of_two_loads(**options):
 
 def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load():
     bins = of_two_loads(temperatures=(60.0,), days=(4.0,), bins=3, **SCATTER)
-    (found,) = close(bins, TWO_FOLDS).document["effects"]
+    (found,) = close(bins).document["effects"]
     assert (found["id"], found["channels"][-1]) == ("power_viscous", "speed_mm_s")
     values = {p["name"]: p["value"] for p in found["parameters"]}
     assert values["n"] == pytest.approx(2.0, abs=0.3)

@@ -1,14 +1,20 @@
 import numpy as np
-from bins_helpers import make_bins, make_traces
+import pytest
+from bins_helpers import TWO_FOLDS, make_bins, make_traces
 
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
-from sealfit.config import Config
 
 
-def test_between_three_speeds_the_force_is_not_known():
+@pytest.fixture(scope="module")
+def of_three_speeds():
+    """Bins at three speeds, and the model of them."""
     bins = make_bins(speeds=(1.0, 8.0, 64.0), bins=6)
-    model = close_loop(bins, make_traces(bins), Config()).model
+    return bins, close_loop(bins, make_traces(bins), TWO_FOLDS).model
+
+
+def test_between_three_speeds_the_force_is_not_known(of_three_speeds):
+    bins, model = of_three_speeds
     points = bins.groupby("condition").head(1).assign(speed_mm_s=8.1)
     tested = predict(model, points)
     assert not tested["extrapolated"].any()
@@ -20,9 +26,8 @@ def test_between_three_speeds_the_force_is_not_known():
     assert np.isfinite(between["force_after_N"]).all()
 
 
-def test_a_point_with_an_infinite_number_has_no_answer():
-    bins = make_bins(speeds=(1.0, 8.0, 64.0), bins=6)
-    model = close_loop(bins, make_traces(bins), Config()).model
+def test_a_point_with_an_infinite_number_has_no_answer(of_three_speeds):
+    bins, model = of_three_speeds
     points = bins.groupby("condition").head(1)
     for name in ("load_N", "speed_mm_s"):
         for value in (np.inf, 9.9e37):
@@ -33,7 +38,7 @@ def test_a_point_with_an_infinite_number_has_no_answer():
 
 def test_unaged_rubber_may_be_named_as_in_a_runs_table():
     bins = make_bins(bins=6)
-    model = close_loop(bins, make_traces(bins), Config()).model
+    model = close_loop(bins, make_traces(bins), TWO_FOLDS).model
     points = bins[bins["aging_days"] == 0].head(2)
     answer = predict(model, points)
     assert np.isfinite(answer["force_after_N"]).all()

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from bins_helpers import make_bins, make_traces
+from bins_helpers import TWO_FOLDS, make_bins, make_traces
 
 from sealfit.closure import rename_effects
 from sealfit.closure.channels import find_channels
@@ -31,7 +31,7 @@ def test_a_shape_of_no_catalogue_is_one_effect_and_not_two_bumps():
 
     bins = make_bins(5, setup=0.003, effect=sigmoid, run_channels=OIL, bins=6)
     rows = make_rows(numbered(bins), has_aging=True)
-    selection = select_effects(rows, steady_samples(make_traces(bins), rows), Context(Config(), EFFECTS))
+    selection = select_effects(rows, steady_samples(make_traces(bins), rows), Context(TWO_FOLDS, EFFECTS))
     (effect,) = selection.added
     assert effect.proposal.term.channels == ("oil_ppm",)
     assert selection.left is None
