@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drawing_helpers import only_svg
 from measured import emps_plateaus, kidney, kidney_plain, measured
 
 from sealfit.pipeline import STEPS, run
@@ -94,7 +95,8 @@ def test_emps_as_it_is(tmp_path):
     assert loop["after"]["heldout_rmse_N"] < 0.25 * loop["before"]["heldout_rmse_N"]
 
 
-def test_kidney_has_a_slope_along_the_stroke_that_follows_the_pressure(tmp_path):
+def test_kidney_has_a_slope_along_the_stroke_that_follows_the_pressure(tmp_path, monkeypatch):
+    monkeypatch.setattr("sealfit.report.drawing._saved", only_svg)
     config = kidney_plain(measured(), tmp_path / "campaign")
     run(tmp_path / "campaign", tmp_path / "out", config)
     loop = json.loads((tmp_path / "out" / "closure.json").read_text())

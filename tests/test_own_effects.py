@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from drawing_helpers import undrawn
 from user_effects import WORN_PATCH
 
 from sealfit import commands
 from sealfit.errors import ConfigError, RequestError, StaleError
 from sealfit.pipeline import run, single
-from sealfit.report.drawing import Drawn
-from sealfit.report.style import Plot
 from sealfit.simulation import load_spec, simulate
 from sealfit.store.manifest import ConfigCopy, fingerprint
 from sealfit.store.paths import own_effects_folder
@@ -32,11 +31,6 @@ kind = "white"
 sd_N = 0.2
 """
 RAN = "from pathlib import Path\nPath({mark!r}).write_text('ran')\n"
-
-
-def undrawn(plot: Plot) -> Drawn:
-    """Stand for `draw` in reports that nobody looks at."""
-    return Drawn("<svg/>", b"", b"", ("<svg/>",) * len(plot.panels))
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import pandas as pd
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
+from drawing_helpers import command
 
 from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED
 from sealfit.simulation import load_truth, true_force
@@ -49,9 +50,14 @@ KEYS = {
 TIMES = ("provenance.json", "state.json", "report.html")  # hold times of day
 
 
-def sealfit(*arguments, code=0):
+def sealfit(*arguments, code=0, drawn=False):
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     run = subprocess.run(
-        [sys.executable, "-m", "sealfit", *map(str, arguments)], capture_output=True, text=True, check=False
+        command(*arguments, drawn=drawn),
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": paths},
     )
     assert run.returncode == code, run.stderr
     return run
@@ -82,7 +88,7 @@ def campaign(tmp_path_factory):
 @pytest.fixture(scope="module")
 def first(campaign):
     out = campaign.parent / "out"
-    return out, sealfit("run", campaign, "--out", out)
+    return out, sealfit("run", campaign, "--out", out, drawn=True)
 
 
 def test_a_run_gives_every_table_with_its_schema(first):
@@ -195,10 +201,8 @@ def test_a_changed_file_is_found_and_everything_after_it_redone(first, campaign,
     assert "holds the same data" in moved.stderr
     trace = sorted((copy / "traces").iterdir())[0]
     trace.write_text(trace.read_text().replace("time_s,", "time_s,", 1) + "oops,1,1\n")
-    for command in (["fit-steady", out], ["report", out]):
-        assert (
-            f"inputs changed (traces/{trace.name}). Run: sealfit ingest" in sealfit(*command, code=1).stderr
-        )
+    for words in (["fit-steady", out], ["report", out]):
+        assert f"inputs changed (traces/{trace.name}). Run: sealfit ingest" in sealfit(*words, code=1).stderr
     run = sealfit("run", copy, "--out", out, "--json")
     assert json.loads(run.stdout)["done"] == list(STEPS)
     assert f"traces/{trace.name}:" in run.stderr

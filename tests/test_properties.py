@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from drawing_helpers import only_svg
 from typer.testing import CliRunner
 
 import sealfit
@@ -26,7 +27,7 @@ def table(tmp_path):
     return Path(shutil.copy(HARDNESS, tmp_path / "hardness.csv"))
 
 
-def test_the_simulated_hardness_comes_back(table, tmp_path):
+def test_the_simulated_hardness_comes_back(table, tmp_path, monkeypatch):
     made = pipeline.fit_properties(table, tmp_path / "out")
     (one,) = made["fit_aging"]["properties"]
     assert one["replicate_sd"] == pytest.approx(0.5, rel=0.2)
@@ -37,6 +38,7 @@ def test_the_simulated_hardness_comes_back(table, tmp_path):
     life = commands.lifetime(tmp_path / "out", TO_80)
     assert life["ci95"][0] < 168.0 < life["ci95"][1]  # as docs/how-to/properties.md says
     assert life["model"] is None
+    monkeypatch.setattr("sealfit.report.drawing._saved", only_svg)
     pipeline.single("report", tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "hardness.csv: aging report" in page
@@ -136,7 +138,7 @@ def test_json_and_the_summary_say_the_same(table, tmp_path):
     assert "there is no table of values" in str(missing.exception)
 
 
-def test_the_page_says_at_its_top_that_a_law_does_not_fit(tmp_path):
+def test_the_page_says_at_its_top_that_a_law_does_not_fit(tmp_path, monkeypatch):
     rng = np.random.default_rng(3)
     rows = [
         f"{temperature},{days},{70.0 + 6.0 * (days in (2, 8)) + rng.normal(0.0, 0.4):.3f}"
@@ -148,6 +150,7 @@ def test_the_page_says_at_its_top_that_a_law_does_not_fit(tmp_path):
     table.write_text("\n".join(["temperature_C,aging_days,hardness", *rows]) + "\n", "utf-8")
     (one,) = pipeline.fit_properties(table, tmp_path / "out")["fit_aging"]["properties"]
     assert one["lack_of_fit_p"] < 1e-6
+    monkeypatch.setattr("sealfit.report.drawing._saved", only_svg)
     pipeline.single("report", tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert '<span class="badge above_scatter">The law does not fit<' in page

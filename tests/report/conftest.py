@@ -1,9 +1,8 @@
 import pytest
+from drawing_helpers import only_svg
 from matplotlib.figure import Figure
 
 from sealfit.report import drawing
-
-SAVED = drawing._saved
 
 
 @pytest.fixture
@@ -16,11 +15,7 @@ def unsaved(monkeypatch):
 @pytest.fixture(scope="module")
 def only_panels():
     """Draw the panels, which are what the page shows, and not the plots composed of them, which OUT keeps."""
-
-    def saved(figure, form, metadata, **options):
-        return SAVED(figure, form, metadata, **options) if form == "svg" else b""
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drawing, "compose", lambda plot: Figure())
-        patch.setattr(drawing, "_saved", saved)
+        patch.setattr(drawing, "_saved", only_svg)
         yield

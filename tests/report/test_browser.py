@@ -125,7 +125,10 @@ frame.srcdoc = PAGE;
 document.body.append(frame);
 </script>"""
 
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium on PATH")
+pytestmark = [
+    pytest.mark.skipif(BROWSER is None, reason="no chromium on PATH"),
+    pytest.mark.usefixtures("only_panels"),
+]
 
 
 @pytest.mark.parametrize("make", [aging_campaign, after_campaign, torque_campaign, not_run])
