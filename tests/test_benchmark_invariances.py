@@ -186,7 +186,7 @@ SHORT = {
     [("short", "ripple"), ("there_and_back", "zero_offset"), ("zero_offset", "zero_offset")],
 )
 def test_claims_do_not_hang_on_what_does_not_matter(name, effect):
-    given = campaign(name)
+    given = campaign(name).told(loop={"folds": 2})
     changed = {change: CHANGES[change].make(given, np.random.default_rng(5)) for change in SHORT[name]}
     closures = {change: closed(made) for change, made in {"as it is": given, **changed}.items()}
     assert [found["id"] for found in closures["as it is"]["effects"]] == [effect]

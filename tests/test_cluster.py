@@ -203,11 +203,12 @@ def campaign(tmp_path_factory):
     spec = load_spec(ROOT / "sample_data" / "simulated.spec.toml")
     design = spec.design.model_copy(update={"temperatures_C": (60.0,), "days": (1.0, 4.0), "max_rows": 150})
     simulate(spec.model_copy(update={"design": design}), folder / "c")
+    (folder / "rig.toml").write_text("[loop]\nfolds = 2\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(partitions, "PART_FILES", 12)
         patch.setattr(loop, "JACKKNIFE_UNITS", 6)  # so that the folds search, few runs as there are
-        run(folder / "c", folder / "here", steps=STEPS[:-1], workers=1)
-    return folder / "c", results(folder / "here")
+        run(folder / "c", folder / "here", folder / "rig.toml", steps=STEPS[:-1], workers=1)
+    return folder / "c", folder / "rig.toml", results(folder / "here")
 
 
 OPENSSL = shutil.which("openssl")
@@ -249,10 +250,10 @@ def test_over_tls_only_who_has_the_certificate_connects(campaign, tmp_path, monk
 def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(
     campaign, tmp_path, dask, monkeypatch
 ):
-    folder, (here, _) = campaign
+    folder, rig, (here, _) = campaign
     monkeypatch.setattr(partitions, "PART_FILES", 12)
     kills = KillsAt(dask.workers[1], "reading trace files")
-    run(folder, tmp_path / "there", steps=("ingest",), scheduler=str(dask.file), progress=kills)
+    run(folder, tmp_path / "there", rig, steps=("ingest",), scheduler=str(dask.file), progress=kills)
     assert kills.killed
     there = Store.open(tmp_path / "there")
     for name in INGESTED:
@@ -262,10 +263,10 @@ def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(
 def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
     campaign, tmp_path, dask, monkeypatch
 ):
-    folder, (here, closure) = campaign
+    folder, rig, (here, closure) = campaign
     monkeypatch.setattr(partitions, "PART_FILES", 12)
     monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
     kills = KillsAt(dask.workers[1], "fold 1 of")
-    run(folder, tmp_path / "there", steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
+    run(folder, tmp_path / "there", rig, steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
     assert kills.killed
     assert_same_results(tmp_path / "there", here, closure)

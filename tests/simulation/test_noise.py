@@ -5,9 +5,14 @@ import numpy.testing as npt
 import pytest
 from simulation_helpers import ONE_CONDITION, steady
 
+CLEAN = {}
+
 
 def noisy(campaign, *kinds, **more):
-    """Campaigns without and with noise; the difference of their forces, file by file."""
+    """Campaigns without and with noise; the difference of their forces, file by file.
+
+    Campaigns without noise are kept for other tests of the same design.
+    """
     spec = {
         "design": {
             "days": (),
@@ -19,7 +24,9 @@ def noisy(campaign, *kinds, **more):
         "physics": {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0},
         **more,
     }
-    _, runs, clean = campaign("clean", **spec)
+    if str(more) not in CLEAN:
+        CLEAN[str(more)] = campaign("clean", **spec)
+    _, runs, clean = CLEAN[str(more)]
     truth, _, dirty = campaign("dirty", **spec, noise=kinds)
     return truth, runs, {file: (clean[file], dirty[file]) for file in clean}
 
