@@ -37,12 +37,13 @@ class DaskHere:
         self._log = (folder / "log.txt").open("w")
         scheduler = f"--host {protocol}://127.0.0.1 --port 0 --no-dashboard --scheduler-file"
         self.scheduler = self._start("dask_scheduler", f"{scheduler} {self.file}")
-        worker = (
+        self._worker = (
             f"--scheduler-file {self.file} --nthreads 1 --no-nanny --no-dashboard --local-directory {folder}"
         )
-        self.workers = [
-            self._start("dask_worker", f"{worker} --name worker-{number}") for number in range(workers)
-        ]
+        self.workers = [self._start_worker(number) for number in range(workers)]
+
+    def _start_worker(self, number: int) -> subprocess.Popen:
+        return self._start("dask_worker", f"{self._worker} --name worker-{number}")
 
     def _start(self, what: str, options: str) -> subprocess.Popen:
         command = [sys.executable, "-m", f"distributed.cli.{what}", *options.split()]
@@ -71,6 +72,13 @@ class DaskHere:
                     return self
             time.sleep(0.2)
         raise TimeoutError("the workers did not start")
+
+    def mend(self) -> DaskHere:
+        """Start another worker for each that has ended, and return when all are there."""
+        for number, worker in enumerate(self.workers):
+            if worker.poll() is not None:
+                self.workers[number] = self._start_worker(number)
+        return self.wait()
 
     def stop(self) -> None:
         """End all of them."""

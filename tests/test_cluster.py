@@ -39,13 +39,19 @@ def started(folder):
 
 
 @pytest.fixture(scope="module")
-def left_whole(tmp_path_factory):
-    """A cluster for tests that kill nothing of it."""
+def one_cluster(tmp_path_factory):
     yield from started(tmp_path_factory.mktemp("dask"))
 
 
 @pytest.fixture
-def dask(tmp_path):
+def dask(one_cluster):
+    """A cluster whose workers a test may kill."""
+    return one_cluster.mend()
+
+
+@pytest.fixture
+def own_cluster(tmp_path):
+    """A cluster whose scheduler a test may kill."""
     yield from started(tmp_path)
 
 
@@ -75,10 +81,10 @@ def fatal(number):
     os._exit(1)
 
 
-def test_a_map_runs_on_the_cluster_in_order(left_whole):
-    with on_cluster(str(left_whole.file)):
+def test_a_map_runs_on_the_cluster_in_order(dask):
+    with on_cluster(str(dask.file)):
         assert list(run_map(square, range(50))) == [n * n for n in range(50)]
-        pids = {worker.pid for worker in left_whole.workers}
+        pids = {worker.pid for worker in dask.workers}
         assert set(run_map(process_id, range(20), together=1)) <= pids
         with pytest.raises(RequestError, match="0 is wrong"):
             list(run_map(wrong, range(3)))
@@ -89,9 +95,9 @@ def process_id(_):
     return os.getpid()
 
 
-def test_an_answer_that_comes_as_the_wait_ends_is_taken(left_whole, monkeypatch):
+def test_an_answer_that_comes_as_the_wait_ends_is_taken(dask, monkeypatch):
     monkeypatch.setattr("sealfit.engine.run_map.LOOK_S", 0.02)
-    with on_cluster(str(left_whole.file)):
+    with on_cluster(str(dask.file)):
         assert list(run_map(answer_late, range(120), together=1)) == list(range(120))
         with pytest.raises(TimeoutError, match="too slow"):
             list(run_map(timed_out, range(2)))
@@ -105,12 +111,12 @@ def test_a_map_survives_a_killed_worker(dask):
         assert first + list(made) == [n * n for n in range(30)]
 
 
-def test_a_lost_scheduler_is_a_clear_error_wherever_it_is_missed(dask, tmp_path):
-    with on_cluster(str(dask.file)):
+def test_a_lost_scheduler_is_a_clear_error_wherever_it_is_missed(own_cluster):
+    with on_cluster(str(own_cluster.file)):
         made = run_map(slow_square, range(30), together=1)
         next(made)
-        dask.scheduler.kill()
-        dask.scheduler.wait()
+        own_cluster.scheduler.kill()
+        own_cluster.scheduler.wait()
         for missed in (lambda: list(made), lambda: list(run_map(square, range(3)))):
             with pytest.raises(
                 WorkerError, match=r"went away\. Look at the scheduler, and run the command again"
@@ -124,10 +130,10 @@ def test_work_that_kills_every_worker_is_a_clear_error(dask, monkeypatch):
         list(run_map(fatal, range(1)))
 
 
-def test_a_folder_that_workers_do_not_see_is_refused(left_whole, tmp_path):
+def test_a_folder_that_workers_do_not_see_is_refused(dask, tmp_path):
     with (
         pytest.raises(RequestError, match=r"does not see the folder.*all workers share"),
-        on_cluster(str(left_whole.file), tmp_path / "nowhere"),
+        on_cluster(str(dask.file), tmp_path / "nowhere"),
     ):
         pass
 
