@@ -1,13 +1,16 @@
 """Commands that pages of the documentation show, run in a folder that is like a clone."""
 
 import doctest
+import io
 import os
 import re
 import shlex
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+from sealfit.cli import app, exit_code
 from sealfit.simulation import load_spec, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -78,6 +81,17 @@ def run(command, folder, codes=(0,)):
     done = subprocess.run(words, cwd=folder, env=settings, capture_output=True, text=True)
     assert done.returncode in codes, f"{command}\n{done.stderr}"
     return done.stdout
+
+
+def called(command, folder, monkeypatch):
+    """Run a command of sealfit in this process, which has loaded the libraries, and return its stdout."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", shlex.split(command))
+    monkeypatch.setattr("webbrowser.open", lambda address: True)
+    with redirect_stdout(io.StringIO()) as said, redirect_stderr(io.StringIO()) as told:
+        code = exit_code(app)
+    assert code == 0, f"{command}\n{told.getvalue()}"
+    return said.getvalue()
 
 
 def ran(page, folder):

@@ -10,7 +10,20 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from page_helpers import DOCS, ROOT, as_in_a_clone, assert_as_shown, console, examples, has, plain, ran, run
+from drawing_helpers import undrawn
+from page_helpers import (
+    DOCS,
+    ROOT,
+    as_in_a_clone,
+    assert_as_shown,
+    called,
+    console,
+    examples,
+    has,
+    plain,
+    ran,
+    run,
+)
 
 from sealfit.effects.user import load_user_effects
 from sealfit.report.summary import verdict_sentence
@@ -88,7 +101,7 @@ def test_the_commands_of_the_readme_for_your_own_data_run(desk, printed):
     assert run(f"python -c {shlex.quote(code)}", desk) == ""
 
 
-def test_the_examples_of_commands_on_campaigns_run(desk, printed, tmp_path):
+def test_the_examples_of_commands_on_campaigns_run(desk, printed, tmp_path, monkeypatch):
     shutil.copy(ROOT / "sample_data" / "hardness.csv", tmp_path / "strength.csv")
     (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
     commands = [*plain(DOCS / "how-to" / "own-data.md"), *examples(of_results=False)]
@@ -96,10 +109,10 @@ def test_the_examples_of_commands_on_campaigns_run(desk, printed, tmp_path):
         if " init " in command:
             (desk / "rig.toml").unlink()
         new = command.split()[1] in ("fit-aging", "simulate")
-        assert run(command.replace("FOLDER", "my_campaign"), tmp_path if new else desk)
+        assert called(command.replace("FOLDER", "my_campaign"), tmp_path if new else desk, monkeypatch)
 
 
-def test_the_effect_of_ones_own_is_searched_and_predicted_with(desk, tmp_path):
+def test_the_effect_of_ones_own_is_searched_and_predicted_with(desk, tmp_path, monkeypatch):
     page = DOCS / "how-to" / "own-effects.md"
     (code,) = re.findall(r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
     (tmp_path / "my_effects").mkdir()
@@ -108,8 +121,9 @@ def test_the_effect_of_ones_own_is_searched_and_predicted_with(desk, tmp_path):
     shutil.copytree(desk / "my_campaign", tmp_path / "my_campaign")
     runs = pd.read_csv(desk / "my_campaign" / "runs.csv")
     runs.drop(columns="file").assign(displacement_mm=20.0).to_csv(tmp_path / "points.csv", index=False)
+    monkeypatch.setattr("sealfit.report.page.draw", undrawn)
     for command in plain(page):
-        assert run(command, tmp_path)
+        assert called(command, tmp_path, monkeypatch)
     assert pd.read_csv(tmp_path / "answers.csv")["force_after_N"].notna().all()
 
 

@@ -13,7 +13,7 @@ import numpy.testing as npt
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from page_helpers import DOCS, ROOT, assert_as_shown, examples, plain, ran, run
+from page_helpers import DOCS, ROOT, assert_as_shown, called, examples, plain, ran, run
 
 import sealfit
 from sealfit import commands
@@ -124,12 +124,12 @@ def test_the_page_about_enough_runs_prints_what_it_says(clone):
     assert_as_shown(ran(DOCS / "how-to" / "enough-runs.md", clone))
 
 
-def test_the_examples_of_commands_on_results_run(clone):
+def test_the_examples_of_commands_on_results_run(clone, monkeypatch):
     POINTS.to_csv(clone / "points.csv", index=False)
     lifetimes = [command.replace("OUT", "results") for command in plain(DOCS / "explanation" / "fits.md")]
     assert len(lifetimes) == 2
     for command in [*examples(of_results=True), *lifetimes]:
-        assert run(command, clone)
+        assert called(command, clone, monkeypatch)
 
 
 def test_the_readme_shows_what_make_demo_prints(clone):

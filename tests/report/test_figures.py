@@ -428,9 +428,9 @@ def test_powers_of_ten_are_written_out_behind_the_title_of_an_axis(values, power
     assert axes.title.get_position()[1] == 1.0
 
 
-def test_every_panel_has_a_white_edge():
-    for made in (aging_campaign(), torque_campaign()):
-        for name, plot in draw_all(made.tables, made.closure, made.config).items():
+def test_every_panel_has_a_white_edge(made):
+    for one in (made, torque_campaign()):
+        for name, plot in draw_all(one.tables, one.closure, one.config).items():
             assert edge(white_of(compose(plot))).all(), name
             for panel in plot.panels:
                 white = white_of(panel_figure(panel))
