@@ -104,8 +104,11 @@ def main(arguments: list[str] | None = None) -> None:
     spec = spec.model_copy(update={"physics": physics, "design": spec.design.model_copy(update=short)})
     campaign, out = given.work / "campaign", given.work / "out"
     simulate(spec, campaign)
-    steps = STEPS[:-1] if given.short else STEPS  # the page needs no report
-    run(campaign, out, None, steps=steps, workers=cores(), force=False, strict=False, progress=to_stderr())
+    steps, config = STEPS, None
+    if given.short:  # the page needs no report, and nothing of the folds
+        steps, config = STEPS[:-1], given.work / "rig.toml"
+        config.write_text("[loop]\nfolds = 2\n", "utf-8")
+    run(campaign, out, config, steps=steps, workers=cores(), force=False, strict=False, progress=to_stderr())
     store = Store.open(out)
     tables = {
         name: store.read(name) for name in ("steady", "steady_fit", "aging_fit", "aging_curves", "inputs")

@@ -1,19 +1,24 @@
 """Reports without the drawings that a test does not look at: saving them is most of the time of a run."""
 
+import os
 import sys
+from pathlib import Path
 
 from sealfit.report import drawing
 from sealfit.report.drawing import Drawn
 from sealfit.report.style import Plot
 
-UNDRAWN_COMMAND = """
-import sys
-from drawing_helpers import undrawn
-from sealfit.report import page
-page.draw = undrawn
+COMMAND = """
+import drawing_helpers
+from sealfit.report import drawing, page
+{patch}
 from sealfit.__main__ import main
 main()
 """
+PATCHES = {
+    "panels": "drawing._saved = drawing_helpers.only_svg",
+    "none": "page.draw = drawing_helpers.undrawn",
+}
 SAVED = drawing._saved
 
 
@@ -27,8 +32,14 @@ def only_svg(figure, form, metadata, **options) -> bytes:
     return SAVED(figure, form, metadata, **options) if form == "svg" else b""
 
 
-def command(*words: object, drawn: bool = True) -> list[str]:
-    """Return what runs a command line in a process of its own; the folder of this file is on its path."""
-    draws = words[0] in ("run", "report")
-    program = ["-m", "sealfit"] if drawn or not draws else ["-c", UNDRAWN_COMMAND]
+def command(*words: object, drawn: str = "all") -> list[str]:
+    """Return what runs a command line in a process of its own, where "all", "panels" or "none" is drawn."""
+    as_it_is = drawn == "all" or words[0] not in ("run", "report")
+    program = ["-m", "sealfit"] if as_it_is else ["-c", COMMAND.format(patch=PATCHES[drawn])]
     return [sys.executable, *program, *map(str, words)]
+
+
+def environment(**settings: str) -> dict[str, str]:
+    """Return the environment of such a process, which finds sealfit and this file."""
+    here = Path(__file__).resolve().parent
+    return {**os.environ, "PYTHONPATH": f"{here.parent}{os.pathsep}{here}", **settings}

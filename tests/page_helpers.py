@@ -2,13 +2,14 @@
 
 import doctest
 import io
-import os
 import re
 import shlex
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+
+import drawing_helpers
 
 from sealfit.cli import app, exit_code
 from sealfit.simulation import load_spec, simulate
@@ -72,12 +73,16 @@ def as_in_a_clone(folder):
 
 
 def run(command, folder, codes=(0,)):
-    """Run a command of a page with this Python's sealfit, and return what it prints on stdout."""
+    """Run a command of a page with this Python's sealfit, and return what it prints on stdout.
+
+    Of a report the panels on the page are drawn, and not the files for print.
+    """
     words = shlex.split(command)
-    programs = {"sealfit": ["-m", "sealfit"], "python": []}
-    if words[0] in programs:
-        words = [sys.executable, *programs[words[0]], *words[1:]]
-    settings = {**os.environ, "PYTHONPATH": str(ROOT), "BROWSER": "true"}  # a program that opens nothing
+    if words[0] == "sealfit":
+        words = drawing_helpers.command(*words[1:], drawn="panels")
+    elif words[0] == "python":
+        words[0] = sys.executable
+    settings = drawing_helpers.environment(BROWSER="true")  # a program that opens nothing
     done = subprocess.run(words, cwd=folder, env=settings, capture_output=True, text=True)
     assert done.returncode in codes, f"{command}\n{done.stderr}"
     return done.stdout

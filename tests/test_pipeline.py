@@ -15,7 +15,7 @@ import pandas as pd
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
-from drawing_helpers import command
+from drawing_helpers import command, environment
 
 from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED
 from sealfit.simulation import load_truth, true_force
@@ -50,14 +50,13 @@ KEYS = {
 TIMES = ("provenance.json", "state.json", "report.html")  # hold times of day
 
 
-def sealfit(*arguments, code=0, drawn=False):
-    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+def sealfit(*arguments, code=0, drawn="none"):
     run = subprocess.run(
         command(*arguments, drawn=drawn),
         capture_output=True,
         text=True,
         check=False,
-        env={**os.environ, "PYTHONPATH": paths},
+        env=environment(),
     )
     assert run.returncode == code, run.stderr
     return run
@@ -88,7 +87,7 @@ def campaign(tmp_path_factory):
 @pytest.fixture(scope="module")
 def first(campaign):
     out = campaign.parent / "out"
-    return out, sealfit("run", campaign, "--out", out, drawn=True)
+    return out, sealfit("run", campaign, "--out", out, drawn="all")
 
 
 def test_a_run_gives_every_table_with_its_schema(first):

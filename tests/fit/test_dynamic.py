@@ -236,14 +236,22 @@ def test_warming_along_the_stroke_is_no_break_away(tmp_path):
     assert not ratio["identified"].any()
 
 
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Results in several parts, and the fit of all traces in one table."""
+    out = tmp_path_factory.mktemp("stored")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(partitions, "PART_FILES", 20)
+        run(SIMULATED, out, steps=STEPS[:2])
+    store = Store.open(out)
+    tables = store.read("steady"), whole_steady_fit(store.read)
+    return store, tables, fit_dynamic(store.read("traces"), *tables, store.config)
+
+
 @pytest.mark.parametrize("workers", [1, 2])
-def test_traces_that_are_read_condition_by_condition_give_the_same(tmp_path, monkeypatch, workers):
-    monkeypatch.setattr(partitions, "PART_FILES", 20)
-    run(SIMULATED, tmp_path, steps=STEPS[:2])
-    store = Store.open(tmp_path)
+def test_traces_that_are_read_condition_by_condition_give_the_same(stored, workers):
+    store, tables, whole = stored
     assert len(store.traces()) > 3
-    tables, config = (store.read("steady"), whole_steady_fit(store.read)), store.config
-    whole = fit_dynamic(store.read("traces"), *tables, config)
-    split = fit_dynamic(store.traces(), *tables, config, workers=workers)
+    split = fit_dynamic(store.traces(), *tables, store.config, workers=workers)
     pdt.assert_frame_equal(whole.fit, split.fit, check_exact=True)
     pdt.assert_frame_equal(whole.curves, split.curves, check_exact=True)
