@@ -55,12 +55,11 @@ def test_slopes_that_specimens_or_runs_have_at_random_are_no_effect(days, level)
         strongest(
             make_bins(seed, days=days, speeds=FEW_SPEEDS, repeats=2, bins=8, effect=tilted(level, 0.5, seed))
         )
-        for seed in range(8)
+        for seed in range(5)
     ]
-    assert min(smallest) > 0.0005  # the least of 8 uniform numbers is smaller in 4 of 1,000
-    assert (
-        sum(p < 0.05 for p in smallest) <= 2
-    )  # more in 6 of 1,000; of p-values below 0.05 half the time, in 86 %
+    assert min(smallest) > 0.0005  # the least of 5 uniform numbers is smaller in 2.5 of 1,000
+    # More in 23 of 1,000; of p-values below 0.05 half the time, in 81 %.
+    assert sum(p < 0.05 for p in smallest) <= 1
 
 
 def test_the_same_slope_in_a_few_specimens_is_an_effect():

@@ -2,6 +2,7 @@
 
 import re
 from datetime import timedelta
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -73,26 +74,36 @@ def assert_values(folder, config, written):
         npt.assert_allclose(table["force_N"], one.force_N, atol=ROUNDED)
 
 
+@pytest.fixture(scope="module")
+def export(tmp_path_factory):
+    """Return by name the folder of an export, what was written, the draft, the config, and what is read."""
+
+    @cache
+    def made(name):
+        folder = tmp_path_factory.mktemp(name)
+        written = exports.EXPORTS[name](folder)
+        return folder, written, *read(folder)
+
+    return made
+
+
 @pytest.mark.parametrize("name", exports.EXPORTS)
-def test_the_draft_reads_an_export(name, tmp_path):
-    written = exports.EXPORTS[name](tmp_path)
-    _, config, ingested = read(tmp_path)
-    assert_values(tmp_path, config, written)
+def test_the_draft_reads_an_export(name, export):
+    folder, written, _, config, ingested = export(name)
+    assert_values(folder, config, written)
     assert_settings(ingested, written, TELLS.get(name, ALL))
     assert set(ingested.tables["inputs"]["status"]) == {"used"}
 
 
 @pytest.mark.parametrize("name", sorted(set(exports.EXPORTS) - {"excel_german", "excel_us"}))
-def test_the_draft_leads_to_no_fault(name, tmp_path):
-    exports.EXPORTS[name](tmp_path)
-    _, _, ingested = read(tmp_path)
+def test_the_draft_leads_to_no_fault(name, export):
+    *_, ingested = export(name)
     assert [str(fault) for fault in ingested.faults] == []
 
 
 @pytest.mark.parametrize(("name", "footer"), [("excel_german", None), ("excel_us", "Average")])
-def test_lines_below_the_data_are_named_by_how_they_begin(name, footer, tmp_path):
-    exports.EXPORTS[name](tmp_path)
-    made, config, ingested = read(tmp_path)
+def test_lines_below_the_data_are_named_by_how_they_begin(name, footer, export):
+    _, _, made, config, ingested = export(name)
     assert config.trace.footer == footer
     assert any("end in lines that are no data" in doubt.reason for doubt in made.doubts) == (footer is None)
     places = {264} if footer is None else set()  # the line below the 260 rows
@@ -243,9 +254,8 @@ def test_rubbers_directions_and_decimal_commas_in_names(tmp_path):
 
 
 @pytest.mark.parametrize("name", exports.EXPORTS)
-def test_every_guess_has_its_evidence_above_it(name, tmp_path):
-    exports.EXPORTS[name](tmp_path)
-    made = draft(tmp_path)
+def test_every_guess_has_its_evidence_above_it(name, export):
+    made = export(name)[2]
     lines = made.text.splitlines()
     assert all(guess.evidence for guess in made.guesses)
     for number, line in enumerate(lines):
