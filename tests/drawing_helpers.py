@@ -8,17 +8,13 @@ from sealfit.report import drawing
 from sealfit.report.drawing import Drawn
 from sealfit.report.style import Plot
 
-COMMAND = """
+PANELS_ONLY = """
 import drawing_helpers
-from sealfit.report import drawing, page
-{patch}
+from sealfit.report import drawing
+drawing._saved = drawing_helpers.only_svg
 from sealfit.__main__ import main
 main()
 """
-PATCHES = {
-    "panels": "drawing._saved = drawing_helpers.only_svg",
-    "none": "page.draw = drawing_helpers.undrawn",
-}
 SAVED = drawing._saved
 
 
@@ -32,11 +28,10 @@ def only_svg(figure, form, metadata, **options) -> bytes:
     return SAVED(figure, form, metadata, **options) if form == "svg" else b""
 
 
-def command(*words: object, drawn: str = "all") -> list[str]:
-    """Return what runs a command line in a process of its own, where "all", "panels" or "none" is drawn."""
-    as_it_is = drawn == "all" or words[0] not in ("run", "report")
-    program = ["-m", "sealfit"] if as_it_is else ["-c", COMMAND.format(patch=PATCHES[drawn])]
-    return [sys.executable, *program, *map(str, words)]
+def command(*words: str) -> list[str]:
+    """Return what runs a command line in a process of its own; of a report no files for print are drawn."""
+    program = ["-c", PANELS_ONLY] if words[0] in ("run", "report") else ["-m", "sealfit"]
+    return [sys.executable, *program, *words]
 
 
 def environment(**settings: str) -> dict[str, str]:

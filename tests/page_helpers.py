@@ -79,7 +79,7 @@ def run(command, folder, codes=(0,)):
     """
     words = shlex.split(command)
     if words[0] == "sealfit":
-        words = drawing_helpers.command(*words[1:], drawn="panels")
+        words = drawing_helpers.command(*words[1:])
     elif words[0] == "python":
         words[0] = sys.executable
     settings = drawing_helpers.environment(BROWSER="true")  # a program that opens nothing

@@ -7,16 +7,19 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
-from drawing_helpers import command, environment
+from drawing_helpers import undrawn
 
+from sealfit.cli import app, exit_code
 from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED
 from sealfit.simulation import load_truth, true_force
 from sealfit.store import Store
@@ -50,16 +53,15 @@ KEYS = {
 TIMES = ("provenance.json", "state.json", "report.html")  # hold times of day
 
 
-def sealfit(*arguments, code=0, drawn="none"):
-    run = subprocess.run(
-        command(*arguments, drawn=drawn),
-        capture_output=True,
-        text=True,
-        check=False,
-        env=environment(),
-    )
-    assert run.returncode == code, run.stderr
-    return run
+def sealfit(*arguments, code=0):
+    """Run a command in this process, which has loaded the libraries, and draw nothing."""
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as out:
+        patch.setattr(sys, "argv", ["sealfit", *map(str, arguments)])
+        patch.setattr("sealfit.report.page.draw", undrawn)
+        with redirect_stderr(StringIO()) as err:
+            ended = exit_code(app)
+    assert ended == code, err.getvalue()
+    return SimpleNamespace(stdout=out.getvalue(), stderr=err.getvalue())
 
 
 def started(*arguments):
@@ -87,7 +89,8 @@ def campaign(tmp_path_factory):
 @pytest.fixture(scope="module")
 def first(campaign):
     out = campaign.parent / "out"
-    return out, sealfit("run", campaign, "--out", out, drawn="all")
+    words = [sys.executable, "-m", "sealfit", "run", campaign, "--out", out]
+    return out, subprocess.run(words, capture_output=True, text=True, check=True)
 
 
 def test_a_run_gives_every_table_with_its_schema(first):
