@@ -92,7 +92,7 @@ def called(command, folder, monkeypatch):
     """Run a command of sealfit in this process, which has loaded the libraries, and return its stdout."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", shlex.split(command))
-    monkeypatch.setattr("webbrowser.open", lambda address: True)
+    monkeypatch.setattr("typer.launch", lambda address: 0)
     with redirect_stdout(io.StringIO()) as said, redirect_stderr(io.StringIO()) as told:
         code = exit_code(app)
     assert code == 0, f"{command}\n{told.getvalue()}"
