@@ -84,6 +84,7 @@ class Candidate:
     test_result: ScoreTestResult
     p_value: float = 1.0  # adjusted over the search
     pair: bool = False  # whether it is an interaction of two channels
+    place: bool = False  # whether it is a step or a kink at one of many places along its channel
 
     @property
     def target(self) -> tuple[str, str]:
@@ -94,6 +95,11 @@ class Candidate:
     def key(self) -> tuple:
         """Its channels and target."""
         return (self.channels, *self.target)
+
+    @property
+    def straight(self) -> bool:
+        """Whether it is one column that was not chosen among many: a line, a level, or a product."""
+        return self.columns.shape[1] == 1 and not self.place
 
     @property
     def consistent(self) -> bool:

@@ -99,10 +99,11 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
 
 
 def _each_column(tests: ScoreTests, channel: Channel, shapes: np.ndarray) -> Iterator[Candidate]:
-    """Yield candidates of every single column of a channel on the main targets."""
+    """Yield candidates of every single column, one for each place along a channel, on the main targets."""
     if shapes.shape[1]:
         parts = [slice(k, k + 1) for k in range(shapes.shape[1])]
-        yield from _shape_candidates(tests, channel, shapes, MAIN_TARGETS, parts)
+        for candidate in _shape_candidates(tests, channel, shapes, MAIN_TARGETS, parts):
+            yield replace(candidate, place=True)
 
 
 def _shape_candidates(
@@ -306,8 +307,9 @@ def _centred(values: np.ndarray) -> np.ndarray:
 #
 # They are searched in few units, where nothing else is significant. Only simple pairs are tested: two
 # straight lines (an offset, for the direction) that share a channel or of which one is of the direction, and
-# a line along strokes with its change along a coarser channel. Both columns must change each unit along one
-# direction, so that a unit is one number; then
+# a line along strokes with its change along a coarser channel. Steps and kinks are not tested: the best of
+# many places is more than one test. Both columns must change each unit along one direction, so that a unit
+# is one number; then
 #
 # .. math:: F = \frac{(RSS_0 - RSS_{12}) / 2}{RSS_{12} / (d - 2)}
 #
@@ -353,7 +355,7 @@ def _pairs(
 ) -> Iterator[tuple[tuple[Candidate, Candidate], str]]:
     """Yield the pairs to test and the level of their units."""
     rows = tests.fitted.rows
-    straight = [c for c in candidates if c.columns.shape[1] == 1 and c.claimable]
+    straight = [c for c in candidates if c.straight and c.claimable]
     between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
     level = {id(c): scatter_level(between[c.channels] or [channels["direction"]], rows) for c in straight}
     lines = [c for c in straight if not c.pair and c.target in _targets(c)]

@@ -343,7 +343,7 @@ def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candi
     pairs = {key: pair for pair in reversed(masked) for key in pair.keys}
     found = []
     for c in candidates:
-        if c.key in pairs and c.columns.shape[1] == 1:
+        if c.key in pairs and c.straight:
             chi2 = max(c.chi2, *(pair.chi2 for pair in masked if c.key in pair.keys))
             p_value = min(c.p_value, pairs[c.key].p_value)
             found.append(replace(c, test_result=c.test_result._replace(chi2=chi2), p_value=p_value))
