@@ -141,7 +141,7 @@ taken out.
 EFFECTS = """
 What the loop can add to the model by name. h is the change: by `add` it is added to the quantity, by
 `multiply` the quantity is multiplied by 1 + h. `sealfit effects` prints the same list. An effect that none
-of these describes is a free shape of its channel (`smooth`, `levels`). [Add your
+of these describes is a free shape of its channels (`smooth`, `surface`, `levels`). [Add your
 own](../how-to/own-effects.md).
 """
 

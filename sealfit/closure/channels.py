@@ -338,11 +338,17 @@ def steps(channel: Channel, rows: Rows) -> np.ndarray:
     return columns - columns.mean(axis=0)
 
 
-def even_knots(values: np.ndarray) -> tuple[float, ...]:
-    """Return up to five quantiles of the distinct values of a channel, for `effects.free.evenly`."""
+def evenly(values: np.ndarray) -> np.ndarray:
+    """Return values mapped so that five quantiles of the distinct ones lie evenly from -1 to 1.
+
+    Examples
+    --------
+    >>> [float(u) for u in evenly(np.array([1.0, 10.0, 55.0, 100.0, 1000.0]))]
+    [-1.0, -0.5, 0.0, 0.5, 1.0]
+    """
     distinct = np.unique(values)
-    knots = distinct if distinct.size <= 5 else np.quantile(distinct, np.linspace(0, 1, 5))
-    return tuple(float(k) for k in np.unique(knots))
+    knots = np.unique(distinct if distinct.size <= 5 else np.quantile(distinct, np.linspace(0, 1, 5)))
+    return np.interp(values, knots, np.linspace(-1, 1, knots.size))
 
 
 def shifted_from_zero(values: np.ndarray) -> np.ndarray:

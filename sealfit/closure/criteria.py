@@ -115,6 +115,8 @@ REACHED = 0.25
 # ---------------------------------------------------------------- forms: which are tried, which is reported
 # Most knots of a penalised spline, whose smoothness is estimated from the data.
 MOST_KNOTS = 24
+# Most knots of a free surface along each of its two channels.
+SURFACE_KNOTS = 6
 # Units of evidence per knot of a free shape.
 UNITS_PER_KNOT = 3
 # Knots of a channel scaled to -1..1 that are closer than this are one value that was measured twice.

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import fdtrc
 
-from sealfit.closure.channels import FINER, Channel, even_knots, scaled
+from sealfit.closure.channels import FINER, Channel, scaled
 from sealfit.closure.criteria import (
     FREE_DF,
     JACKKNIFE_UNITS,
@@ -17,6 +17,7 @@ from sealfit.closure.criteria import (
     MOST_KNOTS,
     SEARCHES,
     SPANS,
+    SURFACE_KNOTS,
     UNITS_PER_KNOT,
 )
 from sealfit.closure.errors_and_intervals import t_quantile
@@ -62,9 +63,7 @@ def terms_of(
     target = candidate.target
     if candidate.pair:
         pair = [channels[name] for name in candidate.channels]
-        alone = fitted.scatter.estimates("specimen") or all(c.unit != "specimen" for c in pair)
-        alone = alone and all(room_along(c, fitted) > 0 for c in pair)
-        yield from _terms_of_pair(*pair, target, effects, alone=alone)
+        yield from _terms_of_pair(*pair, target, effects, alone=have_main_effects(pair, fitted))
         return
     name = candidate.channels[-1]
     channel = channels[name]
@@ -74,6 +73,12 @@ def terms_of(
         # a smoothing spline has fewer effective degrees of freedom
         if fits or len(term.channels) > 1 or term.smoothness is not None:
             yield term, grid
+
+
+def have_main_effects(channels: Sequence[Channel], fitted: Fitted) -> bool:
+    """Whether the rows distinguish shapes of some channels from specimens' scatter and the declared model."""
+    known = fitted.scatter.estimates("specimen") or all(c.unit != "specimen" for c in channels)
+    return known and all(room_along(c, fitted) > 0 for c in channels)
 
 
 def room_along(channel: Channel, fitted: Fitted) -> int:
@@ -181,8 +186,6 @@ def _terms_of_pair(
         if set(effect.reads) == {one.name, other.name} and target in effect.acts_on:
             fixed = {f"{c.name}_ref": reference(np.abs(c.values)) for c in (one, other)}
             yield Term(effect, effect.reads, *target, fixed=fixed), grid_of(effect, np.abs(one.values))
-    fixed = {f"{name}_knots": even_knots(c.values) for name, c in (("x", one), ("z", other))}
-    yield Term(free_effect(SURFACE, fixed), (one.name, other.name), *target, fixed=fixed), {}
 
 
 def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FREE_DF + 1) -> Term:
@@ -200,6 +203,15 @@ def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FR
     categories, count = np.unique(channel.values, return_counts=True)
     fixed = {"categories": tuple(categories.tolist()), "means": tuple((count / count.sum()).tolist())}
     return Term(free_effect(LEVELS, fixed), (channel.name,), acts_on, operation, fixed)
+
+
+def surface_term(one: Channel, other: Channel, acts_on: str, operation: str) -> Term:
+    """Return the free surface of two numeric channels, with a penalty."""
+    x, z = (_knots(np.unique(c.values), SURFACE_KNOTS) for c in (one, other))
+    means = np.einsum("nj,nk->jk", natural(x, one.values), natural(z, other.values)) / one.values.size
+    fixed = {"x_knots": x, "z_knots": z, "means": tuple(means.ravel().tolist())}
+    names = (one.name, other.name)
+    return Term(free_effect(SURFACE, fixed), names, acts_on, operation, fixed, smoothness=1.0)
 
 
 def _knots(distinct: np.ndarray, count: int) -> tuple[float, ...]:

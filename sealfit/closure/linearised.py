@@ -166,7 +166,7 @@ def middles(values: np.ndarray) -> np.ndarray:
 def _smooth(term: Term, left: np.ndarray, residual: np.ndarray) -> tuple[Term, np.ndarray, float]:
     """Return a free shape with estimated smoothness, its amplitudes, and its effective degrees of freedom."""
     normal, gradient, rough = left.T @ left, left.T @ residual, roughness_of(term)
-    smoothness = reml_smoothness(normal, gradient, rough)
+    smoothness = reml_smoothness(normal, gradient, rough, len(term.channels))
     amplitude, size = penalised(normal, gradient, smoothness * rough)
     return replace(term, smoothness=smoothness), amplitude, size
 

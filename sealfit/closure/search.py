@@ -12,7 +12,7 @@ import numpy as np
 from sealfit.closure.channels import (
     FINER,
     Channel,
-    even_knots,
+    evenly,
     flip_level,
     free_columns,
     kinks,
@@ -39,11 +39,11 @@ from sealfit.closure.criteria import (
     SEARCHES,
 )
 from sealfit.closure.multiplicity import adjust_all
-from sealfit.closure.score_test import Candidate, ScoreTests
+from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.small_sample_test import log_p_of
-from sealfit.effects.free import BENDS, evenly
 from sealfit.effects.sensors import DAY_AND_NIGHT, DAY_H
 from sealfit.fit.joint import Fitted
+from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import POWER, Rows, open_columns
 from sealfit.fit.joint.variance_components import orthonormal
 
@@ -180,6 +180,8 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool, lo
 VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
 # Direction has tests of its own, and the calendar interacts with nothing.
 NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
+# Powers of the two mapped channels in the nonlinear terms of a pair.
+BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))
 
 
 def search_pairs(
@@ -260,6 +262,13 @@ def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Ca
     return found
 
 
+def candidate_of(term: Term, pair: Sequence[Channel], rows: Rows, p_value: float) -> Candidate:
+    """Return a candidate of a pair of channels for a term that no test suggested, with a given p-value."""
+    level = flip_level(min((c.unit for c in pair), key=FINER.get), rows)
+    test = ScoreTestResult(0.0, len(term.effect.parameters), rows.groups.starts[level].size, 0.0)
+    return Candidate(term.channels, *term.target, level, np.empty((0, 0)), test, p_value, pair=True)
+
+
 def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
     """Return the interaction terms of two channels, blocks of shape (n, k) that are tested one by one.
 
@@ -295,7 +304,7 @@ def _scales(channel: Channel) -> list[np.ndarray]:
 
 
 def _even(channel: Channel) -> np.ndarray:
-    return _centred(evenly(channel.values, even_knots(channel.values)))
+    return _centred(evenly(channel.values))
 
 
 def _centred(values: np.ndarray) -> np.ndarray:

@@ -23,8 +23,8 @@ from sealfit.effects.contract import (
     not_negative,
     positive,
     reference,
+    sine_attenuation,
 )
-from sealfit.effects.free import sine_attenuation
 
 # A closed form is of any one channel, acts anywhere and names no mechanism, unless it says otherwise.
 closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, physical=False)

@@ -221,3 +221,43 @@ def fill_unit(unit: str, x: str, y: str, z: str = "") -> str:
     if any(sign in base for sign in "/ *·"):
         base = f"({base})"
     return f"{top or 1}/{base}{hat}{power}"
+
+
+# ---------------------------------------------------------------- averaged
+# The factor by which averaging over the samples of a bin reduces a sine.
+#
+# .. math:: \frac{1}{n} \sum_k \sin(\alpha + \beta_k)
+#           = \frac{\sin(\pi w / \lambda)}{n \sin(\pi w / (n \lambda))} \sin \alpha
+#
+# for n samples spread evenly over a width w about the phase alpha (the Dirichlet kernel). It is small in bins
+# that are longer than the wavelength.
+
+# Key of the inputs of an effect: number of samples in each row's mean.
+SAMPLES = "samples"
+
+
+def width_of(name: str) -> str:
+    """Return the key of the inputs of an effect with the width of each row's bin in a channel."""
+    return f"{name} width"
+
+
+def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
+    """Return the factor by which averaging reduces a sine in each row, shape (n,); 1 if rows are not means.
+
+    Examples
+    --------
+    Two samples half a wave apart cancel; many over a whole wave, too.
+
+    >>> given = {"x width": np.array([1.0, 2.0, 0.5]), "samples": np.array([2.0, 2.0, 1.0])}
+    >>> [round(float(f), 12) for f in sine_attenuation(given, "x", 1.0)]
+    [0.0, -1.0, 1.0]
+    """
+    width = inputs.get(width_of(name))
+    if width is None:
+        return 1.0
+    half, samples = np.pi * np.asarray(width, float) / wavelength, np.asarray(inputs[SAMPLES], float)
+    each = np.sin(half / samples)
+    equal = np.abs(each) < 1e-9  # samples whole wavelengths apart have equal values
+    return np.where(
+        equal, np.cos(half) * np.cos(half / samples), np.sin(half) / np.where(equal, 1.0, samples * each)
+    )

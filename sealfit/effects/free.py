@@ -10,46 +10,6 @@ import numpy as np
 from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, reference
 from sealfit.errors import ParameterError
 
-# ---------------------------------------------------------------- averaged
-# The factor by which averaging over the samples of a bin reduces a sine.
-#
-# .. math:: \frac{1}{n} \sum_k \sin(\alpha + \beta_k)
-#           = \frac{\sin(\pi w / \lambda)}{n \sin(\pi w / (n \lambda))} \sin \alpha
-#
-# for n samples spread evenly over a width w about the phase alpha (the Dirichlet kernel). It is small in bins
-# that are longer than the wavelength.
-
-# Key of the inputs of an effect: number of samples in each row's mean.
-SAMPLES = "samples"
-
-
-def width_of(name: str) -> str:
-    """Return the key of the inputs of an effect with the width of each row's bin in a channel."""
-    return f"{name} width"
-
-
-def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
-    """Return the factor by which averaging reduces a sine in each row, shape (n,); 1 if rows are not means.
-
-    Examples
-    --------
-    Two samples half a wave apart cancel; many over a whole wave, too.
-
-    >>> given = {"x width": np.array([1.0, 2.0, 0.5]), "samples": np.array([2.0, 2.0, 1.0])}
-    >>> [round(float(f), 12) for f in sine_attenuation(given, "x", 1.0)]
-    [0.0, -1.0, 1.0]
-    """
-    width = inputs.get(width_of(name))
-    if width is None:
-        return 1.0
-    half, samples = np.pi * np.asarray(width, float) / wavelength, np.asarray(inputs[SAMPLES], float)
-    each = np.sin(half / samples)
-    equal = np.abs(each) < 1e-9  # samples whole wavelengths apart have equal values
-    return np.where(
-        equal, np.cos(half) * np.cos(half / samples), np.sin(half) / np.where(equal, 1.0, samples * each)
-    )
-
-
 # ---------------------------------------------------------------- categories
 # Free shapes of a categorical channel: one level per category, or one straight line in another channel per
 # category.
@@ -211,8 +171,6 @@ SMOOTH, SURFACE = "smooth", "surface"
 # A positive channel with at least this ratio of its largest to its smallest value is transformed by the
 # logarithm.
 WIDE = 20.0
-# Powers of the two scaled channels in the terms of a free surface.
-BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))
 
 
 def smooth_effect(
@@ -321,15 +279,36 @@ def roughness(places: tuple[float, ...], reference: float | None = None) -> np.n
     ndarray, shape (knots - 1, knots - 1)
         Its null space are straight lines in the channel, or in its logarithm.
     """
-    x = np.log(places) if places[0] > 0 and places[-1] / places[0] >= WIDE else np.array(places)
-    bend = _cardinal(tuple(((x - x[0]) / (x[-1] - x[0])).tolist())).derivative(2)
-    # h'' of each cardinal spline is straight between knots
-    at, width = bend(bend.x), np.diff(bend.x)[:, None]
-    left, right = at[:-1], at[1:]
-    across = left.T @ (width / 6 * right)
-    whole = left.T @ (width / 3 * left) + right.T @ (width / 3 * right) + across + across.T
     free = np.arange(len(places)) != _nearest(places, reference)
-    return whole[np.ix_(free, free)]
+    return _gram(places, 2)[np.ix_(free, free)]
+
+
+@lru_cache(maxsize=64)
+def surface_roughness(x_places: tuple[float, ...], z_places: tuple[float, ...]) -> np.ndarray:
+    r"""Return S with :math:`c^T S c = \int h_{xx}^2 + 2 h_{xz}^2 + h_{zz}^2`, scaled as in `roughness`.
+
+    Returns
+    -------
+    ndarray, shape (amplitudes, amplitudes)
+        Of the amplitudes of `surface_effect`; its null space are planes.
+
+    Notes
+    -----
+    The penalty of thin plate splines: Wood 2017, Generalized Additive Models, 2nd ed., CRC Press, 5.5.
+    """
+    x, z = ([_gram(places, order) for order in range(3)] for places in (x_places, z_places))
+    whole = np.kron(x[2], z[0]) + 2 * np.kron(x[1], z[1]) + np.kron(x[0], z[2])
+    return whole[1:, 1:]
+
+
+def _gram(places: tuple[float, ...], order: int) -> np.ndarray:
+    """Return the integrals of products of derivatives of the cardinal splines, shape (knots, knots)."""
+    x = np.log(places) if places[0] > 0 and places[-1] / places[0] >= WIDE else np.array(places)
+    x = (x - x[0]) / (x[-1] - x[0])
+    node, weight = np.polynomial.legendre.leggauss(4)  # exact for products of cubics
+    half = np.diff(x)[:, None] / 2
+    at = _cardinal(tuple(x.tolist()))((x[:-1, None] + half * (1 + node)).ravel(), order)
+    return at.T @ ((half * weight).ravel()[:, None] * at)
 
 
 def _nearest(places: Sequence[float], reference: float | None) -> int:
@@ -337,20 +316,22 @@ def _nearest(places: Sequence[float], reference: float | None) -> int:
     return 0 if reference is None else int(np.argmin(np.abs(np.array(places) - reference)))
 
 
-def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect:
-    """Return a free surface of two channels: mixed terms of a polynomial, zero if either is at its middle.
+def surface_effect(
+    x_knots: Sequence[float], z_knots: Sequence[float], means: Sequence[float] | None = None
+) -> Effect:
+    """Return a free surface of two channels: natural cubic splines of one times those of the other.
 
     Parameters
     ----------
     x_knots, z_knots : sequence of float
-        Rising values of each channel that are mapped to even steps from -1 to 1, linear in between and
-        constant beyond. Tested values are then about evenly spaced, for channels set in steps as well as in
-        decades.
+        At least two different values of each channel, in rising order; the surface is constant beyond them.
+    means : sequence of float, optional
+        Mean of each product of splines over the campaign, z running faster, for a shape whose mean is zero.
 
     Returns
     -------
     Effect
-        Amplitudes `c_jk` of u^j w^k, j and k 1 or 2, u and w the mapped channels.
+        Amplitudes `c_jk`, the value at knot j of x and k of z less that at the first ones.
 
     Raises
     ------
@@ -360,50 +341,66 @@ def surface_effect(x_knots: Sequence[float], z_knots: Sequence[float]) -> Effect
     knots = tuple(tuple(float(k) for k in given) for given in (x_knots, z_knots))
     if any(len(given) < 2 or not (np.diff(given) > 0).all() for given in knots):
         raise ParameterError(f"surface: knots {knots} must be two or more rising numbers.", fix="Sort them.")
+    places = [(j, k) for j in range(len(knots[0])) for k in range(len(knots[1]))]
+    mean = shares(means, len(places))
     return Effect(
         id=SURFACE,
         label="smooth in {x} and {z}",
-        equation=r"h = \sum_{jk} c_{jk} u^j w^k",
-        form="c_jk u^j w^k summed over j, k = 1, 2; u, w = {x}, {z} mapped to -1..1 at "
-        + " and ".join(listed(given) for given in knots),
-        reference="middle of {x} or of {z}",
+        equation=r"h = \sum_{jk} c_{jk} B_j(x) B_k(z)",
+        form="natural cubic splines through (x_j, z_k, c_jk), knots "
+        + " and ".join(listed(given) for given in knots)
+        + f", zero at {knots[0][0]:.6g} and {knots[1][0]:.6g}"
+        + LESS_MEAN * (means is not None),
+        reference="mean over {x} and {z} in the campaign"
+        if means is not None
+        else f"{{x}} = {knots[0][0]:.6g} and {{z}} = {knots[1][0]:.6g}",
         reads=(CHANNEL, SECOND),
         acts_on=ANYWHERE,
         parameters=tuple(
-            Parameter(f"c_{j}{k}", "{y}", 0.0, AMPLITUDE, f"of u^{j} w^{k}", linear=True) for j, k in BENDS
+            Parameter(
+                f"c_{j + 1}{k + 1}",
+                "{y}",
+                0.0,
+                AMPLITUDE,
+                f"value at {knots[0][j]:.6g} and {knots[1][k]:.6g} less that at the first knots",
+                linear=True,
+            )
+            for j, k in places[1:]
         ),
-        shape=partial(_surface, knots),
-        source="Form: ours. The mixed terms of a polynomial in two channels.",
-        # By hand: at the upper corner u = w = 1, and all terms add up.
+        shape=partial(_surface, knots, mean),
+        source="Form: ours. Wood 2017, Generalized Additive Models, 2nd ed., CRC Press.",
+        # By hand: at the upper corner the surface is the last amplitude.
         worked=(
             {CHANNEL: knots[0][-1], SECOND: knots[1][-1]},
-            {f"c_{j}{k}": 10.0 * j + k for j, k in BENDS},
-            66.0,
+            {f"c_{j + 1}{k + 1}": 10.0 * j + k for j, k in places[1:]},
+            10.0 * places[-1][0]
+            + places[-1][1]
+            - sum((10.0 * j + k) * m for (j, k), m in zip(places, mean, strict=True)),
         ),
         physical=False,
     )
 
 
-def _surface(knots: tuple[tuple[float, ...], ...], inputs: Mapping, **values) -> np.ndarray:
-    u, w = (evenly(inputs[name], given) for name, given in zip((CHANNEL, SECOND), knots, strict=True))
-    return sum(values[f"c_{j}{k}"] * u**j * w**k for j, k in BENDS)
-
-
-def evenly(values, knots: Sequence[float]) -> np.ndarray:
-    """Return values mapped so that the knots lie evenly from -1 to 1, shape of `values`.
-
-    Examples
-    --------
-    >>> [float(u) for u in evenly([1.0, 10.0, 55.0, 500.0], [1.0, 10.0, 100.0])]
-    [-1.0, 0.0, 0.5, 1.0]
-    """
-    return np.interp(np.asarray(values, dtype=float), knots, np.linspace(-1, 1, len(knots)))
+def _surface(
+    knots: tuple[tuple[float, ...], ...], means: tuple[float, ...], inputs: Mapping, **values
+) -> np.ndarray:
+    u, w = (
+        natural(given, np.asarray(inputs[name], dtype=float))
+        for name, given in zip((CHANNEL, SECOND), knots, strict=True)
+    )
+    amplitude = np.array(
+        [[values.get(f"c_{j + 1}{k + 1}", 0.0) for k in range(len(knots[1]))] for j in range(len(knots[0]))]
+    )
+    return np.einsum("...j,jk,...k->...", u, amplitude, w) - amplitude.ravel() @ means
 
 
 FREE: Mapping[str, tuple[Callable[..., Effect], tuple[str, ...]]] = {
     SMOOTH: (lambda fixed: smooth_effect(fixed["knots"], fixed.get("x_ref"), fixed.get("means")), ("knots",)),
     LEVELS: (lambda fixed: levels_effect(fixed["categories"], fixed.get("means")), ("categories",)),
-    SURFACE: (lambda fixed: surface_effect(fixed["x_knots"], fixed["z_knots"]), ("x_knots", "z_knots")),
+    SURFACE: (
+        lambda fixed: surface_effect(fixed["x_knots"], fixed["z_knots"], fixed.get("means")),
+        ("x_knots", "z_knots"),
+    ),
     SLOPES: (lambda fixed: slopes_effect(fixed["categories"]), ("categories",)),
 }
 
@@ -416,8 +413,8 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     id : str
         `smooth`, `levels`, `surface` or `slopes`.
     fixed : mapping
-        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `means`, if any,
-        for smooth and levels; `x_knots` and `z_knots` for a surface. Other entries are ignored.
+        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `x_knots` and
+        `z_knots` for a surface; `means`, if any, for all but slopes. Other entries are ignored.
 
     Raises
     ------

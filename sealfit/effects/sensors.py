@@ -13,8 +13,8 @@ from sealfit.effects.contract import (
     Parameter,
     deviation,
     reference,
+    sine_attenuation,
 )
-from sealfit.effects.free import sine_attenuation
 
 
 def ripple_shape(inputs, *, A, lambda_, phi):

@@ -85,10 +85,7 @@ def test_a_product_holds_the_speed_alone_only_where_the_curve_leaves_room(speeds
     )
     terms = [term for term, _ in terms_of(candidate, channels, fitted, EFFECTS)]
     assert any(term.effect.id == "product" for term in terms)
-    assert (
-        any(len(term.effect.linear) > 1 and not term.effect.id.startswith("surface") for term in terms)
-        == alone
-    )
+    assert any(len(term.effect.linear) > 1 for term in terms) == alone
 
 
 def test_of_many_columns_those_that_explain_most_are_paired(monkeypatch):

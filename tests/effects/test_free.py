@@ -15,6 +15,7 @@ from sealfit.effects.free import (
     slopes_effect,
     smooth_effect,
     surface_effect,
+    surface_roughness,
 )
 from sealfit.errors import ParameterError
 
@@ -107,8 +108,19 @@ def test_effects_of_a_pair_give_what_is_worked_by_hand(effect):
     assert float(effect.shape(inputs, **values)) == pytest.approx(expected)
 
 
-def test_surface_is_zero_where_either_channel_is_in_its_middle():
+def test_surface_of_two_knots_each_is_bilinear_and_constant_beyond_them():
     effect = surface_effect((2.0, 6.0), (0.0, 10.0))
-    values = dict.fromkeys(effect.linear, 1.0)
-    given = effect.shape({"x": np.array([4.0, 3.0, 6.0]), "z": np.array([9.0, 5.0, 10.0])}, **values)
-    assert list(given) == [0.0, 0.0, 4.0]
+    at = {"x": np.array([2.0, 4.0, 6.0, 7.0]), "z": np.array([0.0, 5.0, 5.0, 12.0])}
+    given = effect.shape(at, c_12=1.0, c_21=2.0, c_22=5.0)
+    assert list(given) == [0.0, 2.0, 3.5, 5.0]
+
+
+def test_roughness_of_a_surface_by_hand_and_of_a_plane():
+    # h = x z on the unit square: h_xz = 1, so twice its square integrates to 2.
+    rough = surface_roughness((0.0, 1.0), (0.0, 1.0))
+    assert np.array([0.0, 0.0, 1.0]) @ rough @ [0.0, 0.0, 1.0] == pytest.approx(2.0)
+    x, z = (0.0, 1.0, 4.0, 5.0), (1.0, 2.0, 3.0)
+    plane = np.add.outer(2.0 * np.array(x), 3.0 * (np.array(z) - 1.0)).ravel()[1:]
+    rough = surface_roughness(x, z)
+    npt.assert_allclose(rough @ plane, 0.0, atol=1e-9)
+    assert np.linalg.matrix_rank(rough, tol=1e-8) == plane.size - 2

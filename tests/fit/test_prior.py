@@ -9,7 +9,7 @@ import pytest
 
 from sealfit.closure.channels import Channel
 from sealfit.closure.forms import free_term
-from sealfit.effects.free import natural, roughness
+from sealfit.effects.free import natural, roughness, surface_roughness
 from sealfit.fit.joint import effective_df, fit, fit_declared
 from sealfit.fit.joint.model import shape_of
 from sealfit.fit.joint.prior import penalised, reml_smoothness
@@ -31,7 +31,7 @@ def test_a_straight_line_is_worth_one_number():
     for seed in range(20):
         normal, gradient = normal_equations(lambda x: 2.0 * np.asarray(x), 0.3, seed)
         rough = roughness(KNOTS)
-        amplitude, size = penalised(normal, gradient, reml_smoothness(normal, gradient, rough) * rough)
+        amplitude, size = penalised(normal, gradient, reml_smoothness(normal, gradient, rough, 1) * rough)
         sizes.append(size)
         npt.assert_allclose(amplitude, 2.0 * np.array(KNOTS[1:]), atol=0.6)
     assert np.median(sizes) < 1.5
@@ -46,7 +46,7 @@ def test_the_smoothness_of_greatest_likelihood_is_near_the_one_of_least_error(wa
     ratios = []
     for seed in range(20):
         normal, gradient = normal_equations(truth, 0.3, seed)
-        chosen = reml_smoothness(normal, gradient, rough)
+        chosen = reml_smoothness(normal, gradient, rough, 1)
         tried = [*(chosen * 10.0 ** np.linspace(-4, 4, 33)), chosen]
         error = [np.sqrt(np.mean((penalised(normal, gradient, t * rough)[0] - wanted) ** 2)) for t in tried]
         ratios.append(error[-1] / min(error))
@@ -81,3 +81,15 @@ def test_the_joint_fit_holds_a_free_shape_as_smooth_as_the_data_want_it():
     assert errors[True] < errors[False]
     assert 6 < sizes[True] < 20
     assert sizes[False] == pytest.approx(23, abs=0.01)
+
+
+def test_smoothness_of_a_surface_whose_plane_the_model_contains():
+    rough = surface_roughness((0.0, 1.0, 3.0), (0.0, 2.0, 3.0))
+    columns = np.random.default_rng(0).normal(size=(40, 8))
+    plane = np.linalg.svd(rough)[0][:, -2:]
+    normal = 1e-9 * (columns - columns @ plane @ plane.T).T @ (columns - columns @ plane @ plane.T)
+    found = reml_smoothness(normal, np.zeros(8), rough, 2)
+    amplitude, size = penalised(normal, np.zeros(8), found * rough)
+    assert np.isfinite(found)
+    npt.assert_array_equal(amplitude, 0.0)
+    assert 0 <= size <= 6

@@ -9,8 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 import pandas as pd
 
-from sealfit.effects.contract import CHANNEL, SECOND, Effect
-from sealfit.effects.free import SAMPLES, width_of
+from sealfit.effects.contract import CHANNEL, SAMPLES, SECOND, Effect, width_of
 from sealfit.fit.joint.declared import QUANTITIES, Declared
 from sealfit.fit.joint.rows import ALONG, Rows
 from sealfit.fit.joint.tangent import Layout, Tangent, blocks_of

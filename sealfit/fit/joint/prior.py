@@ -4,7 +4,8 @@ log v_s and log b have a Gaussian prior with standard deviation 3, a factor of 2
 global search. It determines a parameter that the data do not, and is negligible otherwise.
 
 A free shape is a smoothing spline with many knots. Its amplitudes c have the prior precision :math:`\lambda
-S`, where :math:`c^T S c` is the integral of the squared second derivative; a straight line is not penalised.
+S`, where :math:`c^T S c` is the integral of the squared second derivative; a straight line, or a plane for a
+surface of two channels, is not penalised.
 :math:`\lambda` maximises the restricted likelihood,
 
 .. math::
@@ -22,20 +23,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealfit.effects.free import roughness
+from sealfit.effects.free import roughness, surface_roughness
 from sealfit.fit.joint.model import LOGARITHMIC, Model, Term
 
 # Standard deviation of the prior of log v_s and log b.
 PRIOR_SD = 3.0
 # Decimal logarithms of the smoothness tried, relative to the one whose penalty weighs as much as the data.
 DECADES = np.linspace(-8.0, 6.0, 57)
-# Ridge added to the normal matrix, as a share of its diagonal. The declared model may contain the straight
-# line, which then makes the matrix singular.
+# Ridge added to the normal matrix, as a share of its diagonal and of the mean of that. The declared model may
+# contain the straight line, and no row may lie near a knot of a surface, which makes the matrix singular.
 RIDGE = 1e-10
 
 
 def roughness_of(term: Term) -> np.ndarray:
-    """Return the penalty matrix S of a smooth shape, shape (amplitudes, amplitudes)."""
+    """Return the penalty matrix S of a smooth shape or surface, shape (amplitudes, amplitudes)."""
+    if "x_knots" in term.fixed:
+        return surface_roughness(tuple(term.fixed["x_knots"]), tuple(term.fixed["z_knots"]))
     return roughness(tuple(term.fixed["knots"]), term.fixed.get("x_ref"))
 
 
@@ -72,21 +75,28 @@ def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
     return np.linalg.pinv(normal * scale, rcond=1e-12, hermitian=True) * scale
 
 
-def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
+def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray, channels: int) -> float:
     """Return the smoothness lambda that maximises the restricted likelihood.
 
-    G and g are those of the amplitudes, all other parameters eliminated, g at zero amplitudes. Straight lines
-    are the null space of S, `rough`, shape (p, p).
+    G and g are those of the amplitudes, all other parameters eliminated, g at zero amplitudes. The null
+    space of S, `rough`, shape (p, p), are straight lines of one channel, or planes of two.
     """
     unit = np.trace(normal) / np.trace(rough)
     if not unit > 0:
         return 1.0
     tried = unit * 10.0**DECADES
-    posterior = normal + np.diag(RIDGE * np.diag(normal)) + tried[:, None, None] * rough
-    solved = np.linalg.solve(posterior, gradient[:, None])[..., 0]
-    rank = rough.shape[0] - 1
-    cost = -(solved @ gradient) + np.linalg.slogdet(posterior)[1] - rank * np.log(tried)
+    size, axes = np.linalg.eigh(rough)  # along these axes a large penalty does not round small numbers off
+    size[:channels] = 0.0
+    pull, rank = axes.T @ gradient, size.size - channels
+    posterior = _ridged(axes.T @ normal @ axes) + tried[:, None, None] * np.diag(size)
+    solved = np.linalg.solve(posterior, pull[:, None])[..., 0]
+    cost = -(solved @ pull) + np.linalg.slogdet(posterior)[1] - rank * np.log(tried)
     return float(tried[np.argmin(cost)])
+
+
+def _ridged(normal: np.ndarray) -> np.ndarray:
+    diagonal = np.diag(normal)
+    return normal + RIDGE * np.diag(diagonal + diagonal.mean())
 
 
 def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> tuple[np.ndarray, float]:
@@ -94,9 +104,8 @@ def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> 
 
     G and g are as above, and P, shape (p, p), is the prior's precision.
     """
-    posterior = normal + penalty + np.diag(RIDGE * np.diag(normal))
-    solved = np.linalg.solve(posterior, np.c_[gradient, normal])
-    return solved[:, 0], float(np.trace(solved[:, 1:]))
+    covariance = covariance_of(_ridged(normal), penalty)
+    return covariance @ gradient, float(np.trace(covariance @ normal))
 
 
 def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
@@ -110,7 +119,7 @@ def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
             continue
         place = model.term_slice(number)
         own, pull = free_of_others(model, normal, gradient, place)
-        value = reml_smoothness(own, pull, roughness_of(term))
+        value = reml_smoothness(own, pull, roughness_of(term), len(term.channels))
         terms = tuple(replace(t, smoothness=value) if k == number else t for k, t in enumerate(model.terms))
         model = replace(model, terms=terms)
     return model
