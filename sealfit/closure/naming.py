@@ -282,7 +282,7 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal
         best = _reestimated(refitted[0])
     least = min(best.bic, refitted[0].bic)
     scatter = best.fitted.scatter
-    near = [_deviance_under(p.fitted, scatter) + p.bic_penalty < least + REFIT_MARGIN for p in refitted[1:]]
+    near = [deviance_under(p.fitted, scatter) + p.bic_penalty < least + REFIT_MARGIN for p in refitted[1:]]
     own = [_reestimated(p) for p, n in zip(refitted[1:], near, strict=True) if n]
     far = [p for p, n in zip(refitted[1:], near, strict=True) if not n]
     return [best, *own, *far[:LIKELIEST]]
@@ -342,7 +342,7 @@ def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter)
         yield replace(proposal, fitted=anew)
 
 
-def _deviance_under(fitted: Fitted, scatter: Scatter) -> float:
+def deviance_under(fitted: Fitted, scatter: Scatter) -> float:
     """Return the deviance that a fit would have under another scatter, refitted in its tangent space."""
     whitening = Whitening(scatter, fitted.friction, fitted.rows.groups)
     residual = whitening(fitted.residual[:, None])[:, 0]

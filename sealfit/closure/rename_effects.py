@@ -7,6 +7,7 @@ not its whole shape: one effect that fits as well replaces the two.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,12 +15,13 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import Channel
-from sealfit.closure.confirm import AcceptedEffect, Context, confirmed
-from sealfit.closure.criteria import EQUAL_BIC, RIVAL_BIC
+from sealfit.closure.confirm import AcceptedEffect, Context, confirmed, heldout_gain
+from sealfit.closure.criteria import EQUAL_BIC, MOST_PROPOSALS, RIVAL_BIC
+from sealfit.closure.forms import have_main_effects, surface_term
 from sealfit.closure.linearised import Linearised, Proposal
-from sealfit.closure.naming import propose
+from sealfit.closure.naming import deviance_under, named_among, propose
 from sealfit.closure.score_test import Candidate, ScoreTests
-from sealfit.closure.search import channel_candidates, search_pairs
+from sealfit.closure.search import MAIN_TARGETS, candidate_of, channel_candidates, search_pairs
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.rows import ALONG
 
@@ -77,8 +79,8 @@ class Renaming:
         """Return the earlier effects and a new one, merged with an earlier one if possible.
 
         The new one is not in `fitted` yet. Two effects are merged if a single one fits as well: a shape of
-        the same channel or of a proportional one, or a product of two channels. While the other effect of a
-        masked pair is `pending`, only effects of the new one's own channel are merged with it.
+        the same channel or of a proportional one, or a product or surface of two channels. While the other
+        effect of a masked pair is `pending`, only effects of the new one's own channel are merged with it.
         """
         for number, earlier in enumerate(added):
             if pending and self._channel(earlier) != self._channel(new):
@@ -94,22 +96,30 @@ class Renaming:
         """Return one effect that fits as well as an earlier and a new one; None if there is none.
 
         Two forms of one channel that are no physical effects are one shape: then the single effect only has
-        to fit as well, whatever its number of parameters.
+        to fit as well, whatever its number of parameters. A surface in place of two such forms must lower the
+        held-out error more; in place of a physical effect its BIC must be smaller.
         """
         names = self._channel(earlier), self._channel(new)
-        if None in names:
+        effects = [item.proposal.term.effect for item in (earlier, new)]
+        if any(effect.periodic for effect in effects):
             return None
         without = fitted.refitted(fitted.model.without_term(number))
-        p_value = min(earlier.proposal.p_value, new.proposal.p_value)
-        proposals = self._proposals_on(fitted, number, without, self._channels_near(*names), p_value)
-        proposals = sorted([*proposals, *self._products(without, names, p_value)], key=lambda p: p.bic)
-        two = new.proposal.bic + earlier.proposal.bic_penalty
-        better = [p for p in proposals[:1] if p.bic < two + EQUAL_BIC]
-        pieces = names[0] == names[1] and not any(a.proposal.term.effect.physical for a in (earlier, new))
-        if pieces and not better:
-            penalties = new.proposal.bic_penalty + earlier.proposal.bic_penalty
-            fitting = [p for p in proposals if p.bic - p.bic_penalty < two - penalties + RIVAL_BIC]
-            better = sorted(fitting, key=lambda p: p.bic)[:1]
+        two, penalties = new.proposal.fitted, new.proposal.bic_penalty + earlier.proposal.bic_penalty
+        surfaces = named_among(without, self._surfaces(without, earlier.proposal, new.proposal))
+        found: list[Proposal] = []
+        if None not in names:
+            p_value = min(earlier.proposal.p_value, new.proposal.p_value)
+            found += self._proposals_on(fitted, number, without, self._channels_near(*names), p_value)
+            found += self._products(without, names, p_value)
+        better = [p for p in found if _lead(p, two) > p.bic_penalty - penalties - EQUAL_BIC]
+        if None not in names and names[0] == names[1] and not any(e.physical for e in effects):
+            better = better or [p for p in found if _lead(p, two) > -RIVAL_BIC]
+        if any(effect.physical for effect in effects):
+            better += [p for p in surfaces if _lead(p, two) > p.bic_penalty - penalties + EQUAL_BIC]
+        elif surfaces:
+            gain_N = self._gain_N(without, new.proposal)
+            better += [p for p in surfaces if _lead(p, two) > 0 and self._gain_N(without, p) > gain_N]
+        better = sorted(better, key=lambda p: p.bic)
         return self._confirmed(without, better, new.round) if better else None
 
     def _channels_near(self, *names: str) -> list[str]:
@@ -128,6 +138,28 @@ class Renaming:
         found = sorted((replace(c, p_value=p_value) for c in found), key=lambda c: -c.chi2)
         return propose(without, found, self.channels, self.context.effects)
 
+    def _surfaces(self, without: Fitted, *parts: Proposal) -> list[Proposal]:
+        """Return the likeliest surfaces of two channels of which effects may be parts, not refitted yet.
+
+        Time, distance and position are alternatives of each other. No surface differs between directions.
+        """
+        names = {name for p in parts for name in p.term.channels}
+        along = set(ALONG) if names & set(ALONG) else set()
+        near = [c for c in self.channels.values() if c.numeric and c.name in (names | along) - {"direction"}]
+        pairs = [
+            (one, other)
+            for one, other in itertools.combinations(near, 2)
+            if names <= {one.name, other.name} | (along if along & {one.name, other.name} else set())
+        ]
+        p_value = min(p.p_value for p in parts)
+        linearised, found = Linearised(without), []
+        for pair in pairs:
+            if have_main_effects(pair, without):
+                for target in dict.fromkeys((*MAIN_TARGETS, *(p.term.target for p in parts))):
+                    term = surface_term(*pair, *target)
+                    found += linearised(term, {}, candidate_of(term, pair, without.rows, p_value))
+        return sorted(found, key=lambda p: p.bic)[:MOST_PROPOSALS]
+
     def _proposals_on(
         self, fitted: Fitted, number: int, without: Fitted, names: Sequence[str], p_value: float
     ) -> Sequence[Proposal]:
@@ -144,6 +176,11 @@ class Renaming:
         own_form = Linearised(without)(own, at_own_values, same_target) if same_target is not None else ()
         return propose(without, found, self.channels, self.context.effects, own_form)
 
+    def _gain_N(self, without: Fitted, proposal: Proposal) -> float:
+        """Return by how much the model of a fitted proposal lowers the error on held-out data."""
+        loop = self.context.config.loop
+        return heldout_gain(without, proposal, loop.folds, loop.seed, self.samples, {}).rmse_N
+
     def _confirmed(
         self, without: Fitted, proposals: Sequence[Proposal], number: int
     ) -> AcceptedEffect | None:
@@ -155,3 +192,8 @@ class Renaming:
         names = item.proposal.source[0]
         single = len(set(names) - {"direction"}) <= 1 and names[-1] in self.channels
         return names[-1] if single and not item.proposal.term.effect.periodic else None
+
+
+def _lead(proposal: Proposal, other: Fitted) -> float:
+    """Return by how much the deviance of a proposal is below that of another fit under its scatter."""
+    return deviance_under(other, proposal.fitted.scatter) - proposal.fitted.deviance

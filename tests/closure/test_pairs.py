@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from bins_helpers import TWO_FOLDS, make_bins, make_traces
+from bins_helpers import make_bins, make_traces
 
 from sealfit.closure import search as search_module
 from sealfit.closure.channels import Channel, find_channels
@@ -9,6 +9,7 @@ from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.search import mixed_columns, search, search_pairs
+from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
@@ -22,7 +23,7 @@ COLUMNS = {
 
 def close(effect):
     bins = make_bins(5, setup=0.003, effect=effect, run_channels=COLUMNS, bins=8)
-    return bins, close_loop(bins, make_traces(bins), TWO_FOLDS)
+    return bins, close_loop(bins, make_traces(bins), Config())
 
 
 def test_product_of_two_columns_is_found_and_predicted():

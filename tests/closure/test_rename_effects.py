@@ -14,6 +14,7 @@ from sealfit.closure.search import search
 from sealfit.closure.selection import select_effects
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
+from sealfit.effects.free import free_effect
 from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
@@ -120,23 +121,23 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
     assert after is fitted
 
 
-def in_place_of_two(bins, first, second, **options):
-    """Return what stands in place of two terms with their starts, each accepted beside the other."""
+def in_place_of(bins, *terms, gain_N=1.0, **options):
+    """Return what stands in place of terms with their starts, each accepted beside those before it."""
     rows = make_rows(numbered(bins), has_aging=True)
-    model = fit_declared(rows).model.with_term(*first)
-    base = fit(model, rows, turns=2)
-    after = fit(base.model.with_term(*second), rows, base.scatter, turns=2)
+    fits = [fit_declared(rows)]
+    for term, values in terms:
+        fits.append(fit(fits[-1].model.with_term(term, values), rows, fits[-1].scatter, turns=2))
 
     def accepted(term, values, fitted):
         source = (term.channels, term.acts_on, term.operation)
         units = rows.groups.starts["run"].size
         proposal = Proposal(term, values, "run", units, 1e3, 1e-9, np.empty(0), source, fitted=fitted)
-        return AcceptedEffect(proposal, 1.0, 1.0, (), (), 1)
+        return AcceptedEffect(proposal, gain_N, 1.0, (), (), 1)
 
-    one, two = (accepted(t, v, f) for (t, v), f in zip((first, second), (base, after), strict=True))
+    *earlier, new = (accepted(t, v, f) for (t, v), f in zip(terms, fits[1:], strict=True))
     channels = {c.name: c for c in find_channels(rows)}
     again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
-    earlier, new = again.merged_with_earlier(base, [one], two, **options)
+    earlier, new = again.merged_with_earlier(fits[-2], earlier, new, **options)
     return [a.proposal.term for a in (*earlier, new)]
 
 
@@ -148,7 +149,7 @@ def test_an_asymmetry_of_mu_told_as_two_of_its_ends_is_one_effect():
     ends = [
         (Term(EFFECTS["asymmetry"], ("direction",), q, "multiply"), {"A": 0.04}) for q in ("mu_s", "mu_c")
     ]
-    (term,) = in_place_of_two(bins, *ends)
+    (term,) = in_place_of(bins, *ends)
     assert (term.effect.id, term.acts_on) == ("asymmetry", "mu")
 
 
@@ -158,7 +159,7 @@ def test_an_offset_and_an_asymmetry_that_are_both_there_stay_two():
 
     bins = make_bins(3, directions=(1, -1), repeats=2, bins=4, noise_N=0.1, effect=both)
     offset = Term(EFFECTS["zero_offset"], ("direction",), "force", "add"), {"A": 0.5}
-    terms = in_place_of_two(
+    terms = in_place_of(
         bins, offset, (Term(EFFECTS["asymmetry"], ("direction",), "mu", "multiply"), {"A": 0.04})
     )
     assert [t.effect.id for t in terms] == ["zero_offset", "asymmetry"]
@@ -171,7 +172,7 @@ def test_a_change_with_time_told_by_distance_and_by_displacement_is_one_effect()
     bins = make_bins(3, repeats=2, bins=6, noise_N=0.1, effect=growing)
     forms = (EFFECTS["linear"], "distance_mm"), (EFFECTS["log"], "displacement_mm")
     two = (Term(effect, (name,), "mu", "multiply", {"x_ref": 20.0}) for effect, name in forms)
-    (term,) = in_place_of_two(bins, *((t, {"A": 1e-3}) for t in two))
+    (term,) = in_place_of(bins, *((t, {"A": 1e-3}) for t in two))
     assert term.channels == ("time_s",)
 
 
@@ -183,11 +184,37 @@ def test_a_product_told_as_a_sum_of_two_is_one_effect():
 
     bins = make_bins(3, repeats=2, bins=3, noise_N=0.1, effect=product, run_channels=channels)
     two = [(Term(EFFECTS["linear"], (n,), "mu", "multiply", {"x_ref": 5.0}), {"A": 0.01}) for n in channels]
-    (term,) = in_place_of_two(bins, *two)
+    (term,) = in_place_of(bins, *two)
     assert set(term.channels) == set(channels)
-    assert (
-        len(in_place_of_two(bins, *two, pending=True)) == 2
-    )  # a third is to come, beside which alone one shows
+    assert len(in_place_of(bins, *two, pending=True)) == 2  # a third is to come, beside which alone one shows
+
+
+TWO = {name: lambda rng: rng.uniform(0, 10) for name in ("oil_ppm", "humidity_pct")}
+
+
+def curve(name):
+    fixed = {"knots": (0.0, 2.5, 5.0, 7.5, 10.0), "x_ref": 0.0}
+    term = Term(free_effect("smooth", fixed), (name,), "mu", "multiply", fixed)
+    return term, dict.fromkeys(term.effect.linear, 0.0)
+
+
+def waves_of_the_sum(table, force):
+    return force * (1 + 0.05 * np.sin(0.25 * (table["oil_ppm"] + table["humidity_pct"]).to_numpy()))
+
+
+def sum_of_waves(table, force):
+    oil, humidity = (table[name].to_numpy() for name in TWO)
+    return force * (1 + 0.03 * np.sin(oil / 2) + 0.03 * np.cos(humidity / 2))
+
+
+@pytest.mark.parametrize(
+    ("effect", "found"), [(waves_of_the_sum, ["surface"]), (sum_of_waves, ["smooth", "smooth"])]
+)
+def test_a_surface_takes_the_place_of_two_curves_unless_they_add_up(effect, found):
+    bins = make_bins(4, repeats=3, bins=3, noise_N=0.1, effect=effect, run_channels=TWO)
+    terms = in_place_of(bins, *map(curve, TWO))
+    assert [term.effect.id for term in terms] == found
+    assert {name for term in terms for name in term.channels} == set(TWO)
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
