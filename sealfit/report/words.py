@@ -133,9 +133,12 @@ def error_clause(closure: Mapping, config: Config) -> Markup:
 
 
 def does(index: int, effect: Mapping, shapes: pd.DataFrame, config: Config) -> Markup:
-    """Return the largest change of the target by an effect, and its other parameters, in a clause."""
+    """Return the largest change of the target by an effect, and its other parameters, in a clause.
+
+    The values of a free shape at its knots are not among them.
+    """
     change = _change(effect, shapes[shapes["effect"] == index] if len(shapes) else shapes, config)
-    rest = [p for p in effect["parameters"] if p.get("unit") != "rad"]
+    rest = [p for p in effect["parameters"] if effect["named"] and p.get("unit") != "rad"]
     if change:  # which says how large the amplitudes are
         found = [_catalogued(effect["id"], p["name"]) for p in rest]
         rest = [p for p, own in zip(rest, found, strict=True) if own is None or not own.linear]

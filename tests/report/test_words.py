@@ -118,6 +118,11 @@ def test_the_size_of_an_effect_is_read_off_its_shape(values, more, words):
     assert text.replace("<i>", "").replace("</i>", "").startswith(words)
 
 
+def test_the_values_of_a_free_shape_at_its_knots_are_not_said():
+    curve = RIPPLE | {"id": "smooth", "named": False}
+    assert str(does(0, curve, shape([-1.0, 2.0, -1.0]), Config())).endswith(" along time")
+
+
 def test_nothing_missing_gives_one_error():
     text = said(document("nothing_missing", effects=()), empty("shapes"))
     assert text == (
