@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
@@ -22,7 +22,7 @@ from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import SECOND, Effect
-from sealfit.effects.free import FREE, LEVELS, SMOOTH, WIDE, free_effect
+from sealfit.effects.free import FREE, LEVELS, SMOOTH, SURFACE, WIDE, free_effect
 from sealfit.errors import ParameterError
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
@@ -225,26 +225,35 @@ def _farthest(run: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> str:
 
 
 def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
-    """Return each effect's shape along its channel with a 95 % band, and the corresponding free shape."""
+    """Return each effect's shape along its channel with a 95 % band, and the corresponding free shape.
+
+    A surface is drawn along each of its channels, with the other one at its mean.
+    """
     shapes = []
     reach = t_quantile(degrees_of_freedom(after))
-    for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True)):
+    for number, first in _drawn(after.model):
+        term, values = after.model.terms[number], after.model.values[number]
         place = after.model.term_slice(number)
-        covariance = (robust_covariance(after, "file") if "held" in term.fixed else after.covariance)[
-            place, place
-        ]
-        inputs, x, labels = _along(term, after)
+        covariance = robust_covariance(after, "file") if "held" in term.fixed else after.covariance
+        inputs, x, labels = _along(term, after, first)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
         tangent = np.column_stack(
             [np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)]
         )
-        se = mean_se(Tangent.dense(tangent), covariance)
+        se = mean_se(Tangent.dense(tangent), covariance[place, place])
         free = _free_shape(after, number, x)
         unit = parameter_unit("{y}", term, config.units)
-        drawn = {"effect": number, "id": term.effect.id, "channel": term.channels[0], "x": x}
+        drawn = {"effect": number, "id": term.effect.id, "channel": first, "x": x}
         drawn |= {"label": labels, "value": value, "lo95": value - reach * se, "hi95": value + reach * se}
         shapes.append(pd.DataFrame({**drawn, "free": np.nan if free is None else free, "unit": unit}))
     return pd.concat(shapes, ignore_index=True) if shapes else pd.DataFrame(columns=SHAPES.names())
+
+
+def _drawn(model: Model) -> Iterator[tuple[int, str]]:
+    """Yield the numbers of the effects and the channels along which they are drawn."""
+    for number, term in enumerate(model.terms):
+        for channel in term.channels if term.effect.id == SURFACE else term.channels[:1]:
+            yield number, channel
 
 
 def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
@@ -257,9 +266,11 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
     """
     rows, parts = after.rows, []
     units = rows.codes("file" if rows.groups.starts["file"].size > 1 else "stroke")
-    for number, term in enumerate(after.model.terms):
-        own = shapes[shapes["effect"] == number]
-        values, numeric = term.inputs(rows)[term.effect.reads[0]], bool(own["label"].isna().all())
+    for number, first in _drawn(after.model):
+        term = after.model.terms[number]
+        own = shapes[(shapes["effect"] == number) & (shapes["channel"] == first)]
+        values = term.inputs(rows)[term.effect.reads[term.channels.index(first)]]
+        numeric = bool(own["label"].isna().all())
         known = np.isfinite(values) if numeric else np.full(values.size, True)
         if numeric:
             low, high = own["x"].min(), own["x"].max()
@@ -278,16 +289,15 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
         )
         part = 1 + np.asarray(shape) if term.operation == "multiply" else 1.0  # which the slope has in it
         se = np.abs(part) * np.sqrt((left**2).sum(axis=1)) / size
-        found = {"effect": number, "channel": term.channels[0], "x": x, "label": labels}
+        found = {"effect": number, "channel": first, "x": x, "label": labels}
         found |= {"value": shape + part * change, "se": se, "unit": own["unit"].iloc[0]}
         parts.append(pd.DataFrame(found))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=SHAPE_POINTS.names())
 
 
-def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
-    """Return inputs along a term's first channel, others at their means, and its values or categories."""
+def _along(term: Term, after: Fitted, first: str) -> tuple[dict, np.ndarray, list | None]:
+    """Return inputs along one of a term's channels, others at their means, and its values or categories."""
     rows = after.rows
-    first = term.channels[0]
     values = rows.values(first)
     if values.dtype.kind != "f":
         labels = [str(c) for c in np.unique(values)]
@@ -302,19 +312,18 @@ def _along(term: Term, after: Fitted) -> tuple[dict, np.ndarray, list | None]:
         x = spaced(low, high, 4 * POINTS if high < values.max() else POINTS)
     inputs = {}
     for name, channel in zip(term.effect.reads, term.channels, strict=True):
-        inputs[name] = (
-            x if channel == first else np.full(x.size, _usual(rows.values(channel), pair=name == SECOND))
-        )
+        far = name == SECOND and term.effect.id != SURFACE
+        inputs[name] = x if channel == first else np.full(x.size, _usual(rows.values(channel), far=far))
     fixed = {key: value for key, value in term.fixed.items() if key != "shift"}
     return {**inputs, **fixed}, x, None
 
 
-def _usual(values: np.ndarray, *, pair: bool) -> float | str:
-    """Return a second channel's value in a plot: its mean, the 90 % quantile for a pair, or a category."""
+def _usual(values: np.ndarray, *, far: bool) -> float | str:
+    """Return a second channel's value in a plot: its mean, the 90 % quantile if `far`, or a category."""
     if values.dtype.kind != "f":
         return str(np.unique(values)[0])
     size = np.abs(values)
-    return float(np.quantile(values, 0.9)) if pair else float(size.mean())
+    return float(np.quantile(values, 0.9)) if far else float(size.mean())
 
 
 def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:

@@ -4,7 +4,7 @@ import numpy.testing as npt
 import pytest
 
 from sealfit.closure.channels import Channel, find_channels
-from sealfit.closure.forms import free_term
+from sealfit.closure.forms import free_term, surface_term
 from sealfit.closure.output import GROUPS, POINTS, channel_table, curve_table, shape_points, shape_table
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
@@ -80,3 +80,21 @@ def test_a_shape_along_the_speed_is_even_on_a_logarithmic_axis():
     shapes = shape_table(fit(start_model(rows).with_term(rate, {"A": 0.0}), rows), Config())
     assert len(shapes) == POINTS
     assert np.ptp(np.diff(np.log(shapes["x"].astype(float)))) < 1e-6
+
+
+def test_a_surface_is_drawn_along_both_its_channels_with_the_other_at_its_mean():
+    bins = bins_helpers.make_bins(repeats=2, temperatures=(60.0,), noise_N=0.02, gain=0.0)
+    bins["oil_ppm"] = bins.groupby("file").ngroup() % 7 * 10.0
+    bins["force_N"] *= 1 + 0.001 * bins["oil_ppm"] * (bins["distance_mm"] / 40)
+    rows = make_rows(bins, has_aging=True)
+    two = [Channel(name, rows.values(name), "file") for name in ("oil_ppm", "distance_mm")]
+    term = surface_term(*two, "mu", "multiply")
+    fitted = fit(start_model(rows).with_term(term, dict.fromkeys(term.effect.linear, 0.0)), rows)
+    shapes = shape_table(fitted, Config())
+    points = shape_points(fitted, shapes)
+    means = {c.name: c.values.mean() for c in two}
+    for own, other in (("oil_ppm", "distance_mm"), ("distance_mm", "oil_ppm")):
+        drawn = shapes[shapes["channel"] == own]
+        slope = np.polyfit(drawn["x"], drawn["value"].astype(float), 1)[0]
+        assert slope == pytest.approx(0.001 / 40 * means[other], rel=0.1)
+        assert (points["channel"] == own).sum() > 5
