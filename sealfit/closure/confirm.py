@@ -48,6 +48,8 @@ NO_GAIN = f"it lowers the error on held-out data by less than {LEAST_GAIN:.2%} o
 NEGLIGIBLE = (TOO_FINE, TOO_SMALL, NO_GAIN)
 """Reasons of a refusal after which nothing is left to explain: the effect is too small to matter."""
 
+NEGATIVE = "with it a quantity that cannot be negative is negative"
+
 WHOLE = ("mu", "force")
 """Targets that are the whole friction."""
 
@@ -305,7 +307,8 @@ def confirmed(
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
     for proposal in proposals[:MOST_PROPOSALS]:
         gain = heldout_gain(fitted, proposal, *folds_of)
-        reason = _reason_refused(fitted, proposal, gain, samples, folds_of[-1])
+        negative = turns_negative(proposal.fitted)
+        reason = NEGATIVE if negative else _reason_refused(fitted, proposal, gain, samples, folds_of[-1])
         unit = config.units.unit("force")
         label = describe(proposal.term, fitted.rows)
         context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
@@ -353,6 +356,15 @@ def _reason_refused(
     if not proposal.term.effect.periodic and vague_between_speeds(fitted, proposal):
         return "with it the force between the tested speeds is less certain than the error that it removes"
     return None
+
+
+def turns_negative(fitted: Fitted) -> bool:
+    """Whether the last effect of a fit multiplies a quantity by a negative number at some row.
+
+    The amplitude of a shape on a coefficient that hardly any row determines may be anything, at no cost.
+    """
+    term, values = fitted.model.terms[-1], fitted.model.values[-1]
+    return term.operation == "multiply" and bool((shape_of(term, values, fitted.rows) <= -1).any())
 
 
 def vague_between_speeds(before: Fitted, proposal: Proposal) -> bool:

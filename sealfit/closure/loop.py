@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, silent, varies_within
+from sealfit.closure.confirm import (
+    NEGATIVE,
+    AcceptedEffect,
+    Context,
+    RefusedEffect,
+    silent,
+    turns_negative,
+    varies_within,
+)
 from sealfit.closure.criteria import DETERMINED, JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
 from sealfit.closure.errors_and_intervals import level_table, mean_se
 from sealfit.closure.forms import describe
@@ -336,11 +344,14 @@ def _only_gains(
     `cannot_tell`.
     """
     refused = []
-    while selection.added and not models.gains(_level_of(selection.added), weak=selection.added[-1].weak):
+    while selection.added:
+        negative = turns_negative(models.after)
+        weak = selection.added[-1].weak
+        if not negative and models.gains(_level_of(selection.added), weak=weak):
+            break
         last = selection.added[-1].proposal
-        label = describe(last.term, selection.after.rows)
-        say(f"removed, because it does not lower the error: {label}")
-        reason = "it does not lower the error, in sample or on held-out data"
+        reason = NEGATIVE if negative else "it does not lower the error, in sample or on held-out data"
+        say(f"removed, because {reason}: {describe(last.term, selection.after.rows)}")
         refused.append(RefusedEffect(last.term, last.p_value, reason))
         model = selection.after.model.without_term(len(selection.added) - 1)
         own = (

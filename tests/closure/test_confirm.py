@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.confirm import (
+    NEGATIVE,
     Context,
     Gain,
     about_means,
@@ -13,13 +15,14 @@ from sealfit.closure.confirm import (
     gain_between_settings,
     heldout_gain,
     rounding_error_N,
+    turns_negative,
     vague_between_speeds,
     varies_within,
 )
 from sealfit.closure.left_out import between_speeds, blocks
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint import fit, fit_declared
+from sealfit.fit.joint import fit, fit_declared, fitted_at
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 
@@ -136,18 +139,21 @@ def test_a_free_shape_of_few_speeds_beside_the_stribeck_curve_leaves_the_force_b
 def proposal(effect="smooth", channels=("run_order",), acts_on="mu", p_value=1e-9, physical=False):
     own = SimpleNamespace(id=effect, physical=physical, label=effect, periodic=False)
     term = SimpleNamespace(effect=own, channels=channels, acts_on=acts_on, operation="multiply")
-    return SimpleNamespace(term=term, p_value=p_value, unit="run")
+    return SimpleNamespace(term=term, p_value=p_value, unit="run", fitted=None)
 
 
 @pytest.fixture
 def decide(monkeypatch):
     """Decide on proposals with given gains: held out by groups and by settings, and the force they add."""
 
-    def decided(proposals, gains, settings=(), added=1.0, samples=SAMPLES, vague=False, **more):
+    def decided(
+        proposals, gains, settings=(), added=1.0, samples=SAMPLES, vague=False, negative=False, **more
+    ):
         held = dict(zip(map(id, proposals), gains, strict=True))
         monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda before, p, *args: held[id(p)])
         monkeypatch.setattr("sealfit.closure.confirm.gain_between_settings", lambda *args: settings)
         monkeypatch.setattr("sealfit.closure.confirm.vague_between_speeds", lambda *args: vague)
+        monkeypatch.setattr("sealfit.closure.confirm.turns_negative", lambda fitted: negative)
         monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
         monkeypatch.setattr("sealfit.closure.confirm.follows_strokes", lambda name, rows: name == "time_s")
         monkeypatch.setattr(
@@ -161,6 +167,24 @@ def decide(monkeypatch):
 
 
 GOOD = Gain(0.5, 0.5, 10.0)
+
+
+@pytest.mark.parametrize(("size", "negative"), [(-0.5, False), (0.9, False), (-1.5, True)])
+def test_a_coefficient_times_a_negative_number_is_no_effect(size, negative):
+    before = fit_declared(make_rows(make_bins(0, temperatures=(60.0,), days=(4.0,), bins=4), has_aging=True))
+    late = Term(EFFECTS["step"], ("time_s",), "mu_s", "multiply")
+    place = float(np.median(before.rows.values("time_s")))
+    model = before.model.with_term(late, {"A": size, "x_0": place})
+    after = fitted_at(model, before.rows, before.scatter)
+    assert turns_negative(after) == negative
+    added = replace(late, acts_on="force", operation="add")
+    assert not turns_negative(replace(after, model=before.model.with_term(added, {"A": size, "x_0": place})))
+
+
+def test_an_effect_that_turns_a_coefficient_negative_is_refused(decide):
+    found, (refused,), _ = decide([proposal("form")], [GOOD], negative=True)
+    assert found is None
+    assert refused.reason == NEGATIVE
 
 
 @pytest.mark.parametrize(

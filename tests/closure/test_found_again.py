@@ -69,8 +69,11 @@ def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selec
 @pytest.mark.parametrize("strong", [0, 1])
 def test_the_evidence_for_the_last_effect_says_what_is_asked_of_the_error(selection, strong, monkeypatch):
     monkeypatch.setattr("sealfit.closure.loop._level_of", lambda added: "run")
+    monkeypatch.setattr("sealfit.closure.loop.turns_negative", lambda fitted: False)
 
     class Models:
+        after = None
+
         def gains(self, around, *, weak):
             self.weak = weak
             return True
