@@ -48,7 +48,7 @@ NO_GAIN = f"it lowers the error on held-out data by less than {LEAST_GAIN:.2%} o
 NEGLIGIBLE = (TOO_FINE, TOO_SMALL, NO_GAIN)
 """Reasons of a refusal after which nothing is left to explain: the effect is too small to matter."""
 
-NEGATIVE = "with it a quantity that cannot be negative is negative"
+NEGATIVE = "it multiplies a quantity by a negative number"
 
 WHOLE = ("mu", "force")
 """Targets that are the whole friction."""

@@ -63,7 +63,7 @@ def terms_of(
     target = candidate.target
     if candidate.pair:
         pair = [channels[name] for name in candidate.channels]
-        yield from _terms_of_pair(*pair, target, effects, alone=have_main_effects(pair, fitted))
+        yield from _terms_of_pair(*pair, target, effects, alone=main_effects_identifiable(pair, fitted))
         return
     name = candidate.channels[-1]
     channel = channels[name]
@@ -75,7 +75,7 @@ def terms_of(
             yield term, grid
 
 
-def have_main_effects(channels: Sequence[Channel], fitted: Fitted) -> bool:
+def main_effects_identifiable(channels: Sequence[Channel], fitted: Fitted) -> bool:
     """Whether the rows distinguish shapes of some channels from specimens' scatter and the declared model."""
     known = fitted.scatter.estimates("specimen") or all(c.unit != "specimen" for c in channels)
     return known and all(room_along(c, fitted) > 0 for c in channels)

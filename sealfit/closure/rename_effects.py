@@ -17,7 +17,7 @@ import pandas as pd
 from sealfit.closure.channels import Channel
 from sealfit.closure.confirm import AcceptedEffect, Context, confirmed, heldout_gain
 from sealfit.closure.criteria import EQUAL_BIC, MOST_PROPOSALS, RIVAL_BIC
-from sealfit.closure.forms import have_main_effects, surface_term
+from sealfit.closure.forms import main_effects_identifiable, surface_term
 from sealfit.closure.linearised import Linearised, Proposal
 from sealfit.closure.naming import deviance_under, named_among, propose
 from sealfit.closure.score_test import Candidate, ScoreTests
@@ -154,7 +154,7 @@ class Renaming:
         p_value = min(p.p_value for p in parts)
         linearised, found = Linearised(without), []
         for pair in pairs:
-            if have_main_effects(pair, without):
+            if main_effects_identifiable(pair, without):
                 for target in dict.fromkeys((*MAIN_TARGETS, *(p.term.target for p in parts))):
                     term = surface_term(*pair, *target)
                     found += linearised(term, {}, candidate_of(term, pair, without.rows, p_value))
