@@ -78,9 +78,9 @@ def propose(
     # Conditions are tested one after the other, so the calendar is correlated with them: other channels come
     # first, unless a named form along the calendar fits much better.
     others = _refitted(fitted, _best_few(others), others)
-    calendar = _refitted(fitted, _best_few(calendar)[:CALENDAR_RIVALS])
-    calendar.sort(key=lambda p: p.bic)
-    if calendar[0].named and calendar[0].bic < min(p.bic for p in others) - RIVAL_BIC:
+    calendar = sorted(_refitted(fitted, _best_few(calendar)[:CALENDAR_RIVALS]), key=lambda p: p.bic)
+    least = min(p.bic for p in others) - RIVAL_BIC
+    if any(p.named and p.bic < least for p in calendar):
         return _ordered(fitted, [*calendar, *others])
     return _ordered(fitted, others) + calendar
 

@@ -199,14 +199,16 @@ def _rise(start: Start) -> Rise:
     """Return the rise of a start whose force comes up, and none of any other.
 
     Where a fast stroke starts, damping brings up a part of the force at once, and the bristles the rest. If
-    that rest is large, the rise is that on the plateau of the speed, longer than the one found from rest.
+    that rest is large, the rise is that on the plateau of the speed: if it is longer than the one found from
+    rest, or if it alone follows the law of the bristles.
     """
     rise, ramp, plateau = _rise_from_rest(start), start.plateau_mm, _on_plateau(start)
     level = _level_N(plateau) if rise.length_mm > 0.0 else None
     if level is None or level - plateau.force_N[0] < LARGE * (level - start.force_N[0]):
         return rise
     later = _rise_from_rest(plateau)
-    if not (later.length_mm > LONGER * rise.length_mm and _explained(plateau, later.length_mm) > EXPLAINED):
+    better = later.length_mm > LONGER * rise.length_mm or (later.left_N != 0.0 and rise.left_N == 0.0)
+    if not (better and _explained(plateau, later.length_mm) > EXPLAINED):
         return rise
     return Rise(ramp + later.end_mm, _before(later.left_N, ramp / later.length_mm), later.length_mm)
 

@@ -182,6 +182,17 @@ def test_a_fast_stroke_of_few_samples_whose_force_jumps_at_its_reversal_shows_it
     assert (force - rise.at(distance))[later] == pytest.approx(76.5, abs=0.15)
 
 
+def test_a_rise_that_only_the_plateau_of_the_speed_shows_is_found():
+    """A stroke of three rise lengths; damping brings the force up from -1.5 to -0.2 N while it accelerates."""
+    distance = np.r_[0.0, 0.01, 0.03, 0.056, 0.084 + 0.0288 * np.arange(131)]
+    force = 1.45 - 1.72 * np.exp(-distance / 1.29)
+    force[:4] = -1.48, -1.1, -0.75, -0.4
+    rise = rise_of(Start(distance, force, 4))
+    later = distance > rise.end_mm
+    assert later.sum() > 30
+    assert (force - rise.at(distance))[later] == pytest.approx(1.45, abs=0.01)
+
+
 def test_a_rise_far_shorter_than_the_ramp_of_the_speed_leaves_nothing():
     assert _before(-1e-3, 1e4) == 0.0
     assert _before(-1.0, np.log(2.0)) == pytest.approx(-2.0)
