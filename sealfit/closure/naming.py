@@ -75,10 +75,16 @@ def propose(
         and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)
     ):
         return _ordered(fitted, _refitted(fitted, _best_few(found), found))
-    # Conditions are tested one after the other, so the calendar is correlated with them: other channels come
-    # first, unless a named form along the calendar fits much better.
     others = _refitted(fitted, _best_few(others), others)
-    calendar = sorted(_refitted(fitted, _best_few(calendar)[:CALENDAR_RIVALS]), key=lambda p: p.bic)
+    calendar = _refitted(fitted, _best_few(calendar)[:CALENDAR_RIVALS])
+    return _calendar_last(fitted, others, sorted(calendar, key=lambda p: p.bic))
+
+
+def _calendar_last(fitted: Fitted, others: list[Proposal], calendar: list[Proposal]) -> list[Proposal]:
+    """Return refitted proposals in order: those along the calendar last, unless a named one fits much better.
+
+    Conditions are tested one after the other, so the calendar is correlated with them.
+    """
     least = min(p.bic for p in others) - RIVAL_BIC
     if any(p.named and p.bic < least for p in calendar):
         return _ordered(fitted, [*calendar, *others])

@@ -9,7 +9,7 @@ from bins_helpers import make_bins
 
 from sealfit.closure import naming
 from sealfit.closure.linearised import ZERO_OFFSET, Proposal
-from sealfit.closure.naming import correlation, determined, named_among, rivals
+from sealfit.closure.naming import _calendar_last, correlation, determined, named_among, rivals
 from sealfit.closure.ripple_selection import numbered
 from sealfit.closure.ripples import Peak
 from sealfit.effects import EFFECTS
@@ -24,6 +24,7 @@ CHANNELS = {
     "warming_distance": ("distance_mm",), "warming_time": ("time_s",), "zero_offset": ("direction",),
     "asymmetry": ("direction",), "offset_slope": ("oil_ppm", "direction"),
 }  # fmt: skip
+KNOTS = {"knots": [0.0, 1.0, 2.0], "x_ref": 0.0}
 ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 
 
@@ -77,6 +78,20 @@ def first_of(monkeypatch):
     return first
 
 
+@pytest.mark.parametrize(("behind", "first"), [(0.0, "campaign_drift"), (85.0, "linear"), (200.0, "linear")])
+def test_the_calendar_comes_first_where_a_named_form_of_it_fits_much_better(behind, first):
+    """A free shape of the calendar that fits a little better than the named form does not hide it."""
+    calendar = [
+        proposal(free_effect("smooth", KNOTS), channels=("elapsed_h",), behind=behind - 2.0),
+        proposal("campaign_drift", channels=("elapsed_h",), behind=behind),
+    ]
+    others = [proposal("linear", channels=("repeat",), behind=90.0)]
+    fitted = SimpleNamespace(model=SimpleNamespace(terms=[], values=[]))
+    found = _calendar_last(fitted, others, calendar)
+    assert found[0].term.effect.id == first
+    assert len(found) == 3
+
+
 def test_a_proposal_costs_the_logarithm_of_the_units_for_each_number():
     made = proposal("warming_distance", behind=7.0)
     assert made.bic_penalty == pytest.approx(2 * np.log(100))
@@ -96,7 +111,7 @@ def test_of_none_none_is_named():
 )
 def test_a_closed_form_comes_before_a_free_shape_that_is_hardly_better(first_of, behind, column, named):
     """Hardly is twice as much where both add the same to the force."""
-    free = proposal(free_effect("smooth", {"knots": [0.0, 1.0, 2.0], "x_ref": 0.0}))
+    free = proposal(free_effect("smooth", KNOTS))
     assert first_of(free, proposal("quadratic", behind=behind, column=column)).term.effect.id == named
 
 

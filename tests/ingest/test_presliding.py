@@ -183,7 +183,7 @@ def test_a_fast_stroke_of_few_samples_whose_force_jumps_at_its_reversal_shows_it
 
 
 def test_a_rise_that_only_the_plateau_of_the_speed_shows_is_found():
-    """A stroke of three rise lengths; damping brings the force up from -1.5 to -0.2 N while it accelerates."""
+    """A stroke of three rise lengths; damping brings the force up from -1.5 to -0.2 N in its ramp."""
     distance = np.r_[0.0, 0.01, 0.03, 0.056, 0.084 + 0.0288 * np.arange(131)]
     force = 1.45 - 1.72 * np.exp(-distance / 1.29)
     force[:4] = -1.48, -1.1, -0.75, -0.4
