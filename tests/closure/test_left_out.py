@@ -52,3 +52,26 @@ def test_too_few_files_predict_no_other():
     few = bins[bins["file"].isin(files[:6])].copy()
     few.loc[few["file"] == files[2], "force_N"] *= 1.3
     assert outlier_files(make_rows(few, has_aging=True)) == []
+
+
+def test_one_of_ten_files_that_went_wrong_is_found_though_the_curve_follows_it():
+    """A curve without a fall, or with another v_s, may fit all ten so that another file is the farthest."""
+
+    def shallow(table, force):
+        speed = table["speed_mm_s"].to_numpy()
+        return 9.0 * (1 + 0.15 * np.exp(-((speed / 5.0) ** 2)) + 0.0004 * speed)
+
+    design = {"days": (), "temperatures": (), "speeds": tuple(np.geomspace(1.0, 480.0, 10)), "repeats": 1}
+    for number in range(10):
+        bins, files = bins_with({number: 1.2}, gain=0.0005, effect=shallow, **design)
+        (one,) = outlier_files(make_rows(bins, has_aging=True))
+        assert one.file == files[number]
+
+
+def test_few_files_that_scatter_are_no_outliers():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        speeds = tuple(np.geomspace(0.5, rng.uniform(20, 500), int(rng.integers(5, 10))))
+        one_condition = {"days": (), "temperatures": (), "repeats": 1, "gain": rng.uniform(0.003, 0.05)}
+        bins = make_bins(seed, bins=4, noise_N=0.05, speeds=speeds, **one_condition)
+        assert outlier_files(make_rows(bins, has_aging=True)) == []
