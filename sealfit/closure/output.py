@@ -149,6 +149,7 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
         record["has_load"],
         raw["stribeck"],
         raw["law"],
+        {},  # it is not fitted again
     )
     effects = {**EFFECTS, **(own or {})}
     ids = {term["id"] for stage in ("before", "after") for term in record[stage]["terms"]}

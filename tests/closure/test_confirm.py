@@ -128,8 +128,8 @@ def test_points_between_speeds_are_halfway_to_the_next_speed_in_both_directions(
 def test_a_free_shape_of_few_speeds_beside_the_stribeck_curve_leaves_the_force_between_them_open():
     bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=4, speeds=FOUR)
     before = fit_declared(make_rows(bins, has_aging=True))
-    term = Term(EFFECTS["log_rate"], ("speed_mm_s",), "mu", "multiply", {"speed_mm_s_ref": 10.0})
-    bent = before.refitted(before.model.with_term(term, {"A": 0.01}))
+    term = Term(EFFECTS["quadratic"], ("speed_mm_s",), "mu", "multiply", {"x_ref": 10.0})
+    bent = before.refitted(before.model.with_term(term, term.effect.start()))
     assert vague_between_speeds(before, SimpleNamespace(fitted=bent))
     lost = Term(EFFECTS["exponential_approach"], ("distance_mm",), "mu", "multiply")
     warmed = before.refitted(before.model.with_term(lost, {"A": -0.004, "tau": 3.0}))

@@ -5,6 +5,7 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
+from sealfit.closure.left_out import between_speeds
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
 from sealfit.fit.joint import _searched, fit, fit_declared, fit_with_effects
@@ -186,6 +187,33 @@ def test_nine_files_that_a_line_through_three_speeds_misses_by_a_fifth_are_a_cur
     force = np.array([forces[day][k] for day, k in zip(rows.values("aging_days"), speed, strict=True)])
     rows = replace(rows, force=force * np.sign(rows.speed))
     assert set(declare(rows).stribeck.values()) == {"interpolated"}
+
+
+def test_between_four_speeds_the_force_does_not_fall_far_below_that_at_the_fastest():
+    """Without a prior of mu_s - mu_c half of the fits have mu_c = 0, and forces that are 60 % too low."""
+    errors = []
+    for seed in range(12):
+        one = {"days": (4.0,), "temperatures": (60.0,), "repeats": 1, "noise_N": 0.01, "gain": 0.0}
+        rows = rows_of(seed=seed, bins=4, speeds=(0.04, 0.4, 3.8, 36.0), **one)
+        files = rows.codes("file")
+        gain = 1 + 0.02 * np.random.default_rng(seed).standard_normal(files.max() + 1)[files]
+        true = [r.load * seal_mu(r.speed) for r in (rows, between_speeds(rows))]
+        fitted = fit_declared(replace(rows, force=true[0] * gain))
+        force = evaluate(fitted.model, between_speeds(rows), jacobian=False)[0]
+        errors.append(np.abs(force / true[1] - 1).max())
+    assert np.median(errors) < 0.07
+    assert max(errors) < 0.25
+
+
+def seal_mu(speed):
+    return 0.13 + 0.09 * np.exp(-((speed / 3.6) ** 2)) + 2e-4 * speed
+
+
+def test_a_large_viscous_force_that_the_speeds_determine_keeps_its_size():
+    rows = rows_of(bins=4, speeds=tuple(np.geomspace(0.1, 100.0, 9)), days=(), repeats=1)
+    fitted = fit_declared(replace(rows, force=rows.load * (seal_mu(rows.speed) + 2e-3 * rows.speed)))
+    place = [p.quantity for p in fitted.model.declared.parameters].index("sigma_2")
+    assert fitted.model.theta[place] / rows.load[0] == pytest.approx(2.2e-3, rel=0.01)
 
 
 def test_law_needs_three_days():

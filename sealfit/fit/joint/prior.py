@@ -1,7 +1,8 @@
-r"""Priors of the fitted numbers: weak ones on v_s and b, and the roughness penalty of free shapes.
+r"""Priors of fitted numbers: weak ones of v_s, b and mu_s - mu_c, and the roughness penalty of free shapes.
 
 log v_s and log b have a Gaussian prior with standard deviation 3, a factor of 20, centred at the value of the
-global search. It determines a parameter that the data do not, and is negligible otherwise.
+global search. mu_s - mu_c has one centred at 0, with a standard deviation of half of the friction. Both
+determine a parameter that the data do not, and are negligible otherwise.
 
 A free shape is a smoothing spline with many knots. Its amplitudes c have the prior precision :math:`\lambda
 S`, where :math:`c^T S c` is the integral of the squared second derivative; a straight line, or a plane for a
@@ -45,11 +46,14 @@ def roughness_of(term: Term) -> np.ndarray:
 def precision_of(model: Model) -> np.ndarray:
     """Return the prior's precision of the fitted numbers, shape (model.size, model.size).
 
-    It is 1/3^2 for log v_s and log b, the smoothness times S for amplitudes of free shapes, and 0 elsewhere.
+    It is 1/3^2 for log v_s and log b, that of mu_s - mu_c, the smoothness times S for amplitudes of free
+    shapes, and 0 elsewhere.
     """
     own = [1.0 / PRIOR_SD**2 if p.quantity in LOGARITHMIC else 0.0 for p in model.declared.parameters]
     precision = np.zeros((model.size, model.size))
     precision[range(len(own)), range(len(own))] = own
+    for pair, sd in model.declared.drops.items():
+        precision[np.ix_(pair, pair)] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / sd**2
     for number, term in enumerate(model.terms):
         if term.smoothness is not None:
             place = model.term_slice(number)
@@ -58,8 +62,13 @@ def precision_of(model: Model) -> np.ndarray:
 
 
 def centre_of(model: Model) -> np.ndarray:
-    """Return the prior's mean, shape (model.size,): present values, and 0 for amplitudes of free shapes."""
+    """Return the prior's mean, shape (model.size,).
+
+    It is 0 for each mu_s and mu_c, of which only the difference has a prior, and for amplitudes of free
+    shapes; elsewhere it is the present value.
+    """
     centre = model.vector()
+    centre[[number for pair in model.declared.drops for number in pair]] = 0.0
     for number, term in enumerate(model.terms):
         if term.smoothness is not None:
             centre[model.term_slice(number)] = 0.0
