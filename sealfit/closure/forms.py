@@ -214,18 +214,22 @@ def surface_term(one: Channel, other: Channel, acts_on: str, operation: str) -> 
     return Term(free_effect(SURFACE, fixed), names, acts_on, operation, fixed, smoothness=1.0)
 
 
-def _knots(distinct: np.ndarray, count: int) -> tuple[float, ...]:
-    """Return `count` knots for sorted values of a channel, or the distinct values if there are no more."""
-    distinct = distinct[np.r_[True, np.diff(scaled(distinct)) > KNOTS_APART]]
-    if distinct.size <= count:
-        knots = distinct
-    elif distinct[0] > 0 and distinct[-1] / distinct[0] >= WIDE:
-        knots = np.geomspace(distinct[0], distinct[-1], count)
-    elif count > FREE_DF + 1:
-        knots = np.linspace(distinct[0], distinct[-1], count)
-    else:
-        knots = np.quantile(distinct, np.linspace(0, 1, count))
-    return tuple(float(k) for k in knots)
+def _knots(values: np.ndarray, count: int) -> tuple[float, ...]:
+    """Return up to `count` knots for sorted values of a channel, or the distinct values if there are no more.
+
+    Even knots that are nearest to no value are left out: in a gap between the values nothing determines them.
+    """
+    at, kept = scaled(values), [0]
+    while (after := int(at.searchsorted(at[kept[-1]] + KNOTS_APART, "right"))) < at.size:
+        kept.append(after)
+    wide = values[0] > 0 and values[-1] / values[0] >= WIDE
+    if len(kept) <= count:
+        return tuple(values[kept].tolist())
+    if not wide and count <= FREE_DF + 1:
+        return tuple(np.quantile(values[kept], np.linspace(0, 1, count)).tolist())
+    knots = (np.geomspace if wide else np.linspace)(values[0], values[-1], count)
+    middles = np.sqrt(knots[1:] * knots[:-1]) if wide else (knots[1:] + knots[:-1]) / 2
+    return tuple(knots[np.bincount(middles.searchsorted(values), minlength=count) > 0].tolist())
 
 
 def periodic_terms(
