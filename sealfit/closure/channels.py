@@ -47,6 +47,7 @@ class Channel:
     values: np.ndarray  # (n,) float or str
     unit: str  # "sample" or a nesting level
     grouping: bool = False  # each category in one unit only: an identifier
+    added_only: bool = False  # whether only an added force is tested
 
     @property
     def numeric(self) -> bool:
@@ -69,10 +70,14 @@ def searched(channels: Iterable[Channel], rows: Rows) -> list[Channel]:
     """Return the channels that are searched: all, or those that do not increase along strokes.
 
     Where strokes end before the friction is steady, a residual along them is an error of the bristle model,
-    by which the rest of the rise is taken out.
+    by which the rest of the rise is taken out. That error opposes the motion. A force that time adds, such as
+    a drift of the sensor, does not, so it is searched where strokes go both ways.
     """
-    left_out = ALONG if too_short(rows) else ()
-    return [c for c in channels if c.name not in left_out]
+    if not too_short(rows):
+        return list(channels)
+    both_ways = rows.speed.min() < 0 < rows.speed.max()
+    drifts = [replace(c, added_only=True) for c in channels if both_ways and c.name == "time_s"]
+    return [*(c for c in channels if c.name not in ALONG), *drifts]
 
 
 def too_short(rows: Rows) -> bool:

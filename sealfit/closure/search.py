@@ -163,7 +163,7 @@ def _declared(fitted: Fitted, acts_on: str) -> bool:
 def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool, loads: bool) -> bool:
     if channel.name == "direction":
         return both_ways
-    if channel.grouping:
+    if channel.grouping or channel.added_only:
         return both_ways and (acts_on, operation) == ("force", "add")
     if channel.name == "speed_mm_s":  # mu_s, mu_c, v_s and sigma_2 describe the dependence on it
         return acts_on in (("mu", "a", "sigma_2") if loads else ("mu", "a"))
@@ -235,7 +235,7 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
     return [
         c
         for c in channels
-        if not (c.grouping or c.name in NOT_IN_PAIRS)
+        if not (c.grouping or c.added_only or c.name in NOT_IN_PAIRS)
         and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
     ]
 

@@ -57,6 +57,23 @@ def test_effects_along_strokes_are_not_searched_where_strokes_end_before_the_fri
     )
 
 
+def test_a_drift_of_the_sensor_is_found_in_short_strokes_that_go_both_ways():
+    """What is left of the rise opposes the motion; a force that time adds does not."""
+    bins = make_bins(repeats=2, bins=4, directions=(1, -1), noise_N=0.05)
+    rest = -0.03 * bins["force_N"] * np.exp(-bins["distance_mm"] / 20)
+    left = bins.assign(presliding_N=-0.03 * bins["force_N"], force_N=bins["force_N"] + rest)
+    found = []
+    for drift in (0.0, 0.02):  # N/s
+        rows = make_rows(left.assign(force_N=left["force_N"] + drift * left["time_s"]), has_aging=True)
+        channels = searched(find_channels(rows), rows)
+        assert {c.name for c in channels} & set(ALONG) == {"time_s"}
+        tested = search(ScoreTests(fit_declared(rows)), channels, np.random.default_rng(0))
+        assert {c.target for c in tested if "time_s" in c.channels} == {("force", "add")}
+        found.append(min(c.p_value for c in tested if "time_s" in c.channels))
+    assert found[0] > 0.005
+    assert found[1] < 1e-6
+
+
 def test_a_text_of_more_than_a_hundred_values_is_no_channel():
     bins = make_bins(days=(1.0, 2.0, 4.0, 8.0, 16.0, 32.0), bins=2)
     number = bins["file"].factorize()[0]
