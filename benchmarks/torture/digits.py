@@ -420,6 +420,8 @@ def _compare(name: str, one: pd.DataFrame, other: pd.DataFrame, scatter_N: float
         se = known_se if known_se is not None else np.full(a.size, np.nan)
         if column.endswith("_N") or name in ("shapes", "shape_points"):
             se = np.where(np.isfinite(se) & (se > ZERO), se, scatter_N)
+        if name == "shape_points":  # that of a point of two files may be near 0 by chance
+            se = np.maximum(se, np.median(se))
         if column not in STEEP_COLUMNS:
             of_se = np.divide(away, se, out=np.full_like(away, np.inf), where=np.isfinite(se) & (se > 0))
             by_se = beyond & (of_se <= OF_SE)
