@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -61,8 +61,8 @@ def outlier_files(rows: Rows) -> list[OutlierFile]:
 
     Model and scatter are fitted without the file, so that it does not hide itself. It is an outlier if the
     gain that would explain it is significant beside the scatter of the others. These are then judged without
-    it. In linear regression the test is that of the deletion residual (Cook & Weisberg 1982, *Residuals and
-    Influence in Regression*, section 2.2.2).
+    it. If another file may as well be the wrong one, none is left out. In linear regression the test is that
+    of the deletion residual (Cook & Weisberg 1982, *Residuals and Influence in Regression*, section 2.2.2).
     """
     rows = rows.sparse(ROWS)
     fitted, found = fit_declared(rows), []
@@ -71,9 +71,19 @@ def outlier_files(rows: Rows) -> list[OutlierFile]:
         one, kept = min(tried, key=lambda pair: pair[0].p_value, default=(None, fitted))
         if one is None or one.p_value > OUTLIER_P or abs(one.deviation) < OUTLIER_SHARE:
             break
+        if _may_be_another(one, kept, [other for other, _ in tried]):
+            break
         found.append(one)
         fitted = kept
     return sorted(found, key=lambda one: -abs(one.deviation))
+
+
+def _may_be_another(one: OutlierFile, kept: Fitted, tried: Sequence[OutlierFile]) -> bool:
+    """Whether another file may be the wrong one: significant with `one` in the data, and not without it."""
+    rows = kept.rows
+    names = rows.table["record"].to_numpy()[rows.groups.starts["file"]].tolist()
+    others = [other for other in tried if other is not one and other.p_value <= OUTLIER_P]
+    return any(_without(kept, names.index(other.file))[0].p_value > OUTLIER_P for other in others)
 
 
 def _df(fitted: Fitted) -> int:

@@ -62,10 +62,12 @@ def test_one_of_ten_files_that_went_wrong_is_found_though_the_curve_follows_it()
         return 9.0 * (1 + 0.15 * np.exp(-((speed / 5.0) ** 2)) + 0.0004 * speed)
 
     design = {"days": (), "temperatures": (), "speeds": tuple(np.geomspace(1.0, 480.0, 10)), "repeats": 1}
+    found = []
     for number in range(10):
         bins, files = bins_with({number: 1.2}, gain=0.0005, effect=shallow, **design)
-        (one,) = outlier_files(make_rows(bins, has_aging=True))
-        assert one.file == files[number]
+        found.append([one.file for one in outlier_files(make_rows(bins, has_aging=True))])
+        assert found[-1] in ([], [files[number]])
+    assert found.count([]) <= 2  # either of the two slowest may be the wrong one
 
 
 def test_few_files_that_scatter_are_no_outliers():
@@ -75,3 +77,14 @@ def test_few_files_that_scatter_are_no_outliers():
         one_condition = {"days": (), "temperatures": (), "repeats": 1, "gain": rng.uniform(0.003, 0.05)}
         bins = make_bins(seed, bins=4, noise_N=0.05, speeds=speeds, **one_condition)
         assert outlier_files(make_rows(bins, has_aging=True)) == []
+
+
+def test_no_file_is_left_out_where_another_may_be_the_wrong_one():
+    """Twelve files, three speeds both ways: without either of two files the others agree."""
+    design = {"days": (4.0,), "temperatures": (60.0,), "speeds": (1.0, 10.0, 100.0), "directions": (1, -1)}
+    found = []
+    for number in range(12):
+        bins, files = bins_with({number: 1.2}, gain=0.001, repeats=1, **design)
+        found.append([one.file for one in outlier_files(make_rows(bins, has_aging=True))])
+        assert found[-1] in ([], [files[number]])
+    assert 0 < found.count([]) < 6
