@@ -421,7 +421,7 @@ def _compare(name: str, one: pd.DataFrame, other: pd.DataFrame, scatter_N: float
         if column.endswith("_N") or name in ("shapes", "shape_points"):
             se = np.where(np.isfinite(se) & (se > ZERO), se, scatter_N)
         if name == "shape_points":  # that of a point of two files may be near 0 by chance
-            se = np.maximum(se, np.median(se))
+            se = np.maximum(se, 0.1 * np.median(se))
         if column not in STEEP_COLUMNS:
             of_se = np.divide(away, se, out=np.full_like(away, np.inf), where=np.isfinite(se) & (se > 0))
             by_se = beyond & (of_se <= OF_SE)

@@ -2,7 +2,7 @@ r"""Priors of fitted numbers: weak ones of v_s, b and mu_s - mu_c, and the rough
 
 log v_s and log b have a Gaussian prior with standard deviation 3, a factor of 20, centred at the value of the
 global search. mu_s - mu_c has one centred at 0, with a standard deviation of half of the friction. Both
-determine a parameter that the data do not, and are negligible otherwise.
+determine a parameter that the data do not, and move others by hundredths of their standard errors.
 
 A free shape is a smoothing spline with many knots. Its amplitudes c have the prior precision :math:`\lambda
 S`, where :math:`c^T S c` is the integral of the squared second derivative; a straight line, or a plane for a
