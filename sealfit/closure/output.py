@@ -328,8 +328,12 @@ def _usual(values: np.ndarray, *, far: bool) -> float | str:
 
 
 def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
-    """Return the free shape fitted instead of an effect, with its mean; None for periodic ones and levels."""
+    """Return the free shape fitted instead of an effect, with its mean; None for periodic ones and levels.
+
+    It is None beside another free shape of the same channel and quantity too: only their sum is identifiable.
+    """
     term = after.model.terms[number]
+    free_shapes = [(t.channels, t.target) for t in after.model.terms if t.effect.id == SMOOTH]
     if (
         len(term.channels) != 1
         or term.effect.periodic
@@ -337,7 +341,7 @@ def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
         or np.isnan(x).any()
     ):
         return None
-    if term.channels[0] == "direction":
+    if term.channels[0] == "direction" or (term.channels, term.target) in free_shapes:
         return None
     rows = after.rows
     values = np.abs(rows.speed) if term.channels[0] == "speed_mm_s" else rows.values(term.channels[0])

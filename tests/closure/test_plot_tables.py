@@ -98,3 +98,15 @@ def test_a_surface_is_drawn_along_both_its_channels_with_the_other_at_its_mean()
         slope = np.polyfit(drawn["x"], drawn["value"].astype(float), 1)[0]
         assert slope == pytest.approx(0.001 / 40 * means[other], rel=0.1)
         assert (points["channel"] == own).sum() > 5
+
+
+def test_beside_a_free_shape_of_its_channel_an_effect_has_no_free_shape():
+    """Only the sum of two free shapes of one channel is identifiable; one alone may swing anywhere."""
+    rows = make_rows(bins_helpers.make_bins(bins=6, temperatures=(60.0,), noise_N=0.02), has_aging=True)
+    step = Term(EFFECTS["step"], ("distance_mm",), "force", "add")
+    model = start_model(rows).with_term(step, {"A": 0.1, "x_0": 20.0})
+    alone = shape_table(fit(model, rows), Config())
+    free = free_term(Channel("distance_mm", rows.values("distance_mm"), "sample"), "force", "add", knots=8)
+    both = shape_table(fit(model.with_term(free, dict.fromkeys(free.effect.linear, 0.0)), rows), Config())
+    assert alone["free"].notna().all()
+    assert both["free"].isna().all()
