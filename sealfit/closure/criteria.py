@@ -1,4 +1,4 @@
-"""Every threshold of the loop, with its reason. Limits of time and memory are defined where they are used."""
+"""Thresholds of the loop, each with its reason. Those of a single step are defined in its module."""
 
 # ---------------------------------------------------------------- evidence: how many units a test needs
 # Number of runs from which a contrast within files is tested between runs because repeats share a set-up.
