@@ -22,14 +22,11 @@ def arrhenius_aging_shape(inputs, *, A, E):
     r"""Arrhenius acceleration of aging with temperature: of the loss a, or of the time b of its onset.
 
     Oxidation, scission and cross-linking of network bonds have an activation energy E, and a rate
-    proportional to :math:`e^{-E / R T}`. A share A of the aging is of that kind; the rest is assumed to be
-    independent of temperature,
-
-    .. math:: h = A [e^{E / R\, (1 / T_{ref} - 1 / T)} - 1]
-
-    with T in kelvin. A = 1 is Arrhenius' law, a factor :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a, the
-    rate of the loss, E is positive. On b, a time, E is negative, and A = 1 shifts the curve of Eq. 15 along
-    the logarithm of time (time-temperature superposition). Unaged rubber does not change.
+    proportional to :math:`e^{-E / R T}`, T in kelvin. A share A of the aging is of that kind; the rest is
+    assumed to be independent of temperature. A = 1 is Arrhenius' law, a factor
+    :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a, the rate of the loss, E is positive. On b, a time, E is
+    negative, and A = 1 shifts the curve of Eq. 15 along the logarithm of time (time-temperature
+    superposition). Unaged rubber does not change.
 
     Two temperatures determine one parameter, three distinguish A and E; for a small exponent only A E is
     determined. The declared model has a separate a and b for each series. The effect can be seen only if one
@@ -78,13 +75,9 @@ def compression_factor_shape(inputs, *, A):
     r"""Compression during aging: it changes aging, or friction after aging.
 
     A seal ages under compression. Strain changes which bonds form and break (compression set), and the
-    surface has less contact with air. With c the height in per cent of the original height, to first order,
-
-    .. math:: h = A (100 - c) / 100
-
-    A is the relative change per full compression, so that 80 % gives A / 5; the reference is uncompressed
-    rubber. On a or b it changes aging; on mu it also changes the friction of unaged rubber with a
-    compression.
+    surface has less contact with air. c is the height in per cent of the original height, and A the relative
+    change per full compression, so that 80 % gives A / 5. On a or b it changes aging; on mu it also changes
+    the friction of unaged rubber with a compression.
 
     The declared model has a separate a and b for each series. An effect on a or b can be seen only if one
     series contains several heights.
@@ -120,10 +113,7 @@ COMPRESSION_FACTOR = Effect(
 def aging_floor_shape(inputs, *, A, t_f):
     r"""Aging with a floor: after some day the coefficient falls less than by the logarithm.
 
-    Eq. 15 has no limit, but aging ends when the reactants are consumed. After a day t_f the fall is reduced,
-
-    .. math:: h = A \ln(t / t_f) \quad (t > t_f), \qquad h = 0 \quad (t \le t_f)
-
+    Eq. 15 has no limit, but aging ends when the reactants are consumed. After a day t_f the fall is reduced.
     As a change of mu_s or mu_c, A = a stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t
     well beyond b, and a smaller A slows it. As a factor on mu, A is relative to mu.
     """
@@ -154,11 +144,7 @@ def aging_induction_shape(inputs, *, A, t_i):
     r"""Aging with an induction time: at first the coefficient falls less than by the logarithm.
 
     Antioxidants delay oxidation until they are consumed. The difference from Eq. 15 is zero at day 0, largest
-    at t_i and vanishes later:
-
-    .. math:: h = A \frac{t}{t_i} e^{1 - t / t_i}
-
-    A is the largest difference.
+    (A) at t_i, and vanishes later.
     """
     ratio = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0) / t_i
     return A * ratio * np.exp(1 - ratio)
@@ -187,13 +173,9 @@ def aging_delay_shape(inputs, *, A, t_i, b):
     r"""Aging with a delay: Eq. 15 starts at a day t_i.
 
     Antioxidants delay oxidation until they are consumed. The declared law starts at day 0, so the effect is
-    the difference of the two laws,
-
-    .. math:: h = A \left[\ln(1 + t / b) - \ln(1 + \max(t - t_i, 0) / b)\right]
-
-    which is zero at day 0 and vanishes as :math:`A t_i / t`. If A is the a of the declared law (relative to
-    mu, for a factor) and b its b, the law with the effect is Eq. 15 with :math:`t - t_i` for t.
-    `aging_induction` is a smooth delay.
+    the difference of the two laws, which is zero at day 0 and vanishes as :math:`A t_i / t`. If A is the a of
+    the declared law (relative to mu, for a factor) and b its b, the law with the effect is Eq. 15 with
+    :math:`t - t_i` for t. `aging_induction` is a smooth delay.
     """
     days = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0)
     return A * (np.log1p(days / b) - np.log1p(np.maximum(days - t_i, 0.0) / b))
@@ -234,11 +216,7 @@ def stribeck_speed_aging_shape(inputs, *, A, t_0):
 
     v_s is the speed of the transition from boundary friction to a film or a molecular time scale. Hardened
     rubber conforms less to roughness and relaxes more slowly, which changes v_s. As for the coefficients, the
-    change is a logarithm of time,
-
-    .. math:: h = A \ln(1 + t / t_0)
-
-    A is the relative change of v_s per factor e of the aging time, zero for unaged rubber.
+    change is a logarithm of time.
     """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 
@@ -274,12 +252,7 @@ def viscosity_aging_shape(inputs, *, A, t_0):
     r"""Viscous coefficient that changes with age.
 
     The declared model has one sigma_2 for all days of a series. The remaining lubricant and the damping of
-    the rubber change with age. As for the coefficients, the change is a logarithm of time,
-
-    .. math:: h = A \ln(1 + t / t_0)
-
-    A is the change of sigma_2 per factor e of the aging time (as a factor: relative to it), zero for unaged
-    rubber.
+    the rubber change with age. As for the coefficients, the change is a logarithm of time.
     """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 

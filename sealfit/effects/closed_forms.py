@@ -21,8 +21,6 @@ from sealfit.effects.contract import (
     log_ratio,
     log_ratio_from_zero,
     not_negative,
-    positive,
-    reference,
     sine_attenuation,
 )
 
@@ -38,7 +36,7 @@ def linear_shape(inputs, *, A):
 
     Along `run_order` it is the drift along the campaign counted in runs.
     """
-    return A * (deviation(inputs, CHANNEL))
+    return A * deviation(inputs, CHANNEL)
 
 
 LINEAR = closed_form(
@@ -84,7 +82,7 @@ LINEAR_EACH_WAY = closed_form(
 
 
 def quadratic_shape(inputs, *, A, B):
-    r"""Parabola in any channel, zero at its reference."""
+    """Parabola in any channel, zero at its reference."""
     away = deviation(inputs, CHANNEL)
     return A * away + B * away**2
 
@@ -112,7 +110,7 @@ def log_shape(inputs, *, A):
 
     A is the change per factor e of the channel; NaN where the channel is not positive.
     """
-    return A * np.log(positive(inputs[CHANNEL]) / positive(reference(inputs, CHANNEL, 1.0)))
+    return A * log_ratio(inputs, CHANNEL)
 
 
 LOG = closed_form(
@@ -163,7 +161,7 @@ def power_shape(inputs, *, A, n):
     where the channel is not positive.
     """
     # expm1 keeps all digits where the power is close to one.
-    return A * np.expm1(n * np.log(positive(inputs[CHANNEL]) / positive(reference(inputs, CHANNEL, 1.0))))
+    return A * np.expm1(n * log_ratio(inputs, CHANNEL))
 
 
 POWER = closed_form(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -29,7 +29,7 @@ PHASES = tuple(np.arange(4) * np.pi / 4)
 
 Target = Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"]
 Operation = Literal["add", "multiply"]
-TARGETS = ("force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b")
+TARGETS = get_args(Target)
 
 # Targets of a closed form or free shape, most likely first.
 ANYWHERE: tuple[tuple[Target, Operation], ...] = (
@@ -114,7 +114,7 @@ class Effect:
 
     def __post_init__(self) -> None:
         for target, operation in self.acts_on:
-            if target not in TARGETS or operation not in ("add", "multiply"):
+            if target not in TARGETS or operation not in get_args(Operation):
                 raise ParameterError(f"effect {self.id}: cannot act on {target} by {operation}.")
         if not any(p.linear for p in self.parameters):
             raise ParameterError(f"effect {self.id}: mark at least one parameter as linear (its amplitude).")
@@ -180,7 +180,7 @@ def deviation(inputs: Mapping[str, object], name: str) -> np.ndarray:
 
 def log_ratio(inputs: Mapping[str, object], name: str) -> np.ndarray:
     """Return the logarithm of a channel over its reference, shape (n,); NaN where it is not positive."""
-    return np.log(positive(inputs[name]) / reference(inputs, name, 1.0))
+    return np.log(positive(inputs[name]) / positive(reference(inputs, name, 1.0)))
 
 
 def log_ratio_from_zero(inputs: Mapping[str, object], name: str) -> np.ndarray:

@@ -144,13 +144,9 @@ OFFSET_SLOPE = Effect(
 def asymmetry_shape(inputs, *, A):
     r"""Direction asymmetry: a parameter that differs between the two directions.
 
-    Friction of a lip seal, a misaligned sample or a polished track depends on the direction. With d = +1 or
-    -1,
-
-    .. math:: h = A d / 2
-
-    A is the forward value minus the backward one, relative to their mean, or in its unit for an added change.
-    The mean of the two directions does not change.
+    Friction of a lip seal, a misaligned sample or a polished track depends on the direction d, +1 or -1. A is
+    the forward value minus the backward one, relative to their mean, or in its unit for an added change. The
+    mean of the two directions does not change.
     """
     return A * np.asarray(inputs["direction"], dtype=float) / 2
 
@@ -185,13 +181,10 @@ ASYMMETRY = Effect(
 def campaign_drift_shape(inputs, *, A):
     r"""Drift along the campaign: a slow change over the days of testing.
 
-    A track that polishes, a sensor that ages, rubber that goes on aging in the laboratory's air:
-
-    .. math:: h = A t
-
-    with t the time since the campaign's first file. A is the change per time, relative for friction, in N for
-    the zero. A drift along the order of runs is `linear` in `run_order`. If tests follow the calendar of
-    aging it is not distinguishable from the aging law.
+    It may be due to a track that polishes, a sensor that ages, or rubber that goes on aging in the
+    laboratory's air. t is the time since the campaign's first file. A is the change per time, relative for
+    friction, in N for the zero. A drift along the order of runs is `linear` in `run_order`. If tests follow
+    the calendar of aging it is not distinguishable from the aging law.
     """
     return A * np.asarray(inputs["elapsed_h"], dtype=float)
 
@@ -229,11 +222,7 @@ def _shows_days(hours: np.ndarray) -> bool:
 def day_and_night_shape(inputs, *, A, t_0):
     r"""Change with the time of day: laboratory, drive and oil are warmer in the afternoon than at night.
 
-    The first Fourier term of anything that repeats every 24 h,
-
-    .. math:: h = A \cos\big(2 \pi (t - t_0) / 24\,\mathrm{h}\big)
-
-    with t the time since the campaign's first file. With files in working hours only it describes the change
+    t is the time since the campaign's first file. With files in working hours only it describes the change
     within them and must not be used for the night.
     """
     hours = np.asarray(inputs["elapsed_h"], dtype=float) - t_0

@@ -22,12 +22,8 @@ def conditioning_shape(inputs, *, A, n_0):
 
     Filled rubber softens on its first deformations and keeps what it lost: stress falls most in the first
     cycle and reaches a steady state after some 10. Softer rubber changes contact area and hysteresis, so
-    friction changes along with it,
-
-    .. math:: h = A (1 - e^{-(n - 1) / n_0})
-
-    with n the repeat. A is the relative change after conditioning. The exponential has a limit, as
-    conditioning ends, unlike a logarithm (`log`); three repeats hardly distinguish the two.
+    friction changes along with it. n is the repeat. The exponential has a limit, as conditioning ends, unlike
+    a logarithm (`log`); three repeats hardly distinguish the two.
     """
     before = np.maximum(np.asarray(inputs["repeat"], dtype=float) - 1, 0.0)
     return -A * np.expm1(-before / n_0)
@@ -58,12 +54,9 @@ def run_in_shape(inputs, *, A, n_0):
     r"""Run-in over strokes: the contact changes over the first strokes of a record and settles.
 
     Sliding smooths the rubber's skin, spreads a film or clears it away; friction starts high or low and
-    approaches a steady value stroke by stroke,
-
-    .. math:: h = A (1 - e^{-(n - 1) / n_0})
-
-    with n the stroke in its file. A is the relative change after run-in. It restarts in every file; a change
-    that lasts from file to file is a drift along the campaign, and one from repeat to repeat is conditioning.
+    approaches a steady value stroke by stroke. n is the stroke in its file. It restarts in every file; a
+    change that lasts from file to file is a drift along the campaign, and one from repeat to repeat is
+    conditioning.
     """
     before = np.maximum(np.asarray(inputs["stroke"], dtype=float) - 1, 0.0)
     return -A * np.expm1(-before / n_0)
@@ -93,12 +86,7 @@ def rest_strengthening_shape(inputs, *, A, t_0):
     r"""Strengthening at rest: static friction grows with the time of stationary contact.
 
     Contacts creep and bonds form during rest: the static coefficient grows with the logarithm of the time at
-    rest,
-
-    .. math:: h = A \ln(1 + t / t_0)
-
-    A is the relative growth per factor e of the time at rest, 0.01 to 0.05 for most solids; t_0 is the time
-    at which growth sets in. It needs a column `rest_s`.
+    rest. A is 0.01 to 0.05 for most solids. It needs a column `rest_s`.
     """
     return A * np.log1p(not_negative(inputs["rest_s"]) / t_0)
 
@@ -130,12 +118,8 @@ def load_exponent_shape(inputs, *, A):
     r"""Load exponent of rubber: friction grows more slowly than the load, so the coefficient falls with it.
 
     The true contact area of a smooth elastic asperity goes with the load to the power 2/3, so that :math:`F
-    \propto N^n` and :math:`\mu = \mu_{ref} (N / N_{ref})^{n - 1}` with n between 2/3 and 1. To first order in
-    n - 1,
-
-    .. math:: h = A \ln(N / N_{ref}), \qquad A \approx n - 1
-
-    which is fitted, as A is then a linear parameter. The neglected term is :math:`\frac12 A^2 \ln^2(N /
+    \propto N^n` and :math:`\mu = \mu_{ref} (N / N_{ref})^{n - 1}` with n between 2/3 and 1. The first order
+    in n - 1 is fitted, as A is then a linear parameter. The neglected term is :math:`\frac12 A^2 \ln^2(N /
     N_{ref})`, 0.7 % of friction at A = -1/6 and twice the load; `power` is the full curve.
 
     If the local coefficient depends on the local pressure, :math:`\mu(p) \propto p^{n - 1}`, the exponent is
@@ -168,13 +152,10 @@ def stribeck_exponent_shape(inputs, *, A, v_s, n):
 
     The declared curve falls from mu_s to mu_c as a Gaussian of the speed, by convention. A wide distribution
     of contact strengths gives n near 1 or below; the sudden formation of a film gives n well above 2. The
-    effect is the difference of the two decays,
-
-    .. math:: h = A [e^{-(|v| / v_s)^n} - e^{-(v / v_s)^2}]
-
-    which is zero at rest, at v_s, far above v_s, and everywhere for n = 2. With A = mu_s - mu_c and the
-    declared v_s, the curve with the effect is exactly :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`. As
-    a factor on mu, A is relative to mu, and this is an approximation for small changes of mu around v_s.
+    effect is the difference of the two decays, which is zero at rest, at v_s, far above v_s, and everywhere
+    for n = 2. With A = mu_s - mu_c and the declared v_s, the curve with the effect is exactly
+    :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`. As a factor on mu, A is relative to mu, and this is an
+    approximation for small changes of mu around v_s.
 
     Three parameters here and four of the declared curve need seven speeds in one direction, several on each
     side of v_s. Near n = 2 the shape is :math:`A (2 - n) r^2 \ln r\, e^{-r^2}` with :math:`r = |v| / v_s`, so
@@ -213,12 +194,9 @@ STRIBECK_EXPONENT = Effect(
 def log_rate_shape(inputs, *, A):
     r"""Logarithmic rate dependence: friction that changes by the same amount for every factor of the speed.
 
-    The stress of contacts that break by thermal activation is proportional to the logarithm of the rate,
-
-    .. math:: h = A \ln(|v| / v_{ref})
-
-    A is the relative change per factor e of the speed: positive if the breaking of bonds dominates
-    (strengthening with rate), negative if the age of the contacts does. It is not defined at rest.
+    The stress of contacts that break by thermal activation is proportional to the logarithm of the rate. A is
+    positive if the breaking of bonds dominates (strengthening with rate), negative if the age of the contacts
+    does. It is not defined at rest.
     """
     return A * np.log(positive(np.abs(inputs["speed_mm_s"])) / reference(inputs, "speed_mm_s", 1.0))
 
@@ -279,12 +257,9 @@ def grosch_peak_shape(inputs, *, A, v_p, w):
     r"""Viscoelastic peak over log speed (Grosch): rubber friction has a maximum where its loss has one.
 
     Deformation by asperities and molecular adhesion dissipate most at different rates. Each gives a bell over
-    the logarithm of the speed, shifted by temperature (WLF),
-
-    .. math:: h = A \exp[-(\log_{10}(|v| / v_p) / w)^2]
-
-    A is the height of the bell, relative to the Stribeck curve or as an added coefficient of friction. The
-    height of a peak beyond the tested speeds is not determined.
+    the logarithm of the speed, shifted by temperature (WLF). A is the height of the bell, relative to the
+    Stribeck curve or as an added coefficient of friction. The height of a peak beyond the tested speeds is
+    not determined.
     """
     decades = np.log10(positive(np.abs(inputs["speed_mm_s"])) / v_p)
     return A * np.nan_to_num(np.exp(-((decades / w) ** 2)), nan=0.0)
@@ -318,12 +293,7 @@ def humidity_shape(inputs, *, A):
     r"""Humidity of the laboratory: a film of water between rubber and track.
 
     Water from the air weakens adhesion and lubricates at speed. Over the humidities of a laboratory the
-    effect is about linear,
-
-    .. math:: h = A (H - H_{ref})
-
-    A is the relative change per per cent of relative humidity. It needs a column `humidity_pct`; for another
-    name the effect is `linear`.
+    effect is about linear. It needs a column `humidity_pct`; for another name the effect is `linear`.
     """
     return A * (np.asarray(inputs["humidity_pct"], dtype=float) - reference(inputs, "humidity_pct", 0.0))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ROOM, Effect, Parameter, reference
+from sealfit.effects.contract import AMPLITUDE, ROOM, Effect, Parameter, deviation, reference
 
 
 def warming_time_shape(inputs, *, A, tau):
@@ -12,13 +12,9 @@ def warming_time_shape(inputs, *, A, tau):
 
     A body of heat capacity C that loses heat by conductance G, heated by the power P of friction, warms as
     :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. Rubber friction falls with
-    temperature above its peak (Grosch 1963), to first order in proportion, so mu is multiplied by one plus
-
-    .. math:: h = -A (1 - e^{-t / \tau})
-
-    A is the share of friction lost when warm, negative if friction rises with temperature. Time is that of
-    the stroke or the file; before 0 the contact is cold. The power is assumed to be the same in every run; in
-    `warming_power` it is proportional to speed and load.
+    temperature above its peak (Grosch 1963), to first order in proportion. A is negative if friction rises
+    with temperature. Time is that of the stroke or the file; before 0 the contact is cold. The power is
+    assumed to be the same in every run; in `warming_power` it is proportional to speed and load.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     return A * np.expm1(-time / tau)
@@ -49,11 +45,8 @@ def warming_distance_shape(inputs, *, A, s_0):
 
     At one normal force the heat up to a distance s is the work of friction, mu N s, at any speed. If the
     contact warms a fixed mass and loses heat to cold track in proportion to the distance slid, the
-    temperature approaches its limit over a distance instead of a time:
-
-    .. math:: h = -A (1 - e^{-s / s_0})
-
-    A is the share of friction lost when warm. Two speeds are needed to distinguish it from `warming_time`.
+    temperature approaches its limit over a distance instead of a time. Two speeds are needed to distinguish
+    it from `warming_time`.
     """
     distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0)
     return A * np.expm1(-distance / s_0)
@@ -83,18 +76,20 @@ def warming_power_shape(inputs, *, A, tau):
     r"""Warming by the power of friction: as `warming_time`, but fast and heavily loaded runs warm more.
 
     The power that friction turns into heat is :math:`P = \mu N |v|`, so the limit :math:`P / G` of a lumped
-    body's warming follows load times speed, and the share of friction lost follows it to first order:
-
-    .. math:: h = -A \frac{N |v|}{N_{ref} v_{ref}} (1 - e^{-t / \tau})
-
-    A is the share lost when warm at the reference load and speed, well below 1: the form is linear in the
-    temperature, and P is computed without the fall of mu. Several speeds or loads are needed to distinguish
-    it from `warming_time`.
+    body's warming follows load times speed, and the share of friction lost follows it to first order. A is
+    well below 1: the form is linear in the temperature, and P is computed without the fall of mu. Several
+    speeds or loads are needed to distinguish it from `warming_time`.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
-    speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
-    load = np.asarray(inputs["load_N"], dtype=float) / reference(inputs, "load_N", 1.0)
-    return A * load * speed * np.expm1(-time / tau)
+    return A * _relative_load(inputs) * _relative_speed(inputs) * np.expm1(-time / tau)
+
+
+def _relative_speed(inputs) -> np.ndarray:
+    return np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
+
+
+def _relative_load(inputs) -> np.ndarray:
+    return np.asarray(inputs["load_N"], dtype=float) / reference(inputs, "load_N", 1.0)
 
 
 WARMING_POWER = Effect(
@@ -134,21 +129,17 @@ def warming_conduction_shape(inputs, *, A):
 
     Rubber is a poor conductor: during a stroke heat enters a thin layer only. The surface of a half-space
     under a constant flux q warms by :math:`2 q \sqrt{t / (\pi k \rho c)}` in a time t. The flux of friction
-    is :math:`q \propto \mu p |v|`, and :math:`t = s / |v|`, so
-
-    .. math::
-        \Delta T \propto p |v| \sqrt{s / |v|} = p \sqrt{|v| s}, \qquad
-        h = -A \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
-
-    A is the share of friction lost at the reference speed and distance, at one load;
-    `warming_conduction_load` is for several loads. It is valid until the warm layer reaches the back of the
-    sample, and for a loss well below 1.
+    is :math:`q \propto \mu p |v|`, and :math:`t = s / |v|`, so that :math:`\Delta T \propto p \sqrt{|v| s}`.
+    This is for one load, `warming_conduction_load` for several. It is valid until the warm layer reaches the
+    back of the sample, and for a loss well below 1.
     """
-    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(
-        inputs, "distance_mm", 1.0
-    )
-    speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
-    return -A * np.sqrt(speed * distance)
+    return -A * _root_of_speed_times_distance(inputs)
+
+
+def _root_of_speed_times_distance(inputs) -> np.ndarray:
+    """Return the root of speed times distance, both relative to their references, shape (n,)."""
+    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0)
+    return np.sqrt(_relative_speed(inputs) * (distance / reference(inputs, "distance_mm", 1.0)))
 
 
 WARMING_CONDUCTION = Effect(
@@ -186,18 +177,9 @@ def warming_conduction_load_shape(inputs, *, A):
     r"""Warming limited by conduction into the rubber, at several loads: `warming_conduction` times the load.
 
     The flux of friction is :math:`q \propto \mu p |v|`. For a constant contact area the pressure p is
-    proportional to the load, so the surface warms as :math:`N \sqrt{|v| s}` and
-
-    .. math:: h = -A \frac{N}{N_{ref}} \sqrt{\frac{|v| s}{v_{ref} s_{ref}}}
-
-    A is the share of friction lost at the reference load, speed and distance; small against 1.
+    proportional to the load. A is small against 1.
     """
-    distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0) / reference(
-        inputs, "distance_mm", 1.0
-    )
-    speed = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / reference(inputs, "speed_mm_s", 1.0)
-    load = np.asarray(inputs["load_N"], dtype=float) / reference(inputs, "load_N", 1.0)
-    return -A * load * np.sqrt(speed * distance)
+    return -A * _relative_load(inputs) * _root_of_speed_times_distance(inputs)
 
 
 WARMING_CONDUCTION_LOAD = Effect(
@@ -242,15 +224,10 @@ def lab_temperature_shape(inputs, *, A):
     r"""Laboratory temperature: friction follows the room, a few per mille for each degree.
 
     Above its peak over speed, rubber friction falls with temperature. Over the few degrees of a laboratory
-    the effect is about linear,
-
-    .. math:: h = A (T - T_{ref})
-
-    A is the relative change per degree. It needs a column `lab_temperature_C`, which is not the aging
-    temperature; for another name the effect is `linear`.
+    the effect is about linear. It needs a column `lab_temperature_C`, which is not the aging temperature; for
+    another name the effect is `linear`.
     """
-    temperature = np.asarray(inputs["lab_temperature_C"], dtype=float)
-    return A * (temperature - reference(inputs, "lab_temperature_C", 0.0))
+    return A * deviation(inputs, "lab_temperature_C")
 
 
 LAB_TEMPERATURE = Effect(
