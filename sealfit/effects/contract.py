@@ -30,6 +30,14 @@ PHASES = tuple(np.arange(4) * np.pi / 4)
 Target = Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"]
 Operation = Literal["add", "multiply"]
 TARGETS = get_args(Target)
+# Declared quantities that an effect on each target changes. Effects on mu_s and mu_c come after aging.
+QUANTITIES_OF = {
+    "mu_0": ("mu_0s", "mu_0c"),
+    "a": ("a_s", "a_c"),
+    "b": ("b_s", "b_c"),
+    "v_s": ("v_s",),
+    "sigma_2": ("sigma_2",),
+}
 
 # Targets of a closed form or free shape, most likely first.
 ANYWHERE: tuple[tuple[Target, Operation], ...] = (

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from sealfit.effects.contract import QUANTITIES_OF
 from sealfit.physics.aging_laws import aging_law
 from sealfit.physics.lugre import stribeck_decay
 from sealfit.simulation.model import CONDITIONS, BoundEffect, Physics, declared_parameters, resolve_effects
@@ -162,14 +163,6 @@ def with_presliding(
 # ---------------------------------------------------------------- law
 # The noise-free truth: the declared model with its undeclared effects, in steady sliding.
 
-BY_TARGET = {
-    "mu_0": ("mu_0s", "mu_0c"),
-    "a": ("a_s", "a_c"),
-    "b": ("b_s", "b_c"),
-    "v_s": ("v_s",),
-    "sigma_2": ("sigma_2",),
-}
-
 
 @dataclass(frozen=True, slots=True)
 class SteadyLaw:
@@ -203,7 +196,7 @@ class SteadyLaw:
         """
         given = {name: np.atleast_1d(channels[name]) for name in CONDITIONS if name in channels}
         now = declared_parameters(self.physics, given)
-        for target, quantities in BY_TARGET.items():
+        for target, quantities in QUANTITIES_OF.items():
             for quantity in quantities:
                 now[quantity] = self._changed(target, now[quantity], channels)
         days = given.get("aging_days", np.zeros(1))

@@ -9,7 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 import pandas as pd
 
-from sealfit.effects.contract import CHANNEL, SAMPLES, SECOND, Effect, width_of
+from sealfit.effects.contract import CHANNEL, QUANTITIES_OF, SAMPLES, SECOND, Effect, width_of
 from sealfit.fit.joint.declared import QUANTITIES, Declared
 from sealfit.fit.joint.rows import ALONG, Rows
 from sealfit.fit.joint.tangent import Layout, Tangent, blocks_of
@@ -179,14 +179,6 @@ def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.nd
 
 # Quantities whose logarithm is fitted.
 LOGARITHMIC = ("b_s", "b_c", "v_s")
-# Declared quantities that an effect on each target changes. Effects on mu_s and mu_c come after aging.
-QUANTITIES_OF = {
-    "mu_0": ("mu_0s", "mu_0c"),
-    "a": ("a_s", "a_c"),
-    "b": ("b_s", "b_c"),
-    "v_s": ("v_s",),
-    "sigma_2": ("sigma_2",),
-}
 
 # A tangent of up to so many declared numbers (two or three series) is dense; blocks save no time there.
 DENSE_NUMBERS = 24
