@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
+from inspect import signature
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, reference
+from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, deviation
 from sealfit.errors import ParameterError
 
 # ---------------------------------------------------------------- categories
@@ -48,6 +49,7 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
         If there are fewer than two categories, or one stands twice.
     """
     names = _different(LEVELS, categories)
+    mean = shares(means, len(names))
     return Effect(
         id=LEVELS,
         label="levels of {x}",
@@ -60,13 +62,13 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
             Parameter(f"d_{k}", "{y}", 0.0, AMPLITUDE, f"{name} less {names[0]}", linear=True)
             for k, name in enumerate(names[1:], start=1)
         ),
-        shape=partial(_levels, names, shares(means, len(names))),
+        shape=partial(_levels, names, mean),
         source="Form: ours. One number per category, as in any analysis of variance.",
         # By hand: the last category has its own difference.
         worked=(
             {CHANNEL: names[-1]},
             {f"d_{k}": k / 10 for k in range(1, len(names))},
-            (len(names) - 1) / 10 - sum(k / 10 * m for k, m in enumerate(shares(means, len(names)))),
+            (len(names) - 1) / 10 - sum(k / 10 * m for k, m in enumerate(mean)),
         ),
         physical=False,
     )
@@ -135,12 +137,11 @@ def slopes_effect(categories: Sequence[str]) -> Effect:
 
 
 def _slopes(names: tuple[str, ...], inputs: Mapping, **values) -> np.ndarray:
-    x = np.asarray(inputs[CHANNEL], dtype=float) - reference(inputs, CHANNEL, 0.0)
     given = np.asarray(inputs[SECOND]).astype(str)
     slope = np.full(given.shape, np.nan)
     for k, name in enumerate(names, start=1):
         slope[given == name] = values[f"e_{k}"]
-    return slope * x
+    return slope * deviation(inputs, CHANNEL)
 
 
 def shares(means: Sequence[float] | None, count: int) -> tuple[float, ...]:
@@ -174,7 +175,7 @@ WIDE = 20.0
 
 
 def smooth_effect(
-    knots: Sequence[float], reference: float | None = None, means: Sequence[float] | None = None
+    knots: Sequence[float], x_ref: float | None = None, means: Sequence[float] | None = None
 ) -> Effect:
     """Return a natural cubic spline of the channel, with its values at the knots as amplitudes.
 
@@ -182,7 +183,7 @@ def smooth_effect(
     ----------
     knots : sequence of float
         At least two different channel values, in rising order.
-    reference : float, optional
+    x_ref : float, optional
         The shape is zero at the nearest knot, which has no amplitude; default the first knot.
     means : sequence of float, optional
         Mean of each B_j over the campaign, for a shape whose mean is zero.
@@ -206,7 +207,7 @@ def smooth_effect(
         raise ParameterError(
             f"smooth: knots {list(places)} must be two or more rising numbers.", fix="Sort them."
         )
-    zero = _nearest(places, reference)
+    zero, mean = _nearest(places, x_ref), shares(means, len(places))
     free = [j for j in range(len(places)) if j != zero]
     x = places[free[-1]]
     return Effect(
@@ -229,13 +230,13 @@ def smooth_effect(
             )
             for j in free
         ),
-        shape=partial(_spline, places, zero, shares(means, len(places))),
+        shape=partial(_spline, places, zero, mean),
         source="Form: ours. de Boor 2001, A Practical Guide to Splines, Springer; natural end conditions.",
         # By hand: at a knot the spline is that knot's amplitude, whatever the others are.
         worked=(
             {CHANNEL: x},
             {f"c_{j + 1}": float(j + 1) for j in free},
-            float(free[-1] + 1) - sum((j + 1) * shares(means, len(places))[j] for j in free),
+            float(free[-1] + 1) - sum((j + 1) * mean[j] for j in free),
         ),
         physical=False,
     )
@@ -263,7 +264,7 @@ def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def roughness(places: tuple[float, ...], reference: float | None = None) -> np.ndarray:
+def roughness(places: tuple[float, ...], x_ref: float | None = None) -> np.ndarray:
     r"""Return S with :math:`c^T S c = \int h''^2` of the spline through c at knots scaled to a range of 1.
 
     Parameters
@@ -271,7 +272,7 @@ def roughness(places: tuple[float, ...], reference: float | None = None) -> np.n
     places : tuple of float
         Knots. If they are positive with a ratio of `WIDE` or more, derivatives are with respect to their
         logarithm.
-    reference : float, optional
+    x_ref : float, optional
         As in `smooth_effect`: its knot has no amplitude.
 
     Returns
@@ -279,7 +280,7 @@ def roughness(places: tuple[float, ...], reference: float | None = None) -> np.n
     ndarray, shape (knots - 1, knots - 1)
         Its null space are straight lines in the channel, or in its logarithm.
     """
-    free = np.arange(len(places)) != _nearest(places, reference)
+    free = np.arange(len(places)) != _nearest(places, x_ref)
     return _gram(places, 2)[np.ix_(free, free)]
 
 
@@ -311,9 +312,9 @@ def _gram(places: tuple[float, ...], order: int) -> np.ndarray:
     return at.T @ ((half * weight).ravel()[:, None] * at)
 
 
-def _nearest(places: Sequence[float], reference: float | None) -> int:
+def _nearest(places: Sequence[float], x_ref: float | None) -> int:
     """Return the number of the reference knot."""
-    return 0 if reference is None else int(np.argmin(np.abs(np.array(places) - reference)))
+    return 0 if x_ref is None else int(np.argmin(np.abs(np.array(places) - x_ref)))
 
 
 def surface_effect(
@@ -341,7 +342,7 @@ def surface_effect(
     knots = tuple(tuple(float(k) for k in given) for given in (x_knots, z_knots))
     if any(len(given) < 2 or not (np.diff(given) > 0).all() for given in knots):
         raise ParameterError(f"surface: knots {knots} must be two or more rising numbers.", fix="Sort them.")
-    places = [(j, k) for j in range(len(knots[0])) for k in range(len(knots[1]))]
+    places = list(np.ndindex(len(knots[0]), len(knots[1])))
     mean = shares(means, len(places))
     return Effect(
         id=SURFACE,
@@ -394,15 +395,8 @@ def _surface(
     return np.einsum("...j,jk,...k->...", u, amplitude, w) - amplitude.ravel() @ means
 
 
-FREE: Mapping[str, tuple[Callable[..., Effect], tuple[str, ...]]] = {
-    SMOOTH: (lambda fixed: smooth_effect(fixed["knots"], fixed.get("x_ref"), fixed.get("means")), ("knots",)),
-    LEVELS: (lambda fixed: levels_effect(fixed["categories"], fixed.get("means")), ("categories",)),
-    SURFACE: (
-        lambda fixed: surface_effect(fixed["x_knots"], fixed["z_knots"], fixed.get("means")),
-        ("x_knots", "z_knots"),
-    ),
-    SLOPES: (lambda fixed: slopes_effect(fixed["categories"]), ("categories",)),
-}
+# Every free shape. Its arguments have the names of the fixed values in model files.
+FREE = {SMOOTH: smooth_effect, LEVELS: levels_effect, SURFACE: surface_effect, SLOPES: slopes_effect}
 
 
 def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
@@ -429,8 +423,8 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
     """
     if id not in FREE:
         raise ParameterError(f"'{id}' is no free shape.", fix=f"Use one of {', '.join(FREE)}.")
-    make, needs = FREE[id]
-    for need in needs:
-        if need not in fixed:
-            raise ParameterError(f"{id}: '{need}' is missing.", fix=f"Give '{need}' in its fixed values.")
-    return make(fixed)
+    arguments = signature(FREE[id]).parameters
+    for name, argument in arguments.items():
+        if argument.default is argument.empty and name not in fixed:
+            raise ParameterError(f"{id}: '{name}' is missing.", fix=f"Give '{name}' in its fixed values.")
+    return FREE[id](**{name: fixed[name] for name in arguments if name in fixed})

@@ -25,14 +25,14 @@ from sealfit.errors import ParameterError
     amplitudes=st.lists(st.floats(-5, 5), min_size=6, max_size=6),
 )
 def test_smooth_goes_through_its_knots_and_is_zero_at_the_reference(knots, amplitudes):
-    effect = smooth_effect(knots, reference=knots[1])
+    effect = smooth_effect(knots, x_ref=knots[1])
     values = dict(zip(effect.linear, amplitudes, strict=False))
     wanted = [values.get(f"c_{j + 1}", 0.0) for j in range(len(knots))]
     npt.assert_allclose(effect.shape({"x": np.array(knots, float)}, **values), wanted, atol=1e-10)
 
 
 def test_smooth_holds_straight_lines_inside_its_knots_and_its_last_values_beyond():
-    effect = smooth_effect([0.0, 1.0, 4.0, 10.0], reference=0.0)
+    effect = smooth_effect([0.0, 1.0, 4.0, 10.0], x_ref=0.0)
     x = np.array([-5.0, 0.0, 0.3, 2.0, 7.7, 10.0, 25.0])
     wanted = 0.5 * np.clip(x, 0.0, 10.0)
     npt.assert_allclose(effect.shape({"x": x}, c_2=0.5, c_3=2.0, c_4=5.0), wanted, atol=1e-13)
