@@ -146,7 +146,7 @@ class Parts:
         self._called("fit-aging", config)
         return small("aging_fit", 1).assign(quantity="mu_s", parameter="a", value=0.04, unit="")
 
-    def aging_curves(self, aging_fit, days=None):
+    def aging_curves(self, aging_fit):
         return small("aging_curves")
 
     def fit_dynamic(self, traces, steady, steady_fit, config, *, workers=1):

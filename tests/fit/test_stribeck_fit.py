@@ -119,8 +119,6 @@ def test_forces_against_the_motion_end_at_zero_and_falling_friction_at_sigma_2_z
     npt.assert_array_equal(fit.values()[0, [0, 1, 3]], 0.0)
     npt.assert_allclose(fit.rss[0], 9.0)
     assert fit.sigma_2[1] == 0.0
-    free = solve_stribeck(SPEEDS, LOAD, force, np.ones((2, 9)), nonnegative=(True, True, False))
-    npt.assert_allclose(free.values()[1], [0.6, 0.4, 5.0, -0.02], rtol=1e-8)
 
 
 def test_a_rise_with_speed_is_allowed():

@@ -34,7 +34,7 @@ PAIRS = (("mu_s", "mu_c"), ("F_s", "F_c"))
 WITHOUT_LAW = -2
 # Smallest relative standard deviation of a steady value.
 SMALLEST = 1e-6
-# Number of points of a curve.
+# Number of points of a curve, which are denser near day 0.
 CURVE_POINTS = 61
 
 
@@ -244,28 +244,17 @@ def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: n
 
 
 # ---------------------------------------------------------------- curves
-def aging_curves(aging_fit: pd.DataFrame, days: np.ndarray | None = None) -> pd.DataFrame:
-    """Return the law of every series and quantity along aging time, with its 95 % band.
+def aging_curves(aging_fit: pd.DataFrame) -> pd.DataFrame:
+    """Return table `aging_curves`: the laws of table `aging_fit` up to the last tested day, with 95 % bands.
 
-    Parameters
-    ----------
-    aging_fit : DataFrame
-        Table `aging_fit`.
-    days : ndarray, shape (n,), optional
-        Aging times in days; default from 0 to the last tested day, denser near 0.
-
-    Returns
-    -------
-    DataFrame
-        Table `aging_curves`; the band is that of the population mean, from the covariance of mu_0, a and ln
-        b.
+    A band is that of the population mean, from the covariance of mu_0, a and ln b.
     """
     tables = []
     for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
         keys = zip(own["quantity"], own["parameter"], strict=True)
         known = dict(zip(keys, own["value"].tolist(), strict=True))
         for quantity in [quantity for quantity, parameter in known if parameter == "mu_0"]:
-            curve = pd.DataFrame(_curve(known, quantity, days), columns=AGING_CURVES.names())
+            curve = pd.DataFrame(_curve(known, quantity), columns=AGING_CURVES.names())
             tables.append(curve.assign(series=series, quantity=quantity))
     return pd.concat([curve for curve in tables if len(curve)] or [_no_curve()], ignore_index=True)
 
@@ -275,9 +264,7 @@ def _no_curve() -> pd.DataFrame:
     return pd.DataFrame(columns=AGING_CURVES.names(), dtype=float).astype(texts)
 
 
-def _curve(
-    known: dict[tuple[str, str], float], quantity: str, days: np.ndarray | None
-) -> dict[str, np.ndarray]:
+def _curve(known: dict[tuple[str, str], float], quantity: str) -> dict[str, np.ndarray]:
     """Return the curve of one quantity, empty without a law; `known` are values by quantity and parameter."""
     mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
     if np.isnan([mu_0, a, b]).any():
@@ -288,11 +275,8 @@ def _curve(
         for j in range(i + 1):
             value = known["covariance", f"{names[j]},{names[i]}"]
             covariance[i, j] = covariance[j, i] = value if np.isfinite(value) else 0.0
-    df = known["statistics", f"{quantity}:error_df"]
-    t = t_of_95(df)
-    if days is None:
-        days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
-    days = np.asarray(days, float)
+    t = t_of_95(known["statistics", f"{quantity}:error_df"])
+    days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
     ratio = days / b
     slope = np.stack([np.ones_like(days), -np.log1p(ratio), a * ratio / (1 + ratio)], axis=1)
     half = t * np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", slope, covariance, slope), 0.0))

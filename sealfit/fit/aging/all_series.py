@@ -227,18 +227,17 @@ class _Curve:
 def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
     """Return the values of one quantity of a rubber at the conditions where the forces determine it."""
     of = (levels.table["rubber"] == rubber) & (levels.table["quantity"] == quantity)
-    rows, here = levels.table[of], of.to_numpy()
+    here = of.to_numpy()
+    return aged_of(levels.table[of], levels.covariance[here][:, here])
 
-    def column(name):
-        return rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None
 
-    return Aged(
-        rows["aging_days"].to_numpy(float),
-        rows["value"].to_numpy(float),
-        column(TEMPERATURE),
-        column(COMPRESSION),
-        levels.covariance[here][:, here],
-    )
+def aged_of(rows: pd.DataFrame, *scatter) -> Aged:
+    """Return the values of table rows with the condition's columns; `scatter` is as in `Aged`."""
+    known = [
+        rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None
+        for name in (TEMPERATURE, COMPRESSION)
+    ]
+    return Aged(rows["aging_days"].to_numpy(float), rows["value"].to_numpy(float), *known, *scatter)
 
 
 def joint_laws(

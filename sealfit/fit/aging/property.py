@@ -22,7 +22,7 @@ from scipy.special import stdtrit
 
 from sealfit.config import Config
 from sealfit.fit.aging import SMALLEST, WITHOUT_LAW, aging_curves, curves_of, numbers_of, rubber_rows
-from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, law_tables, laws_of, rubber_of
+from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, aged_of, law_tables, laws_of, rubber_of
 from sealfit.fit.aging.joint_law import Aged, JointLaw
 from sealfit.fit.aging.law import Values
 from sealfit.fit.aging.law_table import without_law
@@ -65,14 +65,7 @@ class Means:
 
     def aged(self) -> Aged:
         """Return the means as the data of a law for all series."""
-
-        def column(name: str) -> np.ndarray | None:
-            known = name in self.table and self.table[name].notna().any()
-            return self.table[name].to_numpy(float) if known else None
-
-        days, value = (self.table[name].to_numpy(float) for name in ("aging_days", "value"))
-        scatter = self.covariance, self.size, self.df, self.level_df
-        return Aged(days, value, column(TEMPERATURE), column(COMPRESSION), *scatter)
+        return aged_of(self.table, self.covariance, self.size, self.df, self.level_df)
 
 
 def means_of(specimens: pd.DataFrame) -> Means:

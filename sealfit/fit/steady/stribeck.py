@@ -142,15 +142,13 @@ def search_limits(speed, weight) -> tuple[np.ndarray, np.ndarray]:
     return np.log(slowest * SLOWEST), np.log(fastest * FASTEST)
 
 
-def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> StribeckFit:
+def solve_stribeck(speed, load, force, weight) -> StribeckFit:
     """Global weighted least-squares fit of Eq. 14 to many conditions.
 
     Parameters
     ----------
     speed, load, force, weight : ndarray, shape (problems, n)
         |v| > 0 in mm/s, N, F sgn(v) in N, 1/variance (0 for padding).
-    nonnegative : three bool
-        Whether mu_s, mu_c and sigma_2 are nonnegative.
 
     Raises
     ------
@@ -169,7 +167,7 @@ def solve_stribeck(speed, load, force, weight, *, nonnegative=PHYSICAL) -> Strib
         *(np.asarray(x, float) for x in (speed, load, force, weight))
     )
     limits = search_limits(speed, weight)
-    problems = Separable(stribeck_basis(speed, load), force, weight, nonnegative)
+    problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
     found = global_optimum(problems, even_grid(*limits, PER_DECADE))
     mu_s, mu_c, sigma_2 = found.coefficients.T
     return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, limits)

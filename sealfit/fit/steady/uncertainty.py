@@ -9,7 +9,7 @@ are widened by the Birge ratio, the square root of the reduced chi-square.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -138,14 +138,11 @@ class UnitVariance:
     df: np.ndarray  # (conditions,), of the Student t of the intervals
     f: np.ndarray  # (conditions,), lack of fit against pure error; NaN without repeats
     p: np.ndarray
-    pooled: float  # reduced chi-square of all conditions together
-    pooled_p: float
     own: np.ndarray  # (conditions,) bool: whether the condition has its own ratio
 
     def at(self, some: slice | int) -> UnitVariance:
         """Return the factors of some conditions, or of one."""
-        own = {name: getattr(self, name)[some] for name in ("value", "df", "f", "p", "own")}
-        return replace(self, **own)
+        return UnitVariance(self.value[some], self.df[some], self.f[some], self.p[some], self.own[some])
 
     def rise(self) -> np.ndarray:
         """Return chi-square's rise above its minimum at the ends of a 95 % interval, shape (conditions,)."""
@@ -169,10 +166,9 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
     ratio = np.divide(chi2, df, out=np.full(chi2.shape, np.nan), where=df > 0)
     pooled = total / total_df if total_df > 0 else np.nan
     repeated = pure_df > 0
-    pooled_p = float(fdtrc(total_df, pure_df, pooled)) if repeated and total_df > 0 else np.nan
     if not repeated:
         base, base_df = pooled, total_df
-    elif pooled_p <= POOLING_P:
+    elif total_df > 0 and fdtrc(total_df, pure_df, pooled) <= POOLING_P:
         base, base_df = max(pooled, 1.0), total_df
     else:
         base, base_df = 1.0, pure_df
@@ -184,8 +180,6 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
         df=np.where(worse, df, base_df if base_df > 0 else np.nan),
         f=ratio if repeated else np.full(chi2.shape, np.nan),
         p=p,
-        pooled=pooled,
-        pooled_p=pooled_p,
         own=worse,
     )
 
