@@ -7,7 +7,7 @@ are fitted alternately until they converge. Priors are in `prior.py`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from sealfit.fit.joint.prior import (
     precision_of,
     smoothed,
 )
-from sealfit.fit.joint.rows import Cache, Rows
+from sealfit.fit.joint.rows import Cache, Rows, cached
 from sealfit.fit.joint.search import descend, search_nonlinear, start_model
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import estimate_components, estimate_scatter
@@ -55,7 +55,6 @@ class Fitted:
     white_jacobian: Tangent  # (n, p)
     deviance: float  # whitened sum of squares + log det: -2 log likelihood without its constant
     whitening: Whitening  # at this scatter and friction
-    # Results of `slope`, `unit_shares` and `unit_residual`.
     cache: Cache = field(default_factory=Cache, init=False, compare=False, repr=False)
 
     @property
@@ -93,32 +92,28 @@ class Fitted:
         """Return another model fitted to the same rows, to be compared: scatter and friction are the same."""
         return fit(model, self.rows, self.scatter, turns=0, friction=self.friction)
 
+    @cached
     def slope(self, acts_on: str, operation: str) -> np.ndarray:
         """Return the force's derivative dF/dh for the shape h of a term not yet in the model, shape (n,)."""
-        make = partial(term_slope, self.model, self.rows, acts_on, operation)
-        return self.cache.once(("slope", acts_on, operation), make)
+        return term_slope(self.model, self.rows, acts_on, operation)
 
+    @cached
     def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
         """Return eigenvalues and eigenvectors of each group's block of the hat matrix.
 
         Their shapes are (g, k) and (g, k, k). The eigenvectors are in the coordinates of the basis columns
         of the group's block.
         """
-        return self.cache.once(("shares", level), partial(self._unit_shares, level))
-
-    def _unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
         groups = np.split(self.basis.values, self.rows.groups.starts[level][1:])
         return np.linalg.eigh(np.stack([basis.T @ basis for basis in groups]))
 
+    @cached
     def unit_residual(self, level: str) -> np.ndarray:
         """Return the whitened residual times (I - H_gg)^(-1/2) in each group of a level, shape (n,).
 
         H_gg is the group's block of the hat matrix. This is the CR2 correction (Bell & McCaffrey 2002, Survey
         Methodology 28(2), 169-181).
         """
-        return self.cache.once(("residual", level), partial(self._unit_residual, level))
-
-    def _unit_residual(self, level: str) -> np.ndarray:
         size, axes = self.unit_shares(level)
         size = np.clip(size, 0.0, 0.98)  # a leverage of 1 leaves no residual to correct
         grow = np.where(size > 1e-12, (1 / np.sqrt(1 - size) - 1) / np.maximum(size, 1e-12), 0.0)
@@ -178,8 +173,7 @@ def fit(
         model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, centre)
     if not turns:
         model = descend(model, rows, scatter, centre, friction, tolerance=COMPARED)
-        return fitted_at(model, rows, scatter, friction)
-    return fitted_at(model, rows, scatter)
+    return fitted_at(model, rows, scatter, friction)
 
 
 def _searched(model: Model, rows: Rows, scatter: Scatter) -> Model:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
+from functools import wraps
 
 import numpy as np
 import pandas as pd
@@ -130,6 +131,16 @@ class Cache(dict):
         return self[key][1]
 
 
+def cached(method: Callable) -> Callable:
+    """Return a method that is computed once for each choice of its arguments, and kept in `self.cache`."""
+
+    @wraps(method)
+    def once(self, *arguments):
+        return self.cache.once((method.__name__, *arguments), lambda: method(self, *arguments))
+
+    return once
+
+
 @dataclass(frozen=True)
 class Rows:
     """Sorted rows of `bins` as arrays.
@@ -162,27 +173,23 @@ class Rows:
         """Names of the columns on which a residual may depend."""
         return [name for name in self.table.columns if name not in NOT_CHANNELS]
 
+    @cached
     def values(self, channel: str) -> np.ndarray:
         """Return a channel, shape (n,): floats, or strings if it is categorical; missing values filled in."""
         if channel in self.filled:
             return self.filled[channel]
-        return self.cache.once(channel, lambda: self._values(self.table[channel]))
-
-    @staticmethod
-    def _values(column: pd.Series) -> np.ndarray:
+        column = self.table[channel]
         if pd.api.types.is_numeric_dtype(column):
             return column.to_numpy(dtype=float, na_value=np.nan)
         return column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
 
+    @cached
     def bin_width(self, channel: str) -> np.ndarray:
         """Return the width of each row's bin in a channel, shape (n,).
 
         It is the number of samples times the step between them. The step is the difference of neighbouring
         bin means over half the sum of their numbers of samples.
         """
-        return self.cache.once(("width", channel), lambda: self._bin_width(channel))
-
-    def _bin_width(self, channel: str) -> np.ndarray:
         samples, inside = self.samples, np.diff(self.codes("stroke")) == 0
         step = np.where(inside, np.diff(self.values(channel)) / ((samples[1:] + samples[:-1]) / 2), 0.0)
         left, right = np.r_[0.0, step], np.r_[step, 0.0]
@@ -197,11 +204,9 @@ class Rows:
         """Return each row's group number at a level."""
         return self.groups.codes[level]
 
+    @cached
     def sparse(self, most: int) -> Rows:
         """Return about `most` or fewer rows of each stroke, evenly spread, for effects on whole strokes."""
-        return self.cache.once(("sparse", most), lambda: self._sparse(most))
-
-    def _sparse(self, most: int) -> Rows:
         code = self.codes("stroke")
         for channel in (name for name in ALONG if name in self.table):
             self.bin_width(channel)  # from all bins, not from the ones that remain
@@ -226,7 +231,7 @@ class Rows:
             **{name: getattr(self, name)[mask] for name in arrays},
         )
         for key, (at, values) in self.cache.items():
-            if isinstance(key, str) or key[0] == "width":  # channels, and widths of all bins
+            if key[0] in ("values", "bin_width"):  # widths are those of all bins
                 part.cache[key] = (at, values[mask])
         return part
 
