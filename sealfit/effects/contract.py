@@ -143,16 +143,9 @@ class Effect:
 
 
 def reference(inputs: Mapping[str, object], name: str, default: float) -> float:
-    """Return the fixed reference value of a channel, or `default` if `inputs` has none.
+    """Return the fixed reference value of a channel in the inputs of a shape, or `default` if it has none.
 
-    Parameters
-    ----------
-    inputs : mapping
-        Inputs of the shape.
-    name : str
-        Channel as in `Effect.reads`.
-    default : float
-        1 for a reference that divides the channel, 0 for one that is subtracted.
+    The default is 1 for a reference that divides the channel, 0 for one that is subtracted.
     """
     return float(inputs.get(f"{name}_ref", default))
 
@@ -197,14 +190,7 @@ def log_ratio_from_zero(inputs: Mapping[str, object], name: str) -> np.ndarray:
 
 
 def fill_unit(unit: str, x: str, y: str, z: str = "") -> str:
-    """Return a parameter's unit with the units of the channels and of the effect's result inserted.
-
-    Parameters
-    ----------
-    unit : str
-        `Parameter.unit`.
-    x, y, z : str
-        Units of the channel, of the result, and of the second channel; empty for none.
+    """Return `Parameter.unit` with the units of the channels (x, z) and of the effect's result (y) inserted.
 
     Examples
     --------

@@ -29,19 +29,9 @@ MEAN_OF_CAMPAIGN = "mean over {x} in the campaign"
 def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:
     """Return one level per category of the channel, as differences from the first category.
 
-    Parameters
-    ----------
-    categories : sequence of str
-        At least two different categories.
-    means : sequence of float, optional
-        Share of each category in the campaign, for levels whose mean is zero; else the first category is
-        zero.
-
-    Returns
-    -------
-    Effect
-        Amplitudes `d_1`, `d_2`, ... for the categories after the first. A category that is not listed gives
-        NaN.
+    Its amplitudes are `d_1`, `d_2`, ... for the categories after the first. With `means`, the share of each
+    category in the campaign, the mean of the levels is zero; else the first one is. A category that is not
+    listed gives NaN.
 
     Raises
     ------
@@ -96,15 +86,7 @@ def _levels(names: tuple[str, ...], means: tuple[float, ...], inputs: Mapping, *
 def slopes_effect(categories: Sequence[str]) -> Effect:
     """Return a straight line in a channel for each category of a second one, all zero at the reference.
 
-    Parameters
-    ----------
-    categories : sequence of str
-        At least two different categories.
-
-    Returns
-    -------
-    Effect
-        Amplitudes `e_1`, `e_2`, ..., the slope of each category. A category that is not listed gives NaN.
+    Its amplitudes `e_1`, `e_2`, ... are the slopes. A category that is not listed gives NaN.
 
     Raises
     ------
@@ -179,28 +161,14 @@ def smooth_effect(
 ) -> Effect:
     """Return a natural cubic spline of the channel, with its values at the knots as amplitudes.
 
-    Parameters
-    ----------
-    knots : sequence of float
-        At least two different channel values, in rising order.
-    x_ref : float, optional
-        The shape is zero at the nearest knot, which has no amplitude; default the first knot.
-    means : sequence of float, optional
-        Mean of each B_j over the campaign, for a shape whose mean is zero.
-
-    Returns
-    -------
-    Effect
-        Amplitudes `c_j`, j the number of the knot from 1.
+    Its amplitudes are `c_j`, j the number of the knot from 1. The shape is zero at the knot nearest to
+    `x_ref`, by default the first, which has no amplitude; with `means`, the mean of each B_j over the
+    campaign, its mean is zero.
 
     Raises
     ------
     ParameterError
         If there are fewer than two knots, or they do not rise.
-
-    Notes
-    -----
-    Natural cubic spline: de Boor 2001, A Practical Guide to Splines, Springer.
     """
     places = tuple(float(k) for k in knots)
     if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
@@ -267,18 +235,9 @@ def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
 def roughness(places: tuple[float, ...], x_ref: float | None = None) -> np.ndarray:
     r"""Return S with :math:`c^T S c = \int h''^2` of the spline through c at knots scaled to a range of 1.
 
-    Parameters
-    ----------
-    places : tuple of float
-        Knots. If they are positive with a ratio of `WIDE` or more, derivatives are with respect to their
-        logarithm.
-    x_ref : float, optional
-        As in `smooth_effect`: its knot has no amplitude.
-
-    Returns
-    -------
-    ndarray, shape (knots - 1, knots - 1)
-        Its null space are straight lines in the channel, or in its logarithm.
+    Its shape is (knots - 1, knots - 1), as the knot of `x_ref` has no amplitude. If the knots are positive
+    with a ratio of `WIDE` or more, derivatives are with respect to their logarithm. The null space of S are
+    straight lines in the channel, or in its logarithm.
     """
     free = np.arange(len(places)) != _nearest(places, x_ref)
     return _gram(places, 2)[np.ix_(free, free)]
@@ -288,14 +247,8 @@ def roughness(places: tuple[float, ...], x_ref: float | None = None) -> np.ndarr
 def surface_roughness(x_places: tuple[float, ...], z_places: tuple[float, ...]) -> np.ndarray:
     r"""Return S with :math:`c^T S c = \int h_{xx}^2 + 2 h_{xz}^2 + h_{zz}^2`, scaled as in `roughness`.
 
-    Returns
-    -------
-    ndarray, shape (amplitudes, amplitudes)
-        Of the amplitudes of `surface_effect`; its null space are planes.
-
-    Notes
-    -----
-    The penalty of thin plate splines: Wood 2017, Generalized Additive Models, 2nd ed., CRC Press, 5.5.
+    Its shape is (amplitudes, amplitudes) of `surface_effect`, and its null space are planes. It is the
+    penalty of thin plate splines: Wood 2017, Generalized Additive Models, 2nd ed., CRC Press, 5.5.
     """
     x, z = ([_gram(places, order) for order in range(3)] for places in (x_places, z_places))
     whole = np.kron(x[2], z[0]) + 2 * np.kron(x[1], z[1]) + np.kron(x[0], z[2])
@@ -322,17 +275,8 @@ def surface_effect(
 ) -> Effect:
     """Return a free surface of two channels: natural cubic splines of one times those of the other.
 
-    Parameters
-    ----------
-    x_knots, z_knots : sequence of float
-        At least two different values of each channel, in rising order; the surface is constant beyond them.
-    means : sequence of float, optional
-        Mean of each product of splines over the campaign, z running faster, for a shape whose mean is zero.
-
-    Returns
-    -------
-    Effect
-        Amplitudes `c_jk`, the value at knot j of x and k of z less that at the first ones.
+    Its amplitudes `c_jk` are the values at knot j of x and k of z less that at the first ones. With `means`,
+    the mean of each product of splines over the campaign, z running faster, its mean is zero.
 
     Raises
     ------
@@ -400,15 +344,7 @@ FREE = {SMOOTH: smooth_effect, LEVELS: levels_effect, SURFACE: surface_effect, S
 
 
 def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
-    """Return the free shape with the fixed values of a model file.
-
-    Parameters
-    ----------
-    id : str
-        `smooth`, `levels`, `surface` or `slopes`.
-    fixed : mapping
-        `knots` and, if any, `x_ref` for a smooth shape; `categories` for levels and slopes; `x_knots` and
-        `z_knots` for a surface; `means`, if any, for all but slopes. Other entries are ignored.
+    """Return the free shape `id` with the fixed values of a model file; other entries are ignored.
 
     Raises
     ------

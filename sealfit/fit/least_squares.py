@@ -170,7 +170,7 @@ def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple
 # Least squares with one nonlinear parameter: the linear parameters are solved for exactly at each of its
 # values.
 #
-# Many problems are solved together as arrays: the conditions of a campaign, or the draws of a bootstrap.
+# Many problems are solved together as arrays: the conditions of a campaign.
 # Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036 (variable projection).
 
 # A column is linearly dependent if the others explain all but this share of its variance.
@@ -214,17 +214,9 @@ def solve_kept(gram, moment, keep):
 def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
     """Return the exact least squares with some nonnegative coefficients, by trying every active set.
 
-    Parameters
-    ----------
-    gram, moment : ndarray, shape (..., p, p) and (..., p)
-        B'B of the columns, scaled to unit diagonal (0 for a column of zeros), and B'y.
-    nonnegative : sequence of bool, length p
-        Which coefficients are nonnegative.
-
-    Returns
-    -------
-    coefficients, support : ndarray, shape (..., p)
-        The optimum, and which columns are in it. It is global, as the problem is convex.
+    `gram`, shape (..., p, p), is B'B of the columns, scaled to unit diagonal (0 for a column of zeros), and
+    `moment`, shape (..., p), is B'y. Returns the coefficients and which columns are in the optimum, shape
+    (..., p) each. It is global, as the problem is convex.
     """
     nonnegative = np.asarray(nonnegative, bool)
     keep = np.ones(moment.shape, bool)
@@ -248,7 +240,10 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
 
 
 def project(columns, y, nonnegative, refine: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients, (..., p), of weighted columns (..., n, p) and y (..., n), and the rss, (...)."""
+    """Return coefficients, (..., p), of weighted columns (..., n, p) and y (..., n), and the rss, (...).
+
+    `refine` steps of iterative refinement recover the digits that normal equations lose.
+    """
     norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
     scaled = columns / np.where(norm > 0, norm, 1.0)[..., None, :]
     transposed = np.swapaxes(scaled, -1, -2)
@@ -256,7 +251,7 @@ def project(columns, y, nonnegative, refine: int = 2) -> tuple[np.ndarray, np.nd
     moment = (transposed @ y[..., None])[..., 0]
     c, support = least_squares_of(gram, moment, nonnegative)
     rest = y - (scaled @ c[..., None])[..., 0]
-    for _ in range(refine):  # iterative refinement recovers the digits that normal equations lose
+    for _ in range(refine):
         c = c + solve_kept(gram, (transposed @ rest[..., None])[..., 0], support)
         rest = y - (scaled @ c[..., None])[..., 0]
     c = np.where(nonnegative, np.maximum(c, 0.0), c)
@@ -295,8 +290,7 @@ class Separable:
 def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return the least weighted sums of squares, (problems, g), and coefficients, (problems, g, p).
 
-    `u`, shape (problems, g), are the nonlinear parameters. `refine` steps of iterative refinement are made: 0
-    for a search, 2 for full accuracy.
+    `u`, shape (problems, g), are the nonlinear parameters. `refine` is as in `project`: 0 is for a search.
     """
     y, weight, nonnegative = problems.y, problems.weight, problems.nonnegative
     root, rows = np.sqrt(weight), np.arange(len(y))

@@ -130,16 +130,9 @@ def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
 def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) -> dict:
     """Return the truth of a campaign as plain values.
 
-    Parameters
-    ----------
-    spec : Spec
-        What was simulated.
-    files : DataFrame
-        One row per file and direction: `file`, `run_id`, `direction`, `speed_mm_s` (real, signed),
-        `mean_force_N` (noise-free, over the steady rows), `gain`, `offset_N`, `outlier`, `defect`, and the
-        condition columns.
-    effect_rms_N : ndarray, shape (effects,)
-        RMS over all steady rows of what each effect adds to the force.
+    `files` has a row per file and direction: `PER_FILE`, with the real, signed speed and the noise-free mean
+    force over the steady rows, and the condition columns. `effect_rms_N`, shape (effects,), is the RMS over
+    all steady rows of what each effect adds to the force.
     """
     physics = []
     for row in files.drop_duplicates("condition").to_dict("records"):

@@ -78,15 +78,9 @@ class Physics(Strict):
 def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the parameters of the declared model without effects at given conditions, shape (n,) each.
 
-    They are mu_0s, a_s, b_s of mu_s, mu_0c, a_c, b_c of mu_c, v_s and sigma_2.
-
-    Parameters
-    ----------
-    physics : Physics
-        The SPEC's.
-    conditions : mapping of str to ndarray, shape (n,)
-        `temperature_C`, `compression_ratio_pct` and `aging_days`, those that the design has. Unaged rubber
-        (day 0) has v_s and sigma_2 of `physics` itself, whatever its temperature cell says.
+    They are mu_0s, a_s, b_s of mu_s, mu_0c, a_c, b_c of mu_c, v_s and sigma_2. `conditions` has those of
+    `CONDITIONS` that the design has, shape (n,) each. Unaged rubber (day 0) has v_s and sigma_2 of `physics`
+    itself, whatever its temperature cell says.
     """
     n = len(next(iter(conditions.values()))) if conditions else 1
     values = {}

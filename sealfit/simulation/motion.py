@@ -42,16 +42,8 @@ class Motion:
 def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> Motion:
     """Return the motion of one file.
 
-    Parameters
-    ----------
-    design : Design
-        Stroke, ramp, rest and sampling.
-    speed_mm_s : float
-        Real speed of the platform, magnitude.
-    direction : int
-        +1 or -1: direction of the first stroke. The others alternate.
-    start_mm : float
-        Lower end of the stroke in the rig's coordinate.
+    `speed_mm_s` is the magnitude of the platform's real speed. `direction`, +1 or -1, is that of the first
+    stroke; the others alternate. `start_mm` is the lower end of the stroke in the rig's coordinate.
     """
     _, rest, _, period = _phases(design, speed_mm_s)
     total = design.strokes_per_file * period + 0.5 * rest
@@ -128,19 +120,10 @@ def with_presliding(
 
     .. math:: dF/dx = (F_{limit} - F) / x_0
 
-    This is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the length of the rise. At constant
-    speed only the initial difference decays, so that the force of steady sliding has no lag.
-
-    Parameters
-    ----------
-    limit_N : ndarray, shape (n,)
-        Force of the bristles in steady sliding at every row's speed.
-    motion : Motion
-        The rows.
-    rise_mm : ndarray, shape (n,)
-        x_0 in mm.
-    damping_s : float
-        sigma_1 / sigma_0 in s.
+    This is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the length of the rise, `rise_mm`. At
+    constant speed only the initial difference decays, so that the force of steady sliding has no lag.
+    `limit_N` is the force of the bristles in steady sliding at every row's speed; it and `rise_mm` have the
+    shape (n,). `damping_s` is sigma_1 / sigma_0.
     """
     steps = np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0]))
     decay = np.exp(-steps / rise_mm).tolist()
@@ -183,11 +166,8 @@ class SteadyLaw:
     def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the steady bristle force, viscous part and added forces, in N, broadcast over the channels.
 
-        Parameters
-        ----------
-        channels : mapping of str to ndarray
-            `speed_mm_s` (signed), the condition columns and `load_N` of the design, and all channels that the
-            effects read; shape (n,) or (1,) each.
+        `channels` has `speed_mm_s` (signed), the condition columns and `load_N` of the design, and all that
+        the effects read; shape (n,) or (1,) each.
 
         Raises
         ------

@@ -182,14 +182,8 @@ def sample_noise_N(
 ) -> np.ndarray:
     """Return the noise of one trace's samples in N, shape (n,): white, autocorrelated and proportional.
 
-    Parameters
-    ----------
-    force_N, time_s : ndarray, shape (n,)
-        Force without noise; time at equal steps.
-    speed_mm_s : float
-        Speed magnitude, which turns a correlation length in mm into one in s.
-    file : int
-        Number of the file, so that every file has its own noise.
+    `force_N`, without noise, and `time_s`, at equal steps, have the shape (n,). The magnitude of the speed
+    turns a correlation length in mm into one in s. Every `file`, by its number, has its own noise.
     """
     n = len(force_N)
     total = np.zeros(n)

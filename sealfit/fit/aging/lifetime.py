@@ -106,15 +106,9 @@ def over_laws(
     """Return the ends of the model-averaged 95 % interval of the lifetime, 0 or inf if open.
 
     The log lifetime of each law has a Student distribution, and the weights are exp(-BIC/2). With few tests
-    the law of least BIC is often not the true one, and its own interval too short. Buckland, Burnham &
-    Augustin 1997, Biometrics 53(2), 603-618, doi:10.2307/2533961.
-
-    Parameters
-    ----------
-    laws : sequence of JointLaw
-        Laws fitted to the same values.
-    goal, temperature_C, compression_ratio_pct
-        As `lifetime`.
+    the law of least BIC is often not the true one, and its own interval too short. The laws are fitted to the
+    same values; the other arguments are those of `lifetime`. Buckland, Burnham & Augustin 1997, Biometrics
+    53(2), 603-618, doi:10.2307/2533961.
     """
     weights = np.exp(-0.5 * np.array([law.bic - min(one.bic for one in laws) for law in laws]))
     lives = [lifetime(law, goal, temperature_C, compression_ratio_pct) for law in laws]

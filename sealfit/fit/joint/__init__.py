@@ -146,18 +146,9 @@ def fit(
 ) -> Fitted:
     """Return the model fitted to `rows`, physics and effects together.
 
-    Parameters
-    ----------
-    model : Model
-        Starting point, with v_s and b from a global search.
-    rows : Rows
-        Data.
-    scatter : Scatter, optional
-        Starting value; fixed if `turns` is 0.
-    turns : int
-        How often the scatter is re-estimated and the model refitted.
-    friction : ndarray, shape (n,), optional
-        Friction to which gains and noise are proportional, for `turns=0`. Fits to be compared must share it.
+    `model` is the start, with v_s and b from a global search, and `scatter` a starting value. `turns` is how
+    often the scatter is re-estimated and the model refitted. If it is 0, the scatter is fixed, and so is the
+    friction, shape (n,), to which gains and noise are proportional; fits to be compared must share it.
     """
     centre = centre_of(model)
     if scatter is None:
@@ -191,14 +182,7 @@ def fit_with_effects(model: Model, rows: Rows, scatter: Scatter, former: Fitted)
 
     An effect that is taken out lowers the scatter of runs. Where specimens differ in v_s or sigma_2, which
     no component describes, their curves then count for more than their levels, and the error is far larger
-    than it need be.
-
-    Parameters
-    ----------
-    model, rows, scatter
-        As in `fit`.
-    former : Fitted
-        The model without the effects.
+    than it need be. `former` is the fit without the effects; the other arguments are those of `fit`.
     """
     found = fit(model, rows, scatter, turns=2)
     other = fit(found.model, rows, former.scatter, turns=0)

@@ -121,21 +121,10 @@ def pairs_and_shared(
     Each group's two columns are orthonormalised and projected out, which leaves one equation for the shared
     number. Among several solutions it is the one of least norm.
 
-    Parameters
-    ----------
-    columns : ndarray, shape (2, n)
-        Columns of the two numbers of each group.
-    code : ndarray, shape (n,)
-        Number of each value's group, from 0.
-    shared, values : ndarray, shape (n,)
-        Column of the shared number; the values to fit.
-
-    Returns
-    -------
-    pairs : ndarray, shape (groups, 2)
-    number : float
-    rank : int
-        That of the pairs' columns; with one value of both columns a pair is not distinguishable.
+    `columns`, shape (2, n), are those of the two numbers of each group, `code`, shape (n,), is the number of
+    each value's group, and `shared`, shape (n,), the column of the shared number. Returns the pairs, shape
+    (groups, 2), the shared number, and the rank of the pairs' columns; with one value of both columns a pair
+    is not distinguishable.
     """
     one, length = _unit(columns[0], code)
     along = np.bincount(code, one * columns[1])
@@ -196,17 +185,10 @@ def descend(
 ) -> Model:
     """Return the model of least penalised whitened sum of squares at fixed scatter, by Levenberg-Marquardt.
 
-    Parameters
-    ----------
-    model : Model
-        Starting point; it is moved inside the bounds.
-    centre : ndarray, shape (model.size,)
-        Mean of the prior.
-    friction : ndarray, shape (n,), optional
-        Friction on which noise and gains load; default the model's at the start. It is fixed during the
-        descent, so that all steps minimise the same function.
-    tolerance : float
-        Fall of the sum of squares below which the descent ends.
+    The start, `model`, is moved inside the bounds. `centre`, shape (model.size,), is the mean of the prior.
+    `friction`, shape (n,), to which noise and gains are proportional, is by default the model's at the start;
+    it is fixed, so that all steps minimise the same function. The descent ends when the sum of squares falls
+    by less than `tolerance`.
     """
     precision = precision_of(model)
     low, high = bounds_of(model, rows)

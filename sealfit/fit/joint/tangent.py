@@ -174,12 +174,8 @@ class Tangent:
     ) -> Tangent:
         """Return an orthonormal basis of the span of the columns, scaled to length 1 first, shape (n, rank).
 
-        Parameters
-        ----------
-        tolerance : float
-            Singular values below this share of the largest one count as zero.
-        project_out : callable, optional
-            Projection of the scaled columns, (n, m) -> (n, m), that combines rows of one specimen only.
+        Singular values below `tolerance` times the largest one count as zero. `project_out`, (n, m) ->
+        (n, m), is a projection of the scaled columns that combines rows of one specimen only.
         """
         unit = self.scaled(1 / np.maximum(self.norms(), 1e-300))
         unit = unit.with_values(project_out(unit.values))

@@ -22,21 +22,9 @@ def constrained_ends(columns, y, limit, nonnegative):
     optimum at an end lies on one of them, so that the ends are the outermost feasible crossings: exact,
     without iteration.
 
-    Parameters
-    ----------
-    columns : ndarray, shape (problems, g, n, p)
-        Weighted columns.
-    y : ndarray, shape (problems, g, n)
-        Weighted measured values.
-    limit : ndarray, shape (problems,)
-        Largest sum of squares allowed.
-    nonnegative : sequence of bool, length p
-        Which coefficients are nonnegative.
-
-    Returns
-    -------
-    low, high : ndarray, shape (problems, g, p)
-        NaN if the sum of squares exceeds the limit everywhere; inf if c_j is unbounded.
+    Columns, shape (problems, g, n, p), and y, shape (problems, g, n), are weighted; `limit` has the shape
+    (problems,). The ends have the shape (problems, g, p): NaN if the sum of squares exceeds the limit
+    everywhere, inf if c_j is unbounded.
     """
     nonnegative = np.asarray(nonnegative, bool)
     norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
@@ -143,12 +131,10 @@ def search_limits(speed, weight) -> tuple[np.ndarray, np.ndarray]:
 
 
 def solve_stribeck(speed, load, force, weight) -> StribeckFit:
-    """Global weighted least-squares fit of Eq. 14 to many conditions.
+    """Return the global weighted least-squares fit of Eq. 14 to many conditions.
 
-    Parameters
-    ----------
-    speed, load, force, weight : ndarray, shape (problems, n)
-        |v| > 0 in mm/s, N, F sgn(v) in N, 1/variance (0 for padding).
+    The arguments, shape (problems, n) each, are |v| > 0 in mm/s, N and F sgn(v) in N, and 1/variance, 0 for
+    padding.
 
     Raises
     ------
@@ -261,21 +247,11 @@ def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
 
     .. math:: p = \frac{\kappa}{\pi} (1 + c^2/\nu)^{-\nu/2} + P(|t_\nu| > c)
 
-    Parameters
-    ----------
-    speed, weight : ndarray, shape (n,)
-        One condition.
-    columns : ndarray, shape (n, 1) or (n, 2)
-        Columns of the free parameters without Stribeck curve: the load, and the speed unless sigma_2 is at 0.
-    grid : ndarray, shape (g,)
-        Grid of ln v_s.
-    statistic : float
-        c^2: fall of the sum of squares over the variance of unit weight.
-    df : float
-        Degrees of freedom of that variance; inf if it is known.
+    `speed` and `weight`, shape (n,), are of one condition. `columns`, shape (n, 1) or (n, 2), are those of
+    the free parameters without Stribeck curve: the load, and the speed unless sigma_2 is at 0. `grid`, shape
+    (g,), is that of ln v_s. `statistic` is c^2, the fall of the sum of squares over the variance of unit
+    weight, and `df` the degrees of freedom of that variance, inf if it is known.
 
-    Notes
-    -----
     Hotelling 1939, Am. J. Math. 61, 440-460; Davies 1987, Biometrika 74(1), 33-43,
     doi:10.1093/biomet/74.1.33; with estimated variance: Knowles and Siegmund 1989, Int. Stat. Rev. 57(3),
     205-220, doi:10.2307/1403794.
