@@ -53,8 +53,8 @@ def test_no_v_s_of_a_fine_search_does_better(kind):
     speed, load, force, weight, _ = draw(kind, np.random.default_rng(KINDS.index(kind)))
     fit = solve_stribeck(speed, load, force, weight)
     root = np.sqrt(weight)
-    assert np.all(fit.values()[:, [0, 1, 3]] >= 0)
-    rest = root * (force - model((speed, load), *fit.values().T[..., None]))
+    assert np.all(fit.values[:, [0, 1, 3]] >= 0)
+    rest = root * (force - model((speed, load), *fit.values.T[..., None]))
     npt.assert_allclose(fit.rss, np.sum(rest**2, axis=1), rtol=1e-9)
     for k in range(0, PROBLEMS, 50):
         scan = []

@@ -30,7 +30,7 @@ SIGNIFICANT = 0.05
 # Remark on a condition without a Stribeck curve whose directions differ.
 HIDDEN = "The offset between the two directions counts as scatter here and may hide a curve; see close-loop."
 # Parameters of each model.
-COLUMNS = {4: NAMES, 2: ("mu_c", "sigma_2"), 1: ("mu_c",)}
+COLUMNS = {FULL: NAMES, VISCOUS: ("mu_c", "sigma_2"), CONSTANT: ("mu_c",)}
 
 
 @dataclass
@@ -193,7 +193,7 @@ def solve(conditions: list[Condition]) -> None:
     full = [c for c in conditions if c.model == FULL]
     if full:
         fit = solve_stribeck(*stacked(full))
-        for condition, values, rss, grid in zip(full, fit.values(), fit.rss, fit.grid, strict=True):
+        for condition, values, rss, grid in zip(full, fit.values, fit.rss, fit.grid, strict=True):
             condition.values, condition.chi2, condition.grid = values, float(rss), grid
     for condition in conditions:
         if condition.model != FULL:
@@ -228,7 +228,7 @@ def bound(conditions: list[Condition], rise: np.ndarray) -> None:
     if full:
         arrays = stacked([conditions[k] for k in full])
         values, chi2 = (np.array([getattr(conditions[k], name) for k in full]) for name in ("values", "chi2"))
-        fit = StribeckFit(*values.T, chi2, search_limits(arrays[0], arrays[3]))
+        fit = StribeckFit(values, chi2, search_limits(arrays[0], arrays[3]))
         lows, highs = stribeck_intervals(*arrays, fit, rise[full])
         for k, low, high in zip(full, lows, highs, strict=True):
             conditions[k].low, conditions[k].high = low, high

@@ -92,23 +92,16 @@ PHYSICAL = (True, True, True)
 
 @dataclass(frozen=True)
 class StribeckFit:
-    """Parameters of every problem, each shape (problems,)."""
+    """Fits of many problems."""
 
-    mu_s: np.ndarray
-    mu_c: np.ndarray
-    v_s: np.ndarray
-    sigma_2: np.ndarray
-    rss: np.ndarray
+    values: np.ndarray  # (problems, 4): mu_s, mu_c, v_s, sigma_2
+    rss: np.ndarray  # (problems,)
     limits: tuple[np.ndarray, np.ndarray]  # (problems,) each: lowest and highest ln v_s searched
 
     @property
     def grid(self) -> np.ndarray:
         """Grid of ln v_s that was searched, shape (problems, g)."""
         return even_grid(*self.limits, PER_DECADE)
-
-    def values(self) -> np.ndarray:
-        """Return mu_s, mu_c, v_s, sigma_2 as columns, shape (problems, 4)."""
-        return np.stack([self.mu_s, self.mu_c, self.v_s, self.sigma_2], axis=1)
 
 
 def stribeck_basis(speed, load):
@@ -146,7 +139,7 @@ def solve_stribeck(speed, load, force, weight) -> StribeckFit:
     >>> v = np.geomspace(0.5, 100, 9)[None, :]
     >>> force = 50 * (0.3 + 0.1 * np.exp(-((v / 6.0) ** 2))) + 0.02 * v
     >>> fit = solve_stribeck(v, np.full_like(v, 50.0), force, np.ones_like(v))
-    >>> [round(float(value[0]), 8) for value in (fit.mu_s, fit.mu_c, fit.v_s, fit.sigma_2)]
+    >>> fit.values[0].round(8).tolist()
     [0.4, 0.3, 6.0, 0.02]
     """
     speed, load, force, weight = np.broadcast_arrays(
@@ -156,7 +149,8 @@ def solve_stribeck(speed, load, force, weight) -> StribeckFit:
     problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
     found = global_optimum(problems, even_grid(*limits, PER_DECADE))
     mu_s, mu_c, sigma_2 = found.coefficients.T
-    return StribeckFit(mu_s, mu_c, np.exp(found.u), sigma_2, found.rss, limits)
+    values = np.stack([mu_s, mu_c, np.exp(found.u), sigma_2], axis=1)
+    return StribeckFit(values, found.rss, limits)
 
 
 # ---------------------------------------------------------------- intervals
@@ -170,7 +164,7 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
     """
     problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
     limit = fit.rss + rise
-    u_best = np.log(fit.v_s)
+    u_best = np.log(fit.values[:, 2])
     rss, _ = profile(problems, fit.grid)
     inside = rss <= limit[:, None]
     (u_low, open_low), (u_high, open_high) = (
@@ -179,13 +173,10 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
     fine = u_low[:, None] + (u_high - u_low)[:, None] * np.linspace(0, 1, FINE)
     fine = np.concatenate([fine, u_best[:, None]], axis=1)
     low, high = conditional_ends(problems, fine, limit)
-    estimate = np.stack([fit.mu_s, fit.mu_c, fit.sigma_2], axis=1)
+    estimate = fit.values[:, [0, 1, 3]]
     low, high = np.fmin(low, estimate), np.fmax(high, estimate)
     v_low, v_high = np.where(open_low, 0.0, np.exp(u_low)), np.where(open_high, np.inf, np.exp(u_high))
-    return (
-        np.stack([low[:, 0], low[:, 1], v_low, low[:, 2]], axis=1),
-        np.stack([high[:, 0], high[:, 1], v_high, high[:, 2]], axis=1),
-    )
+    return np.insert(low, 2, v_low, axis=1), np.insert(high, 2, v_high, axis=1)
 
 
 def _crossing(problems: Separable, grid, u_best, inside, limit, sign):
