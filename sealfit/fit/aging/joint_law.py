@@ -46,31 +46,19 @@ DRIVERS = (("E", "temperature_C", _inverse), ("kappa", "compression_ratio_pct", 
 
 @dataclass(frozen=True)
 class Aged:
-    """Values of one quantity, each of a specimen or the mean of those of a condition.
+    """Values of one quantity, each of a specimen or the mean of those of a condition; arrays are (n,).
 
-    Attributes
-    ----------
-    days, value : ndarray, shape (n,)
-        Aging time in days, and the value measured.
-    temperature_C, compression_ratio_pct : ndarray, shape (n,), or None
-        Temperature in degrees Celsius and height in percent during aging; not used for unaged specimens. None
-        if unknown.
-    variance : ndarray, shape (n,) or (n, n), sparse array, shape (n, n), or None
-        Measurement variance or covariance of the values; the scatter between specimens is estimated and
-        added. None if it is 0.
-    size : ndarray, shape (n,), or None
-        Values to which that scatter is relative; None for the values themselves.
-    replicates_df, level_df : float
-        Degrees of freedom of a variance estimated from replicates, of differences between values and of their
-        common level; 0 if it is known otherwise.
+    `variance`, shape (n,) or (n, n), is the measurement variance or covariance, None if it is 0; the scatter
+    between specimens is estimated and added. The degrees of freedom are those of a variance estimated from
+    replicates, of differences between values and of their common level; 0 if it is known otherwise.
     """
 
     days: np.ndarray
     value: np.ndarray
-    temperature_C: np.ndarray | None = None
-    compression_ratio_pct: np.ndarray | None = None
-    variance: np.ndarray | None = None
-    size: np.ndarray | None = None
+    temperature_C: np.ndarray | None = None  # while aging, not used for unaged specimens; None if unknown
+    compression_ratio_pct: np.ndarray | None = None  # the same; height in percent
+    variance: np.ndarray | csr_array | None = None
+    size: np.ndarray | None = None  # values to which that scatter is relative; None: the values themselves
     replicates_df: float = 0.0
     level_df: float = 0.0
 
@@ -108,11 +96,8 @@ class Aged:
 
     def drivers(self) -> tuple[str, ...]:
         """Return the names of the coefficients in ln k of the variables that were varied."""
-        at = {name: getattr(self, column) for name, column, _ in DRIVERS}
-        varied = {
-            name: own is not None and np.unique(own[self.days > 0]).size > 1 for name, own in at.items()
-        }
-        return tuple(name for name in at if varied[name])
+        there = ((name, getattr(self, column)) for name, column, _ in DRIVERS)
+        return tuple(name for name, at in there if at is not None and np.unique(at[self.days > 0]).size > 1)
 
     @cached_property
     def middle(self) -> dict[str, float]:
@@ -255,9 +240,8 @@ class JointLaw:
         )
         return x[..., :1] - x[..., 1:2] * lost
 
-    def own(self, x: np.ndarray | None = None) -> list[np.ndarray]:
+    def own(self, x: np.ndarray) -> list[np.ndarray]:
         """Return the parameters of the shape, shape (..., 1) each."""
-        x = self.x if x is None else x
         return [np.exp(x[..., 2 + k, None]) for k in range(len(self.loss.parameters))]
 
     def rate(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
