@@ -27,17 +27,17 @@ class Cells:
 
     def __init__(self, parts: Sequence[Part], group: np.ndarray) -> None:
         self.parts = parts
-        self.groups = Pieces(np.bincount(group)) if len(parts) else Pieces([])
-        self._size = np.array([part.force_N.size for part in parts], np.int64)
+        self.groups = Pieces(np.bincount(group))
+        self._size = np.array([part.force_N.size for part in parts])
         reach = np.array([part.distance_mm[-1] for part in parts], float)
         self.samples, self.reach_mm = (
             np.array([np.median(values[own]) for own in self.groups.slices]) for values in (self._size, reach)
         )
         self.count = np.clip(self.samples.astype(int), LEAST, MOST_CELLS)
-        width = int(self.count.max(initial=0))
+        width = int(self.count.max())
         self.middle_mm = (np.arange(width) + 0.5) * (self.reach_mm / self.count)[:, None]
         # The cell of every sample in a flat array; samples beyond the last cell are in an extra column.
-        distance = np.concatenate([part.distance_mm for part in parts]) if len(parts) else np.zeros(0)
+        distance = np.concatenate([part.distance_mm for part in parts])
         count = np.repeat(self.groups.spread(self.count), self._size)
         cell = (distance / np.repeat(self.groups.spread(self.reach_mm), self._size) * count).astype(np.int64)
         cell = np.where(cell < count, cell, width)

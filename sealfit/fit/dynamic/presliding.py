@@ -324,8 +324,8 @@ class _Lines:
 
     def __init__(self, cells: Cells) -> None:
         names = ("force_N", "slope_N_mm", "distance_mm", "extent_mm", "rows")
-        values = np.array([[getattr(part.sliding, name) for name in names] for part in cells.parts], float)
-        self.force, self.slope, self.distance, self.extent, self.rows = values.reshape(-1, len(names)).T
+        values = [[getattr(part.sliding, name) for name in names] for part in cells.parts]
+        self.force, self.slope, self.distance, self.extent, self.rows = np.array(values, float).T
 
     def at(self, distance_mm: np.ndarray) -> np.ndarray:
         """Return the extrapolated sliding force at distances, shape (strokes, n)."""
@@ -355,8 +355,8 @@ def _units(group: np.ndarray, file: np.ndarray) -> np.ndarray:
     """Return the number of each stroke's unit of evidence: its file, or itself if its group has one file."""
     each = np.arange(len(file))
     first = np.searchsorted(group, group)  # groups lie one after the other
-    alone = np.bincount(group, file != file[first], minlength=1)[group] == 0
-    own = np.where(alone, each, len(file) + group * (int(file.max(initial=0)) + 1) + file)
+    alone = np.bincount(group, file != file[first])[group] == 0
+    own = np.where(alone, each, len(file) + group * (int(file.max()) + 1) + file)
     return np.unique(own, return_inverse=True)[1]
 
 
