@@ -148,8 +148,6 @@ def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple
     """
     n, p = jacobian.shape[-2:]
     free = np.ones(p, bool) if free is None else free
-    if not free.any():
-        return np.zeros((*jacobian.shape[:-2], p, p)), np.zeros(jacobian.shape[:-2], int)
     jacobian = jacobian * free[..., None, :]
     scale = np.linalg.norm(jacobian, axis=-2)
     scale = np.where(scale > 0, scale, 1.0)

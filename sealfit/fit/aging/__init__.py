@@ -13,7 +13,6 @@ from scipy.sparse import csr_array, diags_array
 from sealfit.config import Config
 from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
 from sealfit.fit.aging.law_table import (
-    DAYS_FOR_LAW,
     Curve,
     Estimate,
     OneQuantity,
@@ -25,6 +24,7 @@ from sealfit.fit.aging.law_table import (
     t_of_95,
     without_law,
 )
+from sealfit.fit.joint.declared import DAYS_FOR_LAW
 from sealfit.fit.steady.condition import FULL
 from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT

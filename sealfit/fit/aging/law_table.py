@@ -11,6 +11,7 @@ from scipy.optimize.elementwise import find_root
 from scipy.special import chdtrc, fdtrc, ndtri, stdtrit
 
 from sealfit.fit.aging.law import PROFILED, Groups, LawFit
+from sealfit.fit.joint.declared import DAYS_FOR_LAW
 from sealfit.fit.least_squares import CHUNK, covariance_of, levenberg_marquardt
 from sealfit.fit.steady import table_row
 
@@ -19,8 +20,6 @@ CLOSE = 1e-3
 # The first step along ln b from the optimum outwards; each further step is twice as long.
 FIRST_STEP = 0.25
 
-# Number of days that a law needs: mu_0, a and b are three parameters.
-DAYS_FOR_LAW = 3
 # b is not determined if the ends of its 95 % interval differ by more than this ratio.
 WIDE_B = 100.0
 # Level of the test for lack of fit.

@@ -70,8 +70,6 @@ def reml(
     `jacobian`, shape (m, p), is the mean tangent of the model; `kinds` are the level and kind of the
     components, finest level first, and `start` their starting variances.
     """
-    if not kinds:
-        return ()
     scale_force = max(float(np.sqrt(np.mean(means.force**2))), 1e-12)
     total = max(float(np.var(means.residual)), float(np.mean(means.variance)), 1e-20)
     unit = np.array([total / (scale_force**2 if kind == "gain" else 1.0) for _, kind in kinds])
