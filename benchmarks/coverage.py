@@ -208,9 +208,9 @@ def _dynamic_fit(physics: dict, design: dict, noise: Sequence[dict], seed: int):
         place = Path(folder) / "campaign"
         simulate(Spec(seed=seed, physics=physics, design={**ONE, **design}, noise=tuple(noise)), place)
         tables = ingest_campaign(place, config, workers=1).tables
-    return fit_dynamic(
-        tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config
-    ).fit
+    return fit_dynamic(tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config)[
+        "dynamic_fit"
+    ]
 
 
 PEAKS: dict[str, dict] = {}  # of the designs counted so far, in this process

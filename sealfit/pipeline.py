@@ -267,9 +267,7 @@ def _fit_dynamic(store: Store, staged: Staged, options: Options, progress: Silen
 
     progress.say("fitting the pre-sliding part")
     tables, config = (store.read("steady"), whole_steady_fit(store.read)), store.seen_config("fit-dynamic")
-    found = fit_dynamic(store.traces(), *tables, config, workers=options.workers)
-    staged.table("dynamic_fit", found.fit)
-    staged.table("dynamic_curves", found.curves)
+    _write(staged, fit_dynamic(store.traces(), *tables, config, workers=options.workers))
     return len(tables[0]), "strokes"
 
 

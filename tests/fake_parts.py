@@ -158,7 +158,7 @@ class Parts:
             unit=["N/mm", "N s/mm"],
             reason="",
         )
-        return SimpleNamespace(fit=fit, curves=small("dynamic_curves"))
+        return {"dynamic_fit": fit, "dynamic_curves": small("dynamic_curves")}
 
     def joint_laws(self, steady, steady_fit, config):
         return small("aging_laws"), small("master_curve")

@@ -385,8 +385,7 @@ def after_fits(
         "aging_curves_after": curves,
         "aging_laws_after": laws,
         "master_curve_after": master,
-        "dynamic_fit_after": dynamic.fit,
-        "dynamic_curves_after": dynamic.curves,
+        **{f"{name}_after": table for name, table in dynamic.items()},
     }
     return {
         name: t.assign(model="after") if "model" in SCHEMAS[name].names() else t for name, t in found.items()

@@ -179,7 +179,7 @@ def test_starts_are_fitted_to_forces_without_the_offset():
     }
     steady = pd.DataFrame([{**steady, "load_N": 50.0, "force_N": 30.0, "effects_start_N": 2.0, "used": True}])
     asked = trace.assign(steady=distance > 3.0), steady, pd.DataFrame(columns=STEADY_FIT.names()), Config()
-    curve = fit_dynamic(*asked).curves
+    curve = fit_dynamic(*asked)["dynamic_curves"]
     assert curve["force_N"].max() == pytest.approx(30.0, abs=0.01)
 
 

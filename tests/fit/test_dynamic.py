@@ -96,7 +96,7 @@ def dynamic(fit):
 @pytest.mark.parametrize("jitter_mm", [0.0, 0.002, 0.01])
 def test_noise_of_the_displacement_does_not_hide_the_damping(tmp_path, jitter_mm):
     noise = (*NOISE, {"kind": "displacement", "sd_mm": jitter_mm})
-    found = dynamic(made(tmp_path, noise=noise)[1].fit)
+    found = dynamic(made(tmp_path, noise=noise)[1]["dynamic_fit"])
     assert found.loc["sigma_0", "value"] == pytest.approx(100.0, rel=0.015)
     assert found.loc["sigma_1", "value"] == pytest.approx(0.5, rel=0.06)
     assert found["identified"].all()
@@ -114,16 +114,16 @@ def test_strokes_both_ways_begin_with_bristles_bent_the_other_way(tmp_path):
         "speeds_mm_s": (0.5, 2.0, 4.0, 8.0, 20.0, 40.0),
     }
     _, found = made(tmp_path, **design)
-    table = dynamic(found.fit)
+    table = dynamic(found["dynamic_fit"])
     assert table.loc["sigma_0", "value"] == pytest.approx(100.0, rel=0.02)
-    assert set(found.curves["direction"]) == {1, -1}
-    first = found.curves.groupby(["speed_set_mm_s", "direction"])["force_N"].first()
+    assert set(found["dynamic_curves"]["direction"]) == {1, -1}
+    first = found["dynamic_curves"].groupby(["speed_set_mm_s", "direction"])["force_N"].first()
     assert (first < 5.0).all()
 
 
 def test_without_a_stribeck_curve_the_stiffness_is_known_and_the_damping_is_not(tmp_path):
     _, found = made(tmp_path, speeds_mm_s=(1.0, 4.0, 20.0), physics={"sigma_1": 0.0})
-    table = dynamic(found.fit)
+    table = dynamic(found["dynamic_fit"])
     assert table.loc["sigma_0", "value"] == pytest.approx(100.0, rel=0.1)
     assert not table.loc["sigma_1", "identified"]
     assert "Stribeck curve is not known" in table.loc["sigma_1", "reason"]
@@ -131,7 +131,7 @@ def test_without_a_stribeck_curve_the_stiffness_is_known_and_the_damping_is_not(
 
 def test_the_model_goes_through_the_mean_of_the_starts(tmp_path):
     _, found = made(tmp_path)
-    curves = found.curves
+    curves = found["dynamic_curves"]
     assert (curves["n"] <= 3).all()
     left = (curves["force_N"] - curves["model_N"])[curves["n"] == 3]
     assert np.sqrt((left**2).mean()) < 0.1
@@ -140,7 +140,7 @@ def test_the_model_goes_through_the_mean_of_the_starts(tmp_path):
 def test_a_peak_of_the_ramp_is_a_break_away_and_noise_is_none(tmp_path):
     slow = {"ramp_s": 2.0, "speeds_mm_s": (8.0, 16.0), "sampling_Hz": 400.0, "max_rows": 4000}
     _, found = made(tmp_path, **slow)
-    ratio = found.fit[found.fit["parameter"] == "F_ba/F"].set_index("speed_set_mm_s")
+    ratio = found["dynamic_fit"][found["dynamic_fit"]["parameter"] == "F_ba/F"].set_index("speed_set_mm_s")
     assert (
         ratio.loc[8.0, "lo95"] < 1.0801 < ratio.loc[8.0, "hi95"]
     )  # without noise it is 1.0801, and 1.0000 at 16 mm/s
@@ -149,7 +149,7 @@ def test_a_peak_of_the_ramp_is_a_break_away_and_noise_is_none(tmp_path):
     assert "without passing above" in ratio.loc[16.0, "reason"]
     flat = {"mu_s": {"mu_0": 0.6}, "mu_c": {"mu_0": 0.6}, "sigma_1": 0.0, "sigma_2": 0.0}
     _, found = made(tmp_path, physics=flat, seed=2)
-    ratio = found.fit[found.fit["parameter"] == "F_ba/F"]
+    ratio = found["dynamic_fit"][found["dynamic_fit"]["parameter"] == "F_ba/F"]
     assert ratio["reason"].str.contains("without passing above").all(), ratio["value"]
 
 
@@ -159,10 +159,10 @@ def test_traces_that_begin_in_steady_sliding_say_so(tmp_path):
     traces = tables["traces"][tables["traces"]["steady"]]
     assert starts_of(strokes_along(traces, tables["steady"])) == []
     found = fit_dynamic(traces, tables["steady"], fit_conditions(tables["steady"], config), config)
-    table = dynamic(found.fit)
+    table = dynamic(found["dynamic_fit"])
     assert not table["identified"].any()
     assert table["reason"].str.contains("no stroke begins").all()
-    assert found.curves.empty
+    assert found["dynamic_curves"].empty
 
 
 def test_a_sliding_force_along_the_motion_is_said(tmp_path):
@@ -180,7 +180,7 @@ def test_a_sliding_force_along_the_motion_is_said(tmp_path):
     config = load_config()
     fit = fit_dynamic(
         shifted["traces"], shifted["steady"], fit_conditions(shifted["steady"], config), config
-    ).fit
+    )["dynamic_fit"]
     found = dynamic(fit)
     assert not found["identified"].any()
     assert (
@@ -208,18 +208,19 @@ def test_micro_tribometer(tmp_path):
     assert mu[1] == pytest.approx(0.466, abs=0.006)
     assert mu[-1] == pytest.approx(0.468, abs=0.003)
     found = fit_dynamic(tables["traces"], steady, fit_conditions(steady, config), config)
-    table = dynamic(found.fit)
+    table = dynamic(found["dynamic_fit"])
     assert 33 < table.loc["sigma_0", "value"] < 47
     assert "the rise of the force differs from the model's" in table.loc["sigma_0", "reason"]
     assert not table.loc["sigma_1", "identified"]
     assert "Stribeck" in table.loc["sigma_1", "reason"]
-    largest = found.fit[found.fit["parameter"] == "F_max/F"].set_index("direction")
+    largest = found["dynamic_fit"][found["dynamic_fit"]["parameter"] == "F_max/F"].set_index("direction")
     assert largest.loc[1, "value"] == pytest.approx(1.067, abs=0.01)
     assert largest.loc[-1, "value"] == pytest.approx(1.013, abs=0.005)
     assert (
         largest.loc[1, "reason"] == "0.227 mm into strokes of 0.227 mm"
     )  # at the end forward: no break-away
-    assert not found.fit.loc[found.fit["quantity"] == "break_away", "identified"].any()
+    rows = found["dynamic_fit"]
+    assert not rows.loc[rows["quantity"] == "break_away", "identified"].any()
 
 
 def test_warming_along_the_stroke_is_no_break_away(tmp_path):
@@ -230,7 +231,7 @@ def test_warming_along_the_stroke_is_no_break_away(tmp_path):
         "parameters": {"A": 0.06, "s_0": 10.0},
     }
     _, found = made(tmp_path, effects=(warm,))
-    ratio = found.fit[found.fit["parameter"] == "F_ba/F"]
+    ratio = found["dynamic_fit"][found["dynamic_fit"]["parameter"] == "F_ba/F"]
     assert len(ratio) > 3
     assert (ratio["value"] - 1).abs().max() < 0.01
     assert not ratio["identified"].any()
@@ -253,5 +254,5 @@ def test_traces_that_are_read_condition_by_condition_give_the_same(stored, worke
     store, tables, whole = stored
     assert len(store.traces()) > 3
     split = fit_dynamic(store.traces(), *tables, store.config, workers=workers)
-    pdt.assert_frame_equal(whole.fit, split.fit, check_exact=True)
-    pdt.assert_frame_equal(whole.curves, split.curves, check_exact=True)
+    pdt.assert_frame_equal(whole["dynamic_fit"], split["dynamic_fit"], check_exact=True)
+    pdt.assert_frame_equal(whole["dynamic_curves"], split["dynamic_curves"], check_exact=True)

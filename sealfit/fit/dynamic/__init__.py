@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -106,14 +106,6 @@ def dynamic_units(config: Config) -> Mapping[str, str]:
 OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]
 
 
-@dataclass(frozen=True)
-class Dynamic:
-    """Tables `dynamic_fit`, with the condition columns, and `dynamic_curves`."""
-
-    fit: pd.DataFrame
-    curves: pd.DataFrame
-
-
 def fit_dynamic(
     traces: pd.DataFrame | Sequence[StoredTraces],
     steady: pd.DataFrame,
@@ -121,7 +113,7 @@ def fit_dynamic(
     config: Config,
     *,
     workers: int = 1,
-) -> Dynamic:
+) -> dict[str, pd.DataFrame]:
     """Fit sigma_0 and sigma_1 of Eqs. 1 to 7 to the pre-sliding part of every condition's strokes.
 
     Parameters
@@ -140,11 +132,11 @@ def fit_dynamic(
 
     Returns
     -------
-    Dynamic
-        In its fit `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed and
-        direction: the force, and its ratio to the sliding force), "largest" (likewise: ratio of the largest
-        force in the strokes to the sliding force) or "statistics". Its curves are the mean starts, measured
-        and fitted.
+    dict of DataFrame
+        Tables `dynamic_fit`, with the condition columns, and `dynamic_curves`, the mean starts, measured and
+        fitted. In `dynamic_fit` `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed
+        and direction: the force, and its ratio to the sliding force), "largest" (likewise: ratio of the
+        largest force in the strokes to the sliding force) or "statistics".
 
     Notes
     -----
@@ -166,7 +158,8 @@ def fit_dynamic(
     table = table.merge(keys, on="condition", how="left", validate="many_to_one").assign(model="before")
     fixed = DYNAMIC_FIT.names()
     table = table.reindex(columns=[*fixed, *(name for name in keys.columns if name not in fixed)])
-    return Dynamic(table.astype({"direction": "Int64"}), curves.reindex(columns=DYNAMIC_CURVES.names()))
+    curves = curves.reindex(columns=DYNAMIC_CURVES.names())
+    return {"dynamic_fit": table.astype({"direction": "Int64"}), "dynamic_curves": curves}
 
 
 # The traces of some conditions, and their rows of `steady` and `steady_fit`.
