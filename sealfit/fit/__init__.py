@@ -21,14 +21,10 @@ AFTER = "_after"
 
 
 def stored(name: str, fit: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables that store table `name`, by name; itself alone unless it is a fit with covariances.
+    """Return the tables that store table `name`, by name.
 
-    Parameters
-    ----------
-    name : str
-        "steady_fit", "aging_fit" or the same with "_after"; any other table is returned as it is.
-    fit : DataFrame
-        What `fit_conditions`, `fit_series` or `after_laws` returned.
+    They are several for "steady_fit", "aging_fit" and the same with "_after", as `fit_conditions`,
+    `fit_series` and `after_laws` return them; any other table is stored as it is.
 
     Examples
     --------

@@ -36,30 +36,14 @@ def levenberg_marquardt(
     damping: float = DAMPING,
     linear: Linear | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the local least-squares optima from starting points, and their sums of squares.
+    """Return the local least-squares optima from starting points, (problems, p), and their sums of squares.
 
-    Parameters
-    ----------
-    evaluate : callable
-        `evaluate(x, rows)` -> weighted residual, shape (r, n), and its derivative, shape (r, p, n), of the
-        problems `rows` (r,) at x (r, p).
-    start : ndarray, shape (problems, p)
-        Starting points; they are moved inside the bounds.
-    low, high : ndarray, shape (p,) or (problems, p)
-        Closed bounds; infinite for none, equal for a fixed parameter.
-    damping : float
-        Damping of the first step; small for starts close to the optimum.
-    linear : Linear, optional
-        Products of the derivatives, if they are not arrays.
+    `evaluate(x, rows)` returns weighted residuals, shape (r, n), and their derivatives, shape (r, p, n), of
+    the problems `rows`, shape (r,), at x, shape (r, p). Starts are moved inside the closed bounds, shape (p,)
+    or (problems, p), which are infinite for none and equal for a fixed parameter. `damping` is that of the
+    first step, small for starts close to the optimum. `linear` has the products of the derivatives, if they
+    are not arrays. A sum of squares is infinite if the residual is not finite at the start.
 
-    Returns
-    -------
-    x : ndarray, shape (problems, p)
-    rss : ndarray, shape (problems,)
-        Infinite if the residual is not finite at the start.
-
-    Notes
-    -----
     The scale of each parameter is the largest norm of its column so far (More 1978, Lecture Notes in
     Mathematics 630, 105-116). The damped step is computed by singular values, more accurately than by normal
     equations.

@@ -146,14 +146,9 @@ def _variances(specimens: pd.DataFrame) -> tuple[float, float, tuple[int, int]]:
 
 
 def fit_properties(specimens: pd.DataFrame, config: Config) -> dict[str, pd.DataFrame]:
-    """Return tables `aging_fit`, `aging_curves`, `aging_laws` and `master_curve` of properties.
+    """Return tables `aging_fit`, `aging_curves`, `aging_laws` and `master_curve` of table `property_values`.
 
-    Parameters
-    ----------
-    specimens : DataFrame
-        Table `property_values`.
-    config : Config
-        Names the condition columns.
+    The config names the condition columns.
     """
     rows, found = [], {}
     for (rubber, quantity), own in specimens.groupby(["rubber", "quantity"], sort=True):
