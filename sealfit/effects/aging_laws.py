@@ -12,6 +12,7 @@ GAS_CONSTANT = 8.314462618
 ZERO_C = 273.15
 # Standard laboratory temperature of rubber tests in degrees Celsius, ISO 23529.
 STANDARD_C = 23.0
+WU = "Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102"
 # Targets of laws over the days of aging, most likely first.
 ON_COEFFICIENTS = (
     ("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply"),
@@ -103,8 +104,7 @@ COMPRESSION_FACTOR = Effect(
         Parameter("A", "{y}", 0.5, AMPLITUDE, "relative change per whole height taken away", linear=True),
     ),
     shape=compression_factor_shape,
-    source="Friction after aging at 80, 90 and 100 % of the height: Wu et al. 2020, Polymers 12(1), 102, "
-    "doi:10.3390/polym12010102. First order: ours.",
+    source=f"Friction after aging at 80, 90 and 100 % of the height: {WU}. First order: ours.",
     # By hand: a fifth of the height taken away.
     worked=({"compression_ratio_pct": 80.0}, {"A": 0.6}, 0.12),
 )
@@ -133,8 +133,7 @@ AGING_FLOOR = Effect(
         Parameter("t_f", "{x}", 8.0, (1e-3, 1e5), "day from which it is given back", search="inside"),
     ),
     shape=aging_floor_shape,
-    source="Form: ours. The logarithm of Eq. 15, cut off: Wu et al. 2020, Polymers 12(1), 102, "
-    "doi:10.3390/polym12010102.",
+    source=f"Form: ours. The logarithm of Eq. 15, cut off: {WU}.",
     # By hand: twice the day of the floor, ln 2 = 0.6931471805599453.
     worked=({"aging_days": 16.0}, {"A": 0.04, "t_f": 8.0}, 0.04 * 0.6931471805599453),
 )
@@ -211,12 +210,13 @@ ONSETS = (0.01, 0.1, 1.0, 10.0, 100.0)
 ONSET = Parameter("t_0", "{x}", 1.0, (1e-4, 1e5), "aging time at which the change sets in", search=ONSETS)
 
 
-def stribeck_speed_aging_shape(inputs, *, A, t_0):
-    r"""Stribeck speed that changes with age: the declared model has one v_s for all days of a series.
+def logarithmic_aging_shape(inputs, *, A, t_0):
+    r"""Stribeck speed or viscous coefficient that changes with age; the declared model has one for all days.
 
     v_s is the speed of the transition from boundary friction to a film or a molecular time scale. Hardened
-    rubber conforms less to roughness and relaxes more slowly, which changes v_s. As for the coefficients, the
-    change is a logarithm of time.
+    rubber conforms less to roughness and relaxes more slowly, which changes v_s. The remaining lubricant and
+    the damping of the rubber change with age, and sigma_2 with them. As for the coefficients, the change is a
+    logarithm of time.
     """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 
@@ -240,21 +240,11 @@ STRIBECK_SPEED_AGING = Effect(
         ),
         ONSET,
     ),
-    shape=stribeck_speed_aging_shape,
-    source="Form: ours, after the law of the coefficients: Wu et al. 2020, Polymers 12(1), 102, "
-    "doi:10.3390/polym12010102, Eq. 15.",
+    shape=logarithmic_aging_shape,
+    source=f"Form: ours, after the law of the coefficients: {WU}, Eq. 15.",
     # By hand: t = t_0 gives ln 2 = 0.6931471805599453.
     worked=({"aging_days": 2.0}, {"A": 0.3, "t_0": 2.0}, 0.3 * 0.6931471805599453),
 )
-
-
-def viscosity_aging_shape(inputs, *, A, t_0):
-    r"""Viscous coefficient that changes with age.
-
-    The declared model has one sigma_2 for all days of a series. The remaining lubricant and the damping of
-    the rubber change with age. As for the coefficients, the change is a logarithm of time.
-    """
-    return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 
 
 VISCOSITY_AGING = Effect(
@@ -271,9 +261,8 @@ VISCOSITY_AGING = Effect(
         ),
         ONSET,
     ),
-    shape=viscosity_aging_shape,
-    source="Form: ours, after the law of the coefficients: Wu et al. 2020, Polymers 12(1), 102, "
-    "doi:10.3390/polym12010102, Eq. 15.",
+    shape=logarithmic_aging_shape,
+    source=f"Form: ours, after the law of the coefficients: {WU}, Eq. 15.",
     # By hand: t = 9 t_0 gives ln 10 = 2.302585092994046.
     worked=({"aging_days": 9.0}, {"A": -0.02, "t_0": 1.0}, -0.02 * 2.302585092994046),
 )

@@ -6,6 +6,10 @@ import numpy as np
 
 from sealfit.effects.contract import AMPLITUDE, ROOM, Effect, Parameter, deviation, reference
 
+FRICTION = (("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply"))
+FALL = "Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112."
+LUMPED = "Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford."
+
 
 def warming_time_shape(inputs, *, A, tau):
     r"""Warming by sliding, along time: friction falls as the contact warms, and approaches a limit.
@@ -27,14 +31,13 @@ WARMING_TIME = Effect(
     form="-A (1 - exp(-t / tau))",
     reference="cold contact (time 0)",
     reads=("time_s",),
-    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    acts_on=FRICTION,
     parameters=(
         Parameter("A", "{y}", 0.1, (-5.0, 0.95), "share of friction lost when warm", linear=True),
         Parameter("tau", "{x}", 5.0, (1e-4, 1e7), "time constant of warming", search="span"),
     ),
     shape=warming_time_shape,
-    source="Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112. "
-    "Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford.",
+    source=f"{FALL} {LUMPED}",
     # By hand: at t = tau the contact has warmed by 1 - 1/e = 0.6321205588285577; a fifth of it is lost.
     worked=({"time_s": 4.0}, {"A": 0.2, "tau": 4.0}, -0.2 * 0.6321205588285577),
 )
@@ -59,14 +62,13 @@ WARMING_DISTANCE = Effect(
     form="-A (1 - exp(-s / s_0))",
     reference="cold contact (distance 0)",
     reads=("distance_mm",),
-    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    acts_on=FRICTION,
     parameters=(
         Parameter("A", "{y}", 0.1, (-5.0, 0.95), "share of friction lost when warm", linear=True),
         Parameter("s_0", "{x}", 20.0, (1e-4, 1e7), "distance over which the contact warms", search="span"),
     ),
     shape=warming_distance_shape,
-    source="Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112. "
-    "Approach over a distance: ours, from the heat balance in the docstring.",
+    source=f"{FALL} Approach over a distance: ours, from the heat balance in the docstring.",
     # By hand: at s = s_0 ln 2 the exponential is 1/2, so half of A = 0.3 is lost; ln 2 = 0.6931471805599453.
     worked=({"distance_mm": 6.931471805599453}, {"A": 0.3, "s_0": 10.0}, -0.15),
 )
@@ -99,7 +101,7 @@ WARMING_POWER = Effect(
     form="-A (N |v| / (N_ref v_ref)) (1 - exp(-t / tau))",
     reference="cold contact (time 0)",
     reads=("time_s", "speed_mm_s", "load_N"),
-    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    acts_on=FRICTION,
     parameters=(
         Parameter(
             "A",
@@ -112,8 +114,7 @@ WARMING_POWER = Effect(
         Parameter("tau", "{x}", 5.0, (1e-4, 1e7), "time constant of warming", search="span"),
     ),
     shape=warming_power_shape,
-    source="Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford. "
-    "Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112.",
+    source=f"{LUMPED} {FALL}",
     # By hand: twice the speed, half the load: the power is the reference's; t = tau gives 1 - 1/e =
     # 0.6321205588285577.
     worked=(
@@ -149,7 +150,7 @@ WARMING_CONDUCTION = Effect(
     form="-A sqrt(|v| s / (v_ref s_ref))",
     reference="cold contact (distance 0)",
     reads=("distance_mm", "speed_mm_s"),
-    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    acts_on=FRICTION,
     parameters=(
         Parameter(
             "A",
@@ -189,7 +190,7 @@ WARMING_CONDUCTION_LOAD = Effect(
     form="-A (N / N_ref) sqrt(|v| s / (v_ref s_ref))",
     reference="cold contact (distance 0)",
     reads=("distance_mm", "speed_mm_s", "load_N"),
-    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply")),
+    acts_on=FRICTION,
     parameters=(
         Parameter(
             "A",
@@ -201,9 +202,7 @@ WARMING_CONDUCTION_LOAD = Effect(
         ),
     ),
     shape=warming_conduction_load_shape,
-    source="Half-space under a steady flux: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford; "
-    "sliding contacts: Jaeger 1942, J. Proc. R. Soc. New South Wales 76, 203-224. "
-    "First order in the temperature: ours.",
+    source=WARMING_CONDUCTION.source,
     # By hand: three times the load; nine times the distance at the same speed: 3 * sqrt(9) = 9.
     worked=(
         {
