@@ -8,11 +8,13 @@ underscore are not read.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
+from traceback import walk_tb
 from types import ModuleType
 
 import numpy as np
@@ -116,12 +118,8 @@ def _line_in(path: Path, error: BaseException) -> int | None:
     """Return the last line of the file in the error's traceback."""
     if isinstance(error, SyntaxError):
         return error.lineno
-    line, trace = None, error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            line = trace.tb_lineno
-        trace = trace.tb_next
-    return line
+    lines = [n for frame, n in walk_tb(error.__traceback__) if frame.f_code.co_filename == str(path)]
+    return lines[-1] if lines else None
 
 
 def _refuse_taken(name: str, found: Mapping[str, Effect], path: Path) -> None:
@@ -140,73 +138,69 @@ def _refuse_taken(name: str, found: Mapping[str, Effect], path: Path) -> None:
 
 
 def contract_fault(effect: Effect) -> str:
-    """Return the violation of the contract by an effect as text, empty if there is none."""
+    """Return the first violation of the contract by an effect as text, empty if there is none."""
     try:
         with np.errstate(all="ignore"):
-            return _description_fault(effect) or _shape_fault(effect)
+            return next(chain(_description_faults(effect), _worked_faults(effect), _shape_faults(effect)), "")
     except Exception as error:  # its shape is the user's code
         return f"its shape fails with its worked inputs: {type(error).__name__}: {error}"
 
 
-def _description_fault(effect: Effect) -> str:
+def _description_faults(effect: Effect) -> Iterator[str]:
     for name in ("label", "equation", "form", "source"):
         if not (isinstance(getattr(effect, name), str) and getattr(effect, name).strip()):
-            return f"its {name} is empty"
+            yield f"its {name} is empty"
     if not effect.acts_on:
-        return "acts_on is empty: say on what it may act"
+        yield "acts_on is empty: say on what it may act"
     if not effect.reads:
-        return "reads is empty: name the channels it depends on"
+        yield "reads is empty: name the channels it depends on"
     if {CHANNEL, SECOND} & set(effect.reads) and effect.reads not in READS_ANY:
-        return "reads mixes 'x' or 'z' (any channel) with named channels other than the direction"
-    names = [p.name for p in effect.parameters]
-    if len(set(names)) != len(names):
-        return "two parameters share a name"
-    return next((fault for p in effect.parameters if (fault := _parameter_fault(p))), "") or _worked_fault(
-        effect, names
-    )
+        yield "reads mixes 'x' or 'z' (any channel) with named channels other than the direction"
+    if len({p.name for p in effect.parameters}) != len(effect.parameters):
+        yield "two parameters share a name"
+    for p in effect.parameters:
+        yield from _parameter_faults(p)
 
 
-def _parameter_fault(p: Parameter) -> str:
+def _parameter_faults(p: Parameter) -> Iterator[str]:
     if not np.isfinite(p.bounds).all():
-        return f"the bounds of {p.name} are not finite"
+        yield f"the bounds of {p.name} are not finite"
     if not p.linear and isinstance(p.search, str) and p.search not in ("inside", "between", "span", "ratio"):
-        return f"search of {p.name} is '{p.search}': use numbers, 'inside', 'between', 'span' or 'ratio'"
-    return ""
+        yield f"search of {p.name} is '{p.search}': use numbers, 'inside', 'between', 'span' or 'ratio'"
 
 
-def _worked_fault(effect: Effect, names: list[str]) -> str:
+def _worked_faults(effect: Effect) -> Iterator[str]:
     inputs, values, _ = effect.worked
+    names = {p.name for p in effect.parameters}
     missing = [name for name in effect.reads if name not in inputs]
     if missing:
-        return f"its worked value gives no {', '.join(missing)}"
-    if set(values) != set(names):
-        return f"its worked value gives parameters {sorted(values)}, not {sorted(names)}"
-    return ""
+        yield f"its worked value gives no {', '.join(missing)}"
+    if set(values) != names:
+        yield f"its worked value gives parameters {sorted(values)}, not {sorted(names)}"
 
 
-def _shape_fault(effect: Effect) -> str:
+def _shape_faults(effect: Effect) -> Iterator[str]:
     inputs, values, expected = effect.worked
     arrays = {name: np.full(3, value) if name in effect.reads else value for name, value in inputs.items()}
     before = {name: np.copy(value) for name, value in arrays.items()}
     result = effect.shape(arrays, **values)
     if np.shape(result) != (3,):
-        return f"its shape returns an array of shape {np.shape(result)} for three rows"
+        yield f"its shape returns an array of shape {np.shape(result)} for three rows"
     if not np.allclose(result, expected, rtol=TOLERANCE, atol=1e-12):
-        return f"its shape gives {result[0]:.10g} where its worked value says {expected:.10g}"
+        yield f"its shape gives {result[0]:.10g} where its worked value says {expected:.10g}"
     if any(not np.array_equal(before[name], arrays[name]) for name in before):
-        return "its shape edits its inputs"
+        yield "its shape edits its inputs"
     amplitudes = {name: values[name] for name in effect.linear}
     doubled = effect.shape(arrays, **{**values, **{name: 2 * value for name, value in amplitudes.items()}})
     if not np.allclose(doubled, 2 * result, rtol=TOLERANCE, atol=1e-12):
-        return (
+        yield (
             f"its shape is not linear in {', '.join(amplitudes)}: "
             "twice the amplitude must give twice the shape"
         )
     nothing = effect.shape(arrays, **{**values, **dict.fromkeys(amplitudes, 0.0)})
     if np.any(nothing != 0):
-        return f"its shape is not zero where {', '.join(amplitudes)} is zero"
+        yield f"its shape is not zero where {', '.join(amplitudes)} is zero"
     for p in effect.parameters:
         for bound in p.bounds:
             if not np.isfinite(effect.shape(arrays, **{**values, p.name: bound})).all():
-                return f"its shape is not finite at the bound {p.name} = {bound:g}"
-    return ""
+                yield f"its shape is not finite at the bound {p.name} = {bound:g}"
