@@ -222,8 +222,8 @@ class _Law:
         days = table["aging_days"].to_numpy(float)
         self.unaged = bool((days[(table["rubber"] == self.rubber).to_numpy()] == 0).any())
         symbol = f"mu_{end}"
-        self.quantity = symbol if declared.has_load else FORCES[symbol]
-        self.unit = parameter_units(config.units, declared.has_load)["mu_s"]
+        self.quantity = symbol if after.rows.has_load else FORCES[symbol]
+        self.unit = parameter_units(config.units, after.rows.has_load)["mu_s"]
         names = (f"mu_0{end}", f"a_{end}", f"b_{end}")
         number = [int(declared.index[name][self.conditions[0]]) for name in names]
         self.place = number if min(number) >= 0 else None

@@ -145,8 +145,6 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
     declared = Declared(
         tuple(JointParameter(*p) for p in raw["parameters"]),
         {q: np.array(v, dtype=int) for q, v in raw["index"].items()},
-        tuple(record["conditions"]["condition"]),
-        record["has_load"],
         raw["stribeck"],
         raw["law"],
         {},  # it is not fitted again

@@ -161,7 +161,7 @@ def _conditions(
     )
     known = {name: k for k, name in enumerate(conditions["condition"])}
     declared = after.declared
-    names, index = list(conditions["condition"]), {q: list(v) for q, v in declared.index.items()}
+    index = {q: list(v) for q, v in declared.index.items()}
     added = []
     code = np.full(len(table), -1)
     for k in range(len(table)):
@@ -180,8 +180,7 @@ def _conditions(
                     fix += ", or other days of a tested series with three or more days"
                 notes[k].append(f"condition {name} was not tested{law}: {fix}")
                 continue
-            known[name] = len(names)
-            names.append(name)
+            known[name] = len(known)
             added.append(
                 {"condition": name, "series": series, "rubber": rubber, "aging_days": float(days.iloc[k])}
             )
@@ -189,7 +188,7 @@ def _conditions(
                 index[quantity].append(int(declared.index[quantity][lawful[0]]))
         code[k] = known[name]
     numbers = {q: np.array(v, dtype=int) for q, v in index.items()}
-    wider = replace(declared, index=numbers, conditions=tuple(names))
+    wider = replace(declared, index=numbers)
     full = pd.concat([conditions, pd.DataFrame(added)], ignore_index=True) if added else conditions
     return replace(before, declared=wider), replace(after, declared=wider), full, code
 

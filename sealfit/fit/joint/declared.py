@@ -53,8 +53,6 @@ class Declared:
 
     parameters: tuple[JointParameter, ...]
     index: Mapping[str, np.ndarray]  # quantity -> (conditions,) number of the parameter
-    conditions: tuple[str, ...]
-    has_load: bool
     stribeck: Mapping[str, str]  # series -> "full" | "interpolated" | "viscous" | "constant"
     law: Mapping[str, bool]  # series -> whether Eq. 15 is fitted across its days
     drops: Mapping[tuple[int, int], float]  # (mu_s, mu_c) -> standard deviation of the prior of mu_s - mu_c
@@ -111,7 +109,7 @@ def _declare(rows: Rows) -> Declared:
         if stribeck[series] != "constant":
             use(c, "sigma_2", series)
     drops = _drops(index["mu_0s"], index["mu_0c"], rows)
-    return Declared(tuple(parameters), index, names, rows.has_load, stribeck, law, drops)
+    return Declared(tuple(parameters), index, stribeck, law, drops)
 
 
 def _drops(number_s: np.ndarray, number_c: np.ndarray, rows: Rows) -> dict[tuple[int, int], float]:

@@ -51,8 +51,8 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
     load = rows.groups.means(rows.load, "stroke")
     size = rows.groups.means(rows.force * np.sign(rows.speed), "stroke")
     series = sorted({p.owner for p in declared.parameters if p.quantity in ("v_s", "sigma_2")})
-    level = np.zeros((len(declared.conditions), 2))  # mu_s, mu_c of each condition
-    chosen = np.zeros(len(declared.conditions), dtype=bool)
+    level = np.zeros((len(rows.conditions), 2))  # mu_s, mu_c of each condition
+    chosen = np.zeros(len(rows.conditions), dtype=bool)
     curved = declared.index["v_s"] >= 0
     solved: dict[bytes, tuple] = {}  # with `together`, series of one form share the solution
     for name in series:
