@@ -175,7 +175,8 @@ def smooth_effect(
         raise ParameterError(
             f"smooth: knots {list(places)} must be two or more rising numbers.", fix="Sort them."
         )
-    zero, mean = _nearest(places, x_ref), shares(means, len(places))
+    zero = 0 if x_ref is None else int(np.argmin(np.abs(np.array(places) - x_ref)))
+    mean = shares(means, len(places))
     free = [j for j in range(len(places)) if j != zero]
     x = places[free[-1]]
     return Effect(
@@ -232,15 +233,14 @@ def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def roughness(places: tuple[float, ...], x_ref: float | None = None) -> np.ndarray:
+def roughness(places: tuple[float, ...]) -> np.ndarray:
     r"""Return S with :math:`c^T S c = \int h''^2` of the spline through c at knots scaled to a range of 1.
 
-    Its shape is (knots - 1, knots - 1), as the knot of `x_ref` has no amplitude. If the knots are positive
-    with a ratio of `WIDE` or more, derivatives are with respect to their logarithm. The null space of S are
-    straight lines in the channel, or in its logarithm.
+    Its shape is (knots - 1, knots - 1), as the first knot has no amplitude. If the knots are positive with a
+    ratio of `WIDE` or more, derivatives are with respect to their logarithm. The null space of S are straight
+    lines in the channel, or in its logarithm.
     """
-    free = np.arange(len(places)) != _nearest(places, x_ref)
-    return _gram(places, 2)[np.ix_(free, free)]
+    return _gram(places, 2)[1:, 1:]
 
 
 @lru_cache(maxsize=64)
@@ -263,11 +263,6 @@ def _gram(places: tuple[float, ...], order: int) -> np.ndarray:
     half = np.diff(x)[:, None] / 2
     at = _cardinal(tuple(x.tolist()))((x[:-1, None] + half * (1 + node)).ravel(), order)
     return at.T @ ((half * weight).ravel()[:, None] * at)
-
-
-def _nearest(places: Sequence[float], x_ref: float | None) -> int:
-    """Return the number of the reference knot."""
-    return 0 if x_ref is None else int(np.argmin(np.abs(np.array(places) - x_ref)))
 
 
 def surface_effect(

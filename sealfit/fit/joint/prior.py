@@ -40,7 +40,7 @@ def roughness_of(term: Term) -> np.ndarray:
     """Return the penalty matrix S of a smooth shape or surface, shape (amplitudes, amplitudes)."""
     if "x_knots" in term.fixed:
         return surface_roughness(tuple(term.fixed["x_knots"]), tuple(term.fixed["z_knots"]))
-    return roughness(tuple(term.fixed["knots"]), term.fixed.get("x_ref"))
+    return roughness(tuple(term.fixed["knots"]))
 
 
 def precision_of(model: Model) -> np.ndarray:
