@@ -50,8 +50,14 @@ def _inside(zeta_mm, width_mm):
 def uniform(zeta_mm, load_N, *, width_mm):
     r"""Load per unit width, the same everywhere (Eq. 8), in N/mm: :math:`f_n = F_n / L`.
 
-    `zeta_mm`, a number or an array, is the position in the contact, from 0 to the width L, and `load_N` the
-    total load F_n.
+    Parameters
+    ----------
+    zeta_mm : float or ndarray, shape (n,)
+        Position in the contact, 0 <= zeta <= L, in mm.
+    load_N : float
+        Total load F_n in N.
+    width_mm : float
+        Contact width L in mm.
 
     Raises
     ------
@@ -121,13 +127,27 @@ PRESSURES = {law.__name__: law for law in (uniform, sine, exponential, parabolic
 
 @dataclass(frozen=True)
 class Contact:
-    r"""A contact whose friction depends on the local pressure, :math:`\mu \propto p^{n-1}`."""
+    r"""A contact whose friction depends on the local pressure, :math:`\mu \propto p^{n-1}`.
 
-    pressure: Callable = uniform  # one of `PRESSURES`, or another function with the same arguments, in N/mm
+    Attributes
+    ----------
+    pressure : callable
+        One of `PRESSURES`, or another function with the same arguments, in N/mm.
+    width_mm : float
+        Contact width L in mm.
+    exponent : float
+        n; 1 for friction independent of the pressure, 2/3 to 1 for rubber.
+    reference_N_mm : float, optional
+        Load per width at which mu_s and mu_c are defined; default the mean of the present load.
+    shape : mapping
+        Further arguments of the distribution, such as `decay`.
+    """
+
+    pressure: Callable = uniform
     width_mm: float = 1.0
-    exponent: float = 1.0  # n; 1 for friction independent of the pressure, 2/3 to 1 for rubber
-    reference_N_mm: float | None = None  # where mu_s and mu_c are defined; None: mean of the present load
-    shape: Mapping[str, float] = field(default_factory=dict)  # further arguments of the pressure: `decay`
+    exponent: float = 1.0
+    reference_N_mm: float | None = None
+    shape: Mapping[str, float] = field(default_factory=dict)
 
     def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
         """Return each element's share of the load and mu relative to the reference, shape (elements,) each.
@@ -155,9 +175,21 @@ class Contact:
 
 
 def stribeck_decay(speed_mm_s, v_s):
-    r"""Return the decay of mu_s - mu_c with speed, :math:`e^{-(v / v_s)^2}`: 1 at rest, 0 at high speed.
+    r"""Return the decay of the static rise mu_s - mu_c with speed, from 1 at rest to 0 at high speed.
 
-    The speed v, of either sign, and the Stribeck speed v_s, in mm/s, are numbers or arrays that broadcast.
+    .. math:: E = e^{-(v / v_s)^2}
+
+    Parameters
+    ----------
+    speed_mm_s : float or ndarray
+        Sliding speed v in mm/s, of either sign.
+    v_s : float or ndarray
+        Stribeck speed in mm/s, broadcast against the speed.
+
+    Returns
+    -------
+    float or ndarray
+        E, without unit.
 
     Raises
     ------
@@ -224,17 +256,36 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
 
 @dataclass(frozen=True)
 class Bristles:
-    """Friction force, deflection and heat along a history of the speed, shape (n,) each."""
+    """Force, deflection and heat along a history of the speed.
+
+    Attributes
+    ----------
+    force_N : ndarray, shape (n,)
+        Friction force.
+    deflection_mm : ndarray, shape (n,)
+        Mean deflection z in mm, weighted by stiffness.
+    heat_mW : ndarray, shape (n,)
+        Dissipated power in mW: the power of the force minus that stored in the bristles.
+    """
 
     force_N: np.ndarray
-    deflection_mm: np.ndarray  # mean of z, weighted by stiffness
-    heat_mW: np.ndarray  # dissipated power: that of the force minus that stored in the bristles
+    deflection_mm: np.ndarray
+    heat_mW: np.ndarray
 
 
 def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
-    """Return the deflection of the bristles in steady sliding, g(v) of Eqs. 3 and 6, in mm.
+    r"""Return the deflection of the bristles in steady sliding, g(v) of Eqs. 3 and 6, in mm.
 
-    The arguments are those of `stribeck_force`, and the stiffness of the bristles in N/mm.
+    .. math:: g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}]
+
+    Parameters
+    ----------
+    speed_mm_s, load_N : float or ndarray, shape (n,)
+        Sliding speed in mm/s; normal load in N. A load of 1 turns the coefficients into forces.
+    mu_s, mu_c, v_s : float or ndarray
+        Static and Coulomb coefficients, Stribeck speed in mm/s.
+    sigma_0 : float or ndarray
+        Stiffness of the bristles in N/mm.
 
     Raises
     ------
@@ -258,15 +309,25 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
 
 @dataclass(frozen=True)
 class LuGre:
-    """The parameters of the dynamic LuGre model."""
+    """The parameters of the dynamic LuGre model.
+
+    Attributes
+    ----------
+    mu_s, mu_c, v_s : float
+        Static and Coulomb coefficients, Stribeck speed in mm/s.
+    sigma_0, sigma_1, sigma_2 : float
+        Stiffness in N/mm, damping of the bristles in N s/mm, viscous coefficient in N s/mm.
+    contact : Contact, optional
+        Contact with pressure-dependent friction.
+    """
 
     mu_s: float
     mu_c: float
-    v_s: float  # mm/s
-    sigma_0: float  # stiffness in N/mm
-    sigma_1: float = 0.0  # damping of the bristles in N s/mm
-    sigma_2: float = 0.0  # viscous coefficient in N s/mm
-    contact: Contact | None = None  # with friction that depends on the pressure
+    v_s: float
+    sigma_0: float
+    sigma_1: float = 0.0
+    sigma_2: float = 0.0
+    contact: Contact | None = None
 
     def limit_mm(self, speed_mm_s, load_N: float) -> np.ndarray:
         """Return the deflections in steady sliding in mm, shape (..., elements), by `bristle_limit`."""
