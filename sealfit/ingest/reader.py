@@ -89,34 +89,25 @@ def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the bytes of a file hold; raises as `read_trace`."""
     of_arrays = kind_of(ref.file, config.trace) in OF_ARRAYS
     read = _read_arrays if of_arrays else _read_text
-    return _trace(read(raw, ref, config.trace), ref, config)
+    return _trace(*read(raw, ref, config.trace), ref, config)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Read:
-    """The cells of a trace file; `ours` holds our name of each position (from 0)."""
-
-    cells: Cells
-    ours: Mapping[int, str]
-    layout: Layout
-    faults: tuple[Fault, ...]
-
-
-def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Read:
+def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Cells, dict[int, str], Layout]:
+    """Return the cells of a file of arrays, our name of each position (from 0), and the layout."""
     found = read_arrays(raw, ref.file, settings)
     layout = Layout(found.header, found.names, None, 0, 1)
     ours = locate(layout, len(found.names) or len(found.columns), settings, ref.file)
     cells = array_cells(found.columns, _numeric(ours, settings), settings, ref.file)
-    return _Read(cells, ours, layout, found.faults)
+    return replace(cells, faults=(*found.faults, *cells.faults)), ours, layout
 
 
-def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Read:
-    file, faults = ref.file, ()
+def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Cells, dict[int, str], Layout]:
+    """Return of a text file or workbook what `_read_arrays` returns."""
+    file, cut = ref.file, ()
     text, layout, settings = _text(raw, file, settings)
     text = without_footer(text, settings.footer, layout.start)
     if ref.cut:
-        text, fault = whole_lines(text, file)
-        faults = (fault,)
+        text, *cut = whole_lines(text, file)
     body = body_of(text, layout, settings, file)
     width = width_of(body, settings.delimiter)
     _refuse_narrow(layout, width, settings, file)
@@ -124,7 +115,8 @@ def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> _Read:
         ours = locate(layout, len(layout.names) or width, settings, file)
     except BadFile as error:
         raise _names_below(error, layout, body, settings) from None
-    return _Read(read_cells(body, layout, settings, _numeric(ours, settings), file), ours, layout, faults)
+    cells = read_cells(body, layout, settings, _numeric(ours, settings), file)
+    return replace(cells, faults=(*cut, *cells.faults)), ours, layout
 
 
 def _numeric(ours: Mapping[int, str], settings: TraceFormat) -> dict[int, str]:
@@ -188,10 +180,10 @@ def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | 
     return header_fields(header, config)
 
 
-def _trace(read: _Read, ref: TraceRef, config: Config) -> Trace:
+def _trace(cells: Cells, ours: Mapping[int, str], layout: Layout, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the cells of a file make; raises as `read_trace`."""
-    settings, file, layout, cells = config.trace, ref.file, read.layout, read.cells
-    columns = {name: cells.columns[i] for i, name in read.ours.items() if i in cells.columns}
+    settings, file = config.trace, ref.file
+    columns = {name: cells.columns[i] for i, name in ours.items() if i in cells.columns}
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None or settings.rate_Hz is not None:
         named = name_parts(file, config.files, config.conversions("names")) or {}
@@ -200,7 +192,7 @@ def _trace(read: _Read, ref: TraceRef, config: Config) -> Trace:
     first = settings.drop_first_rows
     counted = max(len(good) - first, 1)
     columns, dropped, found = channel_columns(columns, good, cells.line, config, file)
-    faults = [*read.faults, *cells.faults, *found]
+    faults = [*cells.faults, *found]
     columns = _in_our_units(columns, config, layout, file)
     if settings.rate_Hz is not None:  # a row that is left out takes its time, too
         columns["time_s"] = np.arange(len(good)) / _rate_Hz(settings.rate_Hz, known, file)
