@@ -313,9 +313,7 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
     if len(lines) < 2:
         return None
     delimiter = max((",", ";", "\t"), key=lines[0].count)
-    mark = "tab" if delimiter == "\t" else delimiter
-    names = [cell.strip() for cell in split_line(lines[0], mark)]
-    rows = [[cell.strip() for cell in split_line(line, mark)] for line in lines[1:]]
+    names, *rows = ([cell.strip() for cell in split_line(line, delimiter)] for line in lines)
     cells = {
         name: tuple(row[i] if i < len(row) else "" for row in rows) for i, name in enumerate(names) if name
     }

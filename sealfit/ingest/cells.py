@@ -210,7 +210,7 @@ def array_cells(
             }
             faults += _cell_faults(ColumnOfFile(file, numeric[i], line, settings.decimal), wrong, cells, ())
         plain = i in numeric or not any(cell is not None for cell in values[np.isnan(numbers)])
-        made[i] = numbers if plain or values.dtype.kind == "f" else values
+        made[i] = numbers if plain else values
     return Cells(made, line, bad, tuple(faults))
 
 
@@ -280,10 +280,7 @@ def _column(column: pa.ChunkedArray) -> np.ndarray:
 
 
 def _single_tabs(body: bytes) -> bytes:
-    if b" " in body or b"\t\t" in body or body.startswith(b"\t") or b"\n\t" in body or b"\t\n" in body:
-        body = re.sub(rb"[ \t]+", b"\t", body)
-        body = re.sub(rb"(?m)^\t|\t$", b"", body)
-    return body
+    return re.sub(rb"(?m)^\t|\t$", b"", re.sub(rb"[ \t]+", b"\t", body))
 
 
 def _patient(

@@ -295,9 +295,9 @@ def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat, file:
             fix += f" Name it under [trace.columns], or {INSTEAD[ours]}."
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
-        for mark, word in ((";", '";"'), ("\t", '"tab"'), (",", '","'), ("|", '"|"'), (" ", '"whitespace"')):
-            if len(split_line(line, "tab" if mark == "\t" else mark)) >= 2 and mark != settings.delimiter:
-                fix = f"The header looks separated otherwise: set delimiter = {word} in the rig config."
+        for mark, word in ((";", ";"), ("\t", "tab"), (",", ","), ("|", "|"), (" ", "whitespace")):
+            if len(split_line(line, mark)) >= 2 and mark != settings.delimiter:
+                fix = f'The header looks separated otherwise: set delimiter = "{word}" in the rig config.'
                 break
     return missing_column(theirs, layout, file, fix)
 
