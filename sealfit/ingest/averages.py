@@ -298,18 +298,12 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
         trace = parse_trace(raw, ref, config)
     except BadFile as error:
         return FileStrokes(ref.file, mark or fingerprint(campaign / ref.file), 0, error.faults)
-    return _file_strokes(trace, mark, config)
-
-
-def _file_strokes(trace: Trace, mark: Fingerprint, config: Config) -> FileStrokes:
-    file, rows_read = trace.ref.file, trace.rows_read
     trace, strokes = _with_strokes(trace, config)
     if not strokes:
-        return FileStrokes(file, mark, rows_read, (*trace.faults, _unmoved(trace, config)))
+        return FileStrokes(ref.file, mark, trace.rows_read, (*trace.faults, _unmoved(trace, config)))
     samples = _samples(trace, strokes, config)
     rows, faults = _stroke_rows(trace, strokes, samples, config)
-    samples["stroke"] += _strokes_before(trace.ref)
-    return FileStrokes(file, mark, rows_read, (*trace.faults, *faults), rows, samples)
+    return FileStrokes(ref.file, mark, trace.rows_read, (*trace.faults, *faults), rows, samples)
 
 
 def _with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
@@ -320,10 +314,10 @@ def _with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
     trace = _without_inertia(trace.where(keep, faults), config.mass)
     strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
     keep, faults = force_spikes(trace.ref.file, trace.columns["force_N"], strokes, trace.line, config.quality)
-    if keep.all():
-        return replace(trace, faults=(*trace.faults, *faults)), strokes
     trace = trace.where(keep, faults)
-    return trace, find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
+    if not keep.all():
+        strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
+    return trace, strokes
 
 
 def _without_inertia(trace: Trace, mass: float) -> Trace:
@@ -366,7 +360,7 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         middle = [np.median(displacement[stroke.start : stroke.stop]) for stroke in strokes]
         turns = turn * np.floor(np.array(middle) / turn)
     return {
-        "stroke": np.repeat([stroke.number for stroke in strokes], size),
+        "stroke": np.repeat([stroke.number for stroke in strokes], size) + _strokes_before(trace.ref),
         "time_s": time_s - np.repeat(since, size),
         "displacement_mm": displacement - np.repeat(turns, size),
         "force_N": force,
@@ -386,9 +380,16 @@ def _stroke_rows(
     ref, several, unit = trace.ref, len(strokes) > 1, config.units.unit("force")
     rows, faults = [], []
     for stroke in strokes:
-        means = _means(stroke, samples)
-        row = {**ref.channels, **means, "file": ref.file, "direction": stroke.direction}
-        row["speed_mm_s"] = speed_factor(config.units) * stroke.speed_mm_s
+        row = {
+            **ref.channels,
+            **_means(stroke, samples),
+            "file": ref.file,
+            "stroke": stroke.number + _strokes_before(ref),
+            "direction": stroke.direction,
+            "speed_mm_s": speed_factor(config.units) * stroke.speed_mm_s,
+            "several": several,
+            "several_speeds": stroke.several_speeds,
+        }
         found = stroke_faults(
             stroke, trace.columns["time_s"], trace.columns["force_N"], trace.line, config.quality
         )
@@ -397,9 +398,7 @@ def _stroke_rows(
             found += rising_faults(row["left"], row["force_N"], unit)
         if used and OWN_SPEED in row:
             found += speed_column_faults(row["speed_mm_s"], row[OWN_SPEED], config)
-        row |= {"several": several, "used": used, "stroke": stroke.number + _strokes_before(ref)}
-        row["several_speeds"] = stroke.several_speeds
-        rows.append(row)
+        rows.append({**row, "used": used})
         faults += [
             replace(fault, file=ref.file, stroke=stroke.number if several else None) for fault in found
         ]
