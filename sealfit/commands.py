@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault, OutError, ParameterError, RequestError, StaleError
-from sealfit.pipeline import FAULTY
 from sealfit.progress import Silent
 from sealfit.store import Store, paths
 from sealfit.store.manifest import ConfigCopy
@@ -84,8 +83,7 @@ def check(
             ingested = ingest_campaign(folder, checked, workers=workers, on_file=on_file)
     except CampaignError as error:
         return {"files": None}, list(error.faults)
-    faults = [fault for fault in ingested.faults if fault.severity in FAULTY]
-    return summary.of_ingest(ingested.tables), faults
+    return summary.of_ingest(ingested.tables), ingested.faults
 
 
 def predict(

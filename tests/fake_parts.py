@@ -133,7 +133,7 @@ class Parts:
         good = Fault("read", "was read.", "a.csv", severity="info", action="kept")
         quality = pd.DataFrame([fault.as_dict() for fault in (good, *self.faults)])
         tables |= {"inputs": inputs, "quality": quality}
-        return SimpleNamespace(tables=tables, faults=[good, *self.faults], marks=marks, stored={})
+        return SimpleNamespace(tables=tables, faults=list(self.faults), marks=marks, stored={})
 
     def fit_conditions(self, steady, config):
         self._called("fit-steady", config)

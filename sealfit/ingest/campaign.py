@@ -83,7 +83,6 @@ def inputs_table(
 
 # Columns of samples, and of their scatter, whose means are in `steady`.
 OF_SAMPLES = ("time_s", "displacement_mm", "distance_mm", "force_N", "presliding_N", "force_sd_N", "n")
-FAULTY = ("warning", "error")
 SHOWN = 20  # faults that a campaign without a single usable stroke lists, those that files share as one
 
 
@@ -195,7 +194,7 @@ def ingest_campaign(
             name: _stacked([part.tables[name] for part in parts if name in part.tables]) for name in SAMPLED
         }
     stored = {name: size for part in parts for name, size in part.stored.items()}
-    return Ingested(tables, [fault for fault in faults if fault.severity in FAULTY], marks, stored)
+    return Ingested(tables, [fault for fault in faults if fault.severity != "info"], marks, stored)
 
 
 def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndarray]:
@@ -262,11 +261,7 @@ def _ruled_out(listings: Sequence[Listing], strokes: pd.DataFrame) -> list[froze
 
 def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
     """Return the strokes of all parts in one table; a column with words in one part has words in all."""
-    whole = [part for part in parts if part.num_rows]
-    if not whole:
-        return pd.DataFrame(
-            {"file": pd.array([], "str"), "used": np.array([], bool), "by_itself": np.array([], bool)}
-        )
+    whole = [part for part in parts if part.num_rows] or parts[:1]
     words = {column.name for part in whole for column in part.schema if column.type == pa.string()}
     worded = [_worded(part, words) for part in whole]
     table = pa.concat_tables(worded, promote_options="permissive").to_pandas()
