@@ -89,12 +89,12 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
                 break
         left, fit = left - len(taken), apart
     outliers = _outliers(layout, force, found, level, tiny)
-    rows = np.concatenate([np.array([], int), *(one.rows for one in outliers)])
-    count = np.array([len(one.rows) for one in outliers], int)
-    per_row = {"run_mean_N": [one.mean_N for one in outliers], "t": [one.t for one in outliers],
-               "p": [one.p for one in outliers]}  # fmt: skip
-    told = {name: np.repeat(np.array(values, float), count) for name, values in per_row.items()}
-    return means.iloc[rows].assign(**told, alone=np.repeat(count == 2, count))
+    none = means.iloc[:0].assign(run_mean_N=0.0, t=0.0, p=0.0, alone=False)
+    each = [
+        means.iloc[one.rows].assign(run_mean_N=one.mean_N, t=one.t, p=one.p, alone=len(one.rows) == 2)
+        for one in outliers
+    ]
+    return pd.concat([none, *each])
 
 
 def _furthest(layout: Layout, fit: ScatterFit, kept: np.ndarray, most: int) -> list[np.ndarray]:
