@@ -169,21 +169,15 @@ def several_speeds(speeds: list[float]) -> list[float]:
 
 
 def _several(speeds: list[float]) -> list[float]:
-    groups = _groups(speeds)
+    groups: list[list[float]] = []  # that differ by a quarter or more, the slowest first
+    for speed in sorted(speeds):
+        if not groups or speed > SPEEDS_APART * groups[-1][0]:
+            groups.append([])
+        groups[-1].append(speed)
     own = all(len(group) == 1 for group in groups)
     kept = groups if own else [group for group in groups if len(group) > 1]
     apart = all(a[-1] * SPEEDS_APART < b[0] for a, b in pairwise(kept))
     return [group[0] for group in kept] if len(kept) > 1 and apart else []
-
-
-def _groups(speeds: list[float]) -> list[list[float]]:
-    """Return the speeds in groups that differ by a quarter or more, the slowest first."""
-    found: list[list[float]] = []
-    for speed in sorted(speeds):
-        if not found or speed > SPEEDS_APART * found[-1][0]:
-            found.append([])
-        found[-1].append(speed)
-    return found
 
 
 # ---------------------------------------------------------------- roles

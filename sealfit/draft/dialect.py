@@ -87,7 +87,6 @@ class Dialect:
     numbers: tuple[int, ...]
     width: int
     trailing: bool
-    rows: int
     first: str
     names_are_cells: bool = True
     odd_lines: int = 0
@@ -159,11 +158,9 @@ def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
     several = [found for found in numbers[len(lines) // 2 :] if found and len(found) >= 2]
     counts = Counter(i for found in several for i in found)
     core = frozenset(i for i, count in counts.items() if count >= 0.9 * len(several))
-    if len(core) < 2:
-        return _Block(decimal, 0, 0, ())
     data = [(i, found is not None and core <= found) for i, found in enumerate(numbers) if found is not None]
     start = _first_of_many([is_data for _, is_data in data])
-    if start is None:
+    if len(core) < 2 or start is None:
         return _Block(decimal, 0, 0, ())
     rows = sum(is_data for _, is_data in data[start:])
     rows_of_cells = [split_line(lines[i], delimiter) for i, good in data[start:] if good]
@@ -225,7 +222,6 @@ def _dialect(lines: list[str], delimiter: str, block: _Block) -> Dialect:
         numbers=block.numbers,
         width=width,
         trailing=trailing,
-        rows=sum(is_data),
         first=data[0],
         names_are_cells=names_at is None or rows[names_at] == _cells_of(header[names_at], delimiter),
         odd_lines=odd,
