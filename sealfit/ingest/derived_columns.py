@@ -283,9 +283,8 @@ def _one_setting(column: Column) -> Column:
 
 def add_specimens(columns: Columns, conditions: list[str]) -> Columns:
     """Return the columns with `specimen_id`: one per condition where none is named."""
-    if "specimen_id" not in columns:
-        return {"specimen_id": conditions, **columns}
-    return {**columns, "specimen_id": over(columns["specimen_id"], conditions)}
+    given = columns.get("specimen_id", [None] * len(conditions))
+    return {**columns, "specimen_id": over(given, conditions)}
 
 
 def add_runs(

@@ -75,12 +75,9 @@ _FIELD = re.compile(r"\{([^{}]*)\}")
 
 
 Named = Mapping[str, float | str]  # what a name says; helpers begin with `_`
-SAME_UNITS: Mapping[str, Conversion] = {}
 
 
-def name_parts(
-    file: str, settings: Files, conversions: Mapping[str, Conversion] = SAME_UNITS
-) -> Named | None:
+def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]) -> Named | None:
     """Return what the relative path `file` says under the config's `files`; None if it does not match.
 
     Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the
@@ -96,7 +93,7 @@ def name_parts(
     --------
     >>> rig = Files(name_pattern=r"(?P<_sign>n?)(?P<_rpm>\\d+)\\.csv", values={"_sign": {"": 1, "n": -1}},
     ...             compute={"speed_mm_s": "_sign * _rpm"}, columns={"run_id": "{_rpm} rpm"})
-    >>> channels_of(name_parts("n120.csv", rig))
+    >>> channels_of(name_parts("n120.csv", rig, {}))
     {'speed_mm_s': -120.0, 'run_id': '120 rpm'}
     """
     texts: dict[str, str] = {}
