@@ -138,7 +138,6 @@ def _in_turn(sample: Sequence[str], likely: str | None) -> Iterator[str]:
 
 
 # ---------------------------------------------------------------- data
-# Where the data are.
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +187,6 @@ def _first_of_many(data: Sequence[bool]) -> int | None:
 
 
 # ---------------------------------------------------------------- header
-# What stands above and below the data.
 
 
 # A number with marks between its thousands: 1.120,000 or 12'500.5.
@@ -281,7 +279,6 @@ def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, 
 
 
 # ---------------------------------------------------------------- header lines
-# What header lines say of the whole file: when it was started and how the rig was set.
 
 
 @dataclass(frozen=True, slots=True)

@@ -273,7 +273,6 @@ def _numbers(lines: Sequence[str], dialect: Dialect) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- table of runs
-# A table of runs beside the trace files, runs.csv or one under another name, and what its columns mean.
 
 
 @dataclass(frozen=True)

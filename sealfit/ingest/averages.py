@@ -275,7 +275,6 @@ def _over_files(force: np.ndarray, keep: np.ndarray, file: Sequence[str]) -> tup
 
 
 # ---------------------------------------------------------------- strokes of a file
-# Which strokes of a file are of use, their means, and their samples.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

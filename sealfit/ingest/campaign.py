@@ -42,7 +42,6 @@ from sealfit.store.staged_writes import file_size
 from sealfit.tables import RUNS, STEADY
 
 # ---------------------------------------------------------------- inputs
-# Table `inputs`: every file of a campaign, what was read of it, and whether it is used.
 
 
 def inputs_table(

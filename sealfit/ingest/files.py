@@ -19,7 +19,6 @@ from sealfit.errors import BadFile, ConfigError, Fault, shortened
 from sealfit.store.manifest import Fingerprint, fingerprint_of
 
 # ---------------------------------------------------------------- folder
-# Files of a campaign folder as bytes, each opened once for its text and its fingerprint.
 
 _BLANK = b" \t\r\n\0"
 LINE_ENDS = b"\r\n\x1a"  # the last is DOS's end of a file

@@ -27,7 +27,6 @@ from sealfit.ingest.columns import suggestion
 from sealfit.ingest.files import bad_file
 
 # ---------------------------------------------------------------- kinds
-# Which files are of which kind, and the library that reads them.
 
 ENDINGS = {
     ".xlsx": "xlsx",
