@@ -48,8 +48,6 @@ class Source:
 
 def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, float | str]]:
     """Return what the names of files say, by file."""
-    if names.pattern is None:
-        return {file: {} for file in files}
     given = {"values": names.values, "compute": names.compute, "columns": names.columns, "units": names.units}
     settings = Files(name_pattern=names.pattern, **given)
     conversions = {name: conversion(unit, Units().of(name)) for name, unit in names.units.items()}

@@ -48,7 +48,6 @@ NEXT_LEVELS = 30
 BY_CHANCE = 1e-4  # that so many samples lie at the extreme; few strokes come so far that it is asked
 # Share of the force that may be missing where a stroke ends: more, and it was never steady.
 STILL_RISING = 0.01
-FINE_FILE = {"check": "ok", "severity": "info", "action": "kept", "reason": "nothing found.", "fix": ""}
 MEASURE_AGAIN = "Check the cable and the logger, and measure again."
 
 
@@ -293,14 +292,12 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
     Findings of the campaign come first, then by file, stroke and line.
     """
     told = {fault.file for fault in faults}
-    rows = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in faults]
-    rows += [{**FINE_FILE, "file": file} for file in files if file not in told]
+    fine = [Fault("ok", "nothing found.", file=file, **NOTED) for file in files if file not in told]
     place = {file: i for i, file in enumerate(files)}
-    rows.sort(key=lambda row: (place.get(row["file"], -1), row.get("stroke") or 0, row.get("line") or 0))
+    rows = sorted([*faults, *fine], key=lambda one: (place.get(one.file, -1), one.stroke or 0, one.line or 0))
+    cells = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in rows]
     kinds = {name: "Int64" if name in ("stroke", "line") else "str" for name in QUALITY.names()}
-    return pd.DataFrame(
-        {name: pd.array([row.get(name) for row in rows], kind) for name, kind in kinds.items()}
-    )
+    return pd.DataFrame({name: pd.array([row[name] for row in cells], kind) for name, kind in kinds.items()})
 
 
 def _as_text(value: str | float | None) -> str | None:
@@ -308,7 +305,6 @@ def _as_text(value: str | float | None) -> str | None:
 
 
 # ---------------------------------------------------------------- incomplete
-# Columns of the campaign that some of its files have no value of.
 
 # Share of the files that have a value, from which the search for effects still looks at a column.
 LEAST_KNOWN = 0.8

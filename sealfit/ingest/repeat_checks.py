@@ -15,7 +15,6 @@ from sealfit.ingest.quality import FINE, MEASURE_AGAIN
 from sealfit.ingest.scatter import Layout, ScatterFit, fit_scatter, repeat_means
 
 # ---------------------------------------------------------------- outlying
-# Repeats that lie outside: those that disagree with their runs beyond the scatter pooled over all runs.
 
 # Share of the repeats that the search takes out at most. Beyond it the bulk is not known.
 MAX_OUTLIERS = 0.1
@@ -80,8 +79,6 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
             break
         most = min(left, int(TOGETHER * fit.scatter.df))
         taken, kept, apart = _take_out(layout, force, fit, kept, _furthest(layout, fit, kept, most))
-        if apart.scatter.df < 3:
-            break
         for judged in _judge(fit, apart, taken, tests, tiny):
             found.append(judged)
             over = judged.p >= level and abs(judged.t) < 3.0  # nothing further out remains

@@ -115,7 +115,6 @@ def _spike(file: str, stroke: int | None, column: str, value: float, off: float,
 
 
 # ---------------------------------------------------------------- speed unit
-# From the slope of displacement over time to the unit that the campaign's speed is stated in.
 
 
 def speed_factor(units: Units) -> float:
@@ -146,8 +145,6 @@ def speed_factor(units: Units) -> float:
 
 
 # ---------------------------------------------------------------- speed check
-# Does the displacement move as fast as commanded? A factor that is wrong in a known way names the unit mixed
-# up.
 
 # Pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke.
 BLOCKS = 100
@@ -180,8 +177,6 @@ def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[flo
     (1.5, 3.0)
     """
     cuts = min(len(time_s), BLOCKS * max(1, _strokes(displacement_mm) // 2) + 1)
-    if cuts < 2:
-        return math.nan, math.nan
     at = np.linspace(0, len(time_s) - 1, cuts).astype(np.int64)
     return _of_cuts(time_s[at], displacement_mm[at])
 
