@@ -90,17 +90,14 @@ def column_guesses(
     return [read, Guess(f"trace.compute.{slot}", f"-{helper}", why)], helper
 
 
-def date_lines(when: When) -> tuple[Guess | None, tuple[str, ...]]:
-    """Return the guess for a date of ISO 8601, or the lines of config that another date needs."""
-    if not when.format:
-        evidence = f"header line {when.line}, in every file looked at: '{when.text}'"
-        return Guess("trace.header_fields.started_at", when.pattern, evidence), ()
+def date_lines(when: When) -> list[str]:
+    """Return the lines of config that a date needs which is not ISO 8601."""
     day = "started_day" if when.clock else "started_at"
     lines = [f"[trace.header_fields] {day} = {literal(when.pattern)}"]
     if when.clock:
         lines.append(f"[trace.header_fields] started_clock = {literal(when.clock)}")
         lines.append(f"[files] started_at = {toml({'date': day, 'time': 'started_clock'})}")
-    return None, (*lines, f"[files] date_format = {literal(when.format)}")
+    return [*lines, f"[files] date_format = {literal(when.format)}"]
 
 
 # ---------------------------------------------------------------- text

@@ -376,13 +376,13 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
     given = given | ({"load_N"} if measures_load else set())
     when = started_in(headers)
     if when is not None and "started_at" not in given:
-        guess, lines = date_lines(when)
-        if guess is not None:
-            notes.guesses.append(guess)
-        else:
+        if when.format:
             reason = f"header line {when.line} gives a date that is not ISO 8601: {_shown(when.text)}."
             fix = "Put the lines below into their tables if day and month are in this order."
-            notes.doubt("trace.header_fields", reason, fix, lines)
+            notes.doubt("trace.header_fields", reason, fix, date_lines(when))
+        else:
+            evidence = f"header line {when.line}, in every file looked at: '{when.text}'"
+            notes.guess("trace.header_fields.started_at", when.pattern, evidence)
     settings = [one for one in settings_in(headers, found.dialect.decimal) if one.ours not in given]
     for one in settings:
         evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
@@ -427,11 +427,8 @@ def motion_keys(
     if _turns(roles):  # these speeds are not in mm/s
         return {}
     one_speed = {file: found for file, found in speeds.items() if found and file not in several}
-    return {file: float(np.median(np.abs(found)) * _sign(found)) for file, found in one_speed.items()}
-
-
-def _sign(speeds: Sequence[float]) -> int:
-    return -1 if max(speeds) < 0 else 1
+    signs = {file: -1 if max(found) < 0 else 1 for file, found in one_speed.items()}
+    return {file: float(np.median(np.abs(found)) * signs[file]) for file, found in one_speed.items()}
 
 
 def _shown_speeds(several: Mapping[str, Sequence[float]], files: Sequence[str]) -> str:
