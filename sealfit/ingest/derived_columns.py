@@ -269,15 +269,13 @@ def as_set(columns: Columns) -> Columns:
 
 def _one_setting(column: Column) -> Column:
     count = Counter(value for value in column if value is not None and math.isfinite(value))
-    order = sorted(count, key=lambda value: (abs(value), value))
     usual: dict[float, float] = {}
-    for sign in (1.0, -1.0):
-        group: list[float] = []
-        for value in (value for value in order if math.copysign(1.0, value) == sign):
-            if group and abs(value) > abs(group[0]) * (1 + SETTING):
-                group = []
-            group.append(value)
-            usual.update(dict.fromkeys(group, max(group, key=count.__getitem__)))
+    group: list[float] = []
+    for value in sorted(count, key=lambda value: (value < 0, abs(value))):
+        if group and (value * group[0] < 0 or abs(value) > abs(group[0]) * (1 + SETTING)):
+            group = []
+        group.append(value)
+        usual.update(dict.fromkeys(group, max(group, key=count.__getitem__)))
     return mapped(column, lambda value: usual.get(value, value))
 
 

@@ -19,6 +19,7 @@ from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, Fault, nearest, 
 from sealfit.ingest.columns import Columns, mapped, suggestion
 from sealfit.ingest.files import as_number, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
+from sealfit.store.manifest import glob_names
 from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.store.paths import runs_tables
 
@@ -318,8 +319,7 @@ def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: C
     table, listed = entries[0].table, {entry.file for entry in entries}
     there = files_beside(campaign, listed - outside)
     if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
-        found = (p for p in campaign.glob(config.files.glob) if p.is_file())
-        there |= {p.relative_to(campaign).as_posix() for p in found}
+        there.update(glob_names(campaign, config.files))
     files = there - listed - {table}
     reason, fix = f"is not in {table}.", "Add it to runs.csv if it is a trace."
     return [

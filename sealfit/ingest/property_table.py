@@ -55,7 +55,7 @@ def read_properties(
         With every fault at once: a table that cannot be read, a missing column, cells that are no numbers.
     """
     table = path.name
-    lines, columns, faults = read_table(path.parent, table, config, needed=None)
+    lines, columns, faults = read_table(path.parent, table, config)
     if not lines and not faults:
         raise stopped("no_rows", "has a header but no rows.", "Write one row per specimen.", file=table)
     entries = [Entry(table, line, table) for line in lines]
@@ -130,10 +130,8 @@ def _properties(table: str, columns: Columns, config: Config, named: Sequence[st
 def _lacking(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:
     """Return faults of aged specimens without a value in a condition column."""
     aged = ~where(columns[DAYS], lambda value: value == 0)
-    faults = []
-    for name in config.condition:
-        faults += empty_cells(entries, name, np.flatnonzero(aged & ~known(columns[name])))
-    return faults
+    lacking = {name: np.flatnonzero(aged & ~known(columns[name])) for name in config.condition}
+    return [fault for name, rows in lacking.items() for fault in empty_cells(entries, name, rows)]
 
 
 def _rows(
