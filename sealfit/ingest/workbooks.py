@@ -26,27 +26,27 @@ HEAD_ROWS = 1000  # a header longer than this is no header
 LONGEST = object()  # stands for the sheet with the most rows
 _OLE = b"\xd0\xcf\x11\xe0"  # of .xls, and of the shell that Excel puts around an encrypted workbook
 _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
-_MERGED = re.compile(rb'mergeCell\b[^>]*?\bref="([A-Z]+\d+:[A-Z]+(\d+))"')
+_MERGED = re.compile(rb'mergeCell\b[^>]*?\bref="([A-Z]+\d+:[A-Z]+\d+)"')
 _RELATION = "{http://schemas.openxmlformats.org/officeDocument/2006/relationships}id"
 
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """The text of a sheet, and its merged cells: as `A1:B2`, with the last of their rows."""
+    """The text of a sheet, and its merged cells, as `A1:B2`."""
 
     text: bytes
-    merged: tuple[tuple[str, int], ...]
+    merged: tuple[str, ...]
 
     def check(self, first_row: int, file: str) -> None:
         """Raise `BadFile` if cells are merged at or below the first row of data.
 
         A merged cell has its value in its first row only; those below it would be taken as empty.
         """
-        for reference, last in self.merged:
+        for cells in self.merged:
+            row, last = map(int, re.findall(r"\d+", cells))
             if last >= first_row:
                 fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
-                row = int(re.findall(r"\d+", reference)[0])
-                raise bad_file(file, "merged_cells", f"the cells {reference} are merged.", fix, line=row)
+                raise bad_file(file, "merged_cells", f"the cells {cells} are merged.", fix, line=row)
 
 
 def read_sheet(
@@ -188,16 +188,16 @@ def _refuse_unsaved(sheet, formulas: list[tuple[int, int]], file: str) -> None:
                 raise bad_file(file, "formula", reason, fix, line=number, column=get_column_letter(place))
 
 
-def _merged(raw: bytes, title: str) -> tuple[tuple[str, int], ...]:
+def _merged(raw: bytes, title: str) -> tuple[str, ...]:
     """Return the merged cells of a sheet, which openpyxl does not read row by row."""
-    found: dict[str, int] = {}
+    found: dict[str, None] = {}
     with zipfile.ZipFile(io.BytesIO(raw)) as packed, packed.open(_part(packed, title)) as part:
         rest = b""
         while block := part.read(1 << 20):
             rest += block
-            found |= {match[1].decode(): int(match[2]) for match in _MERGED.finditer(rest)}
+            found |= dict.fromkeys(cells.decode() for cells in _MERGED.findall(rest))
             rest = rest[-200:]
-    return tuple(found.items())
+    return tuple(found)
 
 
 def _part(packed: zipfile.ZipFile, title: str) -> str:
