@@ -22,9 +22,7 @@ LONGEST_LIST = 400  # characters of the names of columns that a message lists
 NO_COLUMN = "there is no such column."
 SLOTS = ("time_s", "displacement_mm", "force_N", "load_N")  # always numbers
 # Columns that our tables make themselves: a channel of that name in a trace file gets another, `stroke_file`.
-RESERVED = ({column.name for schema in (BINS, RUNS) for column in schema.columns} | {"line", "steady"}) - set(
-    SLOTS
-)
+RESERVED = {*BINS.names(), *RUNS.names(), "line", "steady"} - set(SLOTS)
 
 
 # ---------------------------------------------------------------- listing
@@ -78,11 +76,11 @@ def taken(columns: Columns, files: Sequence[int]) -> Columns:
 
 def in_order(columns: Columns) -> Columns:
     """Return the columns in the order of the first file with a value in each, without those that none has."""
-    first = {
-        name: next((i for i, value in enumerate(c) if value is not None), None) for name, c in columns.items()
-    }
+    first = {}
+    for name, column in columns.items():
+        first[name] = next((i for i, value in enumerate(column) if value is not None), None)
     filled = [name for name in columns if first[name] is not None]
-    return {name: columns[name] for name in sorted(filled, key=lambda name: first[name])}
+    return {name: columns[name] for name in sorted(filled, key=first.__getitem__)}
 
 
 # ---------------------------------------------------------------- conditions

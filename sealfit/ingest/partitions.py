@@ -32,11 +32,7 @@ INNER = (
     "by_itself",
 )  # fmt: skip
 IN_PANDAS = {FLOAT: float, INT: np.int64, TEXT: "str", BOOL: bool}
-STEADY_ONLY = tuple(
-    {column.name for column in STEADY.columns}
-    - {column.name for column in RUNS.columns}
-    - {column.name for column in BINS.columns}
-)
+STEADY_ONLY = set(STEADY.names()) - {*RUNS.names(), *BINS.names()}
 
 
 def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.DataFrame:
@@ -176,10 +172,8 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
         for name, table in tables.items()
     }
     if asked.columns is not None:
-        tables = {
-            name: parquet.with_columns(table, asked.columns[name], config.units)
-            for name, table in tables.items()
-        }
+        for name, table in tables.items():
+            tables[name] = parquet.with_columns(table, asked.columns[name], config.units)
     return Part(
         marks={made.file: made.mark for made in files},
         rows=[made.rows for made in files],
@@ -293,18 +287,16 @@ def _mean_traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list],
     names = ("row", "displacement_mm", "force_N", "steady")
     made = mean_traces({name: samples[name][rows] for name in names}, strokes)
     row = made.pop("row")
+    made["direction"] = np.array(strokes["direction"])[row]
     words = {name: as_dictionary(_array(strokes[name]), row) for name in ("run_id", "condition")}
-    return to_arrow(
-        {**made, "direction": np.array(strokes["direction"])[row], **words}, TRACES_MEAN, config.units
-    )
+    return to_arrow(made | words, TRACES_MEAN, config.units)
 
 
 def _bins(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
     """Return table `bins`: means of what is measured along a trace, and what is known of the whole stroke."""
     rows = np.flatnonzero(samples["steady"])
-    measured = {
-        name: values[rows] for name, values in samples.items() if name not in ("stroke", "steady", "sliding")
-    }
+    names = [name for name in samples if name not in ("stroke", "steady", "sliding")]
+    measured = {name: samples[name][rows] for name in names}
     measured["force_N"] = measured["force_N"] - measured["presliding_N"]
     made = bin_table(measured, strokes, config.bins)
     binned, place = np.unique(made.pop("row"), return_inverse=True)
