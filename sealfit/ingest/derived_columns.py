@@ -53,9 +53,7 @@ def with_day_0(columns: Columns, config: Config) -> Columns:
     >>> with_day_0({"aging_days": ["fresh", "4"], "temperature_C": ["RT", "60"]}, Config())
     {'aging_days': [0.0, '4'], 'temperature_C': [None, '60']}
     """
-    others = [
-        n for n in condition_columns(config) if n in columns and n != "aging_days" and n not in config.rubber
-    ]
+    others = [name for name in config.series_columns if name in columns and name not in config.rubber]
     if not config.aging or not columns:
         return columns
     files = len(next(iter(columns.values())))
@@ -196,10 +194,8 @@ def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Col
 
 def empty_cells(entries: list[Entry], name: str, rows: np.ndarray) -> list[Fault]:
     """Return the faults of files, by their numbers, that lack a value in a condition column."""
-    fix = "Fill it: it is one of the config's condition columns."
-    return [
-        entries[i].fault("empty_cell", "the cell is empty.", name, value="", fix=fix) for i in rows.tolist()
-    ]
+    about = {"value": "", "fix": "Fill it: it is one of the config's condition columns."}
+    return [entries[i].fault("empty_cell", "the cell is empty.", name, **about) for i in rows.tolist()]
 
 
 ABSOLUTE_ZERO_C = -273.15
@@ -262,9 +258,8 @@ def as_set(columns: Columns) -> Columns:
     Values within `SETTING` of the smallest of them become the one that most files have. A controller's
     readback, or a change of units, leaves such differences, and runs must not fall apart over them.
     """
-    return columns | {
-        name: _one_setting(columns[name]) for name in ("speed_mm_s", "load_N") if name in columns
-    }
+    there = [name for name in ("speed_mm_s", "load_N") if name in columns]
+    return columns | {name: _one_setting(columns[name]) for name in there}
 
 
 def _one_setting(column: Column) -> Column:
@@ -398,9 +393,8 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
             fix = "Give every file of a run its own repeat number, or each stroke of a repeat its number."
             if conditions[i].startswith(UNAGED):
-                fix += (
-                    " Pieces of unaged rubber that were tested with several series need a specimen_id each."
-                )
+                fix += " Pieces of unaged rubber that were tested with several series "
+                fix += "need a specimen_id each."
             faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], fix=fix))
         for name, column in told.items():
             mine, theirs = column[i], column[j]
