@@ -12,7 +12,7 @@ import io
 import re
 import struct
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date, datetime, time, timedelta
@@ -247,18 +247,15 @@ def _tdms(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     if tdms.file_status.incomplete_final_segment:
         reason = "is cut off: its last segment is not complete."
         raise bad_file(file, "damaged_file", reason, "Copy it again from the rig.")
-    groups = {
-        group.name: group for group in tdms.groups() if any(len(channel) for channel in group.channels())
-    }
+    groups = {group.name: group for group in tdms.groups() if any(map(len, group.channels()))}
     time_name = settings.their_columns.get("time_s")
     names = {name: [channel.name for channel in group.channels()] for name, group in groups.items()}
     group = groups[_chosen(names, "group", settings, file, derived=time_name)]
     header = [_header_line(name, value) for name, value in tdms.properties.items()]
     header += [_header_line(f"{group.name}/{name}", value) for name, value in group.properties.items()]
     for channel in group.channels():
-        header += [
-            _header_line(f"{group.name}/{channel.name}/{k}", value) for k, value in channel.properties.items()
-        ]
+        place = f"{group.name}/{channel.name}"
+        header += [_header_line(f"{place}/{name}", value) for name, value in channel.properties.items()]
     if head:
         return Arrays(tuple(header))
     filled = {channel.name: channel for channel in group.channels() if len(channel)}
@@ -300,19 +297,17 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
         return Arrays(tuple(header))
     tables = _tables(variables)
     if not tables:
-        fix = (
-            "Save the columns as vectors, as a matrix or as a struct: s = table2struct(T, 'ToScalar', true)."
-        )
+        fix = "Save the columns as vectors, as a matrix or as a struct: "
+        fix += "s = table2struct(T, 'ToScalar', true)."
         raise bad_file(file, "no_rows", "holds no vectors, matrix or struct of numbers.", fix)
     options = {name: table if isinstance(table, dict) else () for name, table in tables.items()}
     name = _chosen(options, "variable", settings, file)
     table = tables[name]
     if isinstance(table, dict):
         return _arrays(header, table, settings, file)
-    if table.shape[0] < table.shape[1]:
-        reason = (
-            f"variable '{name}' has {table.shape[0]} rows and {table.shape[1]} columns; samples are rows."
-        )
+    rows, columns = table.shape
+    if rows < columns:
+        reason = f"variable '{name}' has {rows} rows and {columns} columns; samples are rows."
         raise bad_file(file, "column_shape", reason, "Save its transpose.")
     return Arrays(tuple(header), (), tuple(table.T.astype(float)))
 
@@ -411,10 +406,8 @@ def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays
     import pyarrow.parquet as pq
 
     opened = pq.ParquetFile(pa.BufferReader(raw), page_checksum_verification=True)
-    about = {
-        k.decode(): v.decode("utf-8", "replace") for k, v in (opened.schema_arrow.metadata or {}).items()
-    }
-    header = [_header_line(name, text) for name, text in about.items() if name.encode() not in _OF_WRITERS]
+    about = {k: v for k, v in (opened.schema_arrow.metadata or {}).items() if k not in _OF_WRITERS}
+    header = [_header_line(k.decode(), v.decode("utf-8", "replace")) for k, v in about.items()]
     if head:
         return Arrays(tuple(header))
     rows, columns = opened.metadata.num_rows, opened.metadata.num_columns
@@ -442,8 +435,4 @@ def _from_arrow(column) -> np.ndarray:
     return column.to_numpy()
 
 
-_READERS: dict[str, Callable[[bytes, str, TraceFormat, bool], Arrays]] = {
-    "tdms": _tdms,
-    "mat": _mat,
-    "parquet": _parquet,
-}
+_READERS = {"tdms": _tdms, "mat": _mat, "parquet": _parquet}

@@ -203,9 +203,8 @@ def _merged(raw: bytes, title: str) -> tuple[str, ...]:
 def _part(packed: zipfile.ZipFile, title: str) -> str:
     """Return the file inside a workbook that holds a sheet."""
     sheets = ElementTree.fromstring(packed.read("xl/workbook.xml")).iter()
-    number = next(
-        sheet.get(_RELATION) for sheet in sheets if sheet.get("name") == title and sheet.get(_RELATION)
-    )
+    numbers = (sheet.get(_RELATION) for sheet in sheets if sheet.get("name") == title)
+    number = next(filter(None, numbers))
     relations = ElementTree.fromstring(packed.read("xl/_rels/workbook.xml.rels"))
     target = next(relation.get("Target") for relation in relations if relation.get("Id") == number)
     return target.removeprefix("/") if target.startswith("/") else f"xl/{target}"
