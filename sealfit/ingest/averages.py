@@ -307,9 +307,8 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
 
 def _with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
     """Return the trace without rows that are spikes, and its strokes."""
-    keep, faults = displacement_spikes(
-        trace.ref.file, trace.columns["displacement_mm"], trace.line, config.quality
-    )
+    displacement = trace.columns["displacement_mm"]
+    keep, faults = displacement_spikes(trace.ref.file, displacement, trace.line, config.quality)
     trace = _without_inertia(trace.where(keep, faults), config.mass)
     strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
     keep, faults = force_spikes(trace.ref.file, trace.columns["force_N"], strokes, trace.line, config.quality)
@@ -378,6 +377,7 @@ def _stroke_rows(
     """Return a row for every stroke, and what was found in them."""
     ref, several, unit = trace.ref, len(strokes) > 1, config.units.unit("force")
     rows, faults = [], []
+    time_s, force = trace.columns["time_s"], trace.columns["force_N"]
     for stroke in strokes:
         row = {
             **ref.channels,
@@ -389,18 +389,15 @@ def _stroke_rows(
             "several": several,
             "several_speeds": stroke.several_speeds,
         }
-        found = stroke_faults(
-            stroke, trace.columns["time_s"], trace.columns["force_N"], trace.line, config.quality
-        )
+        found = stroke_faults(stroke, time_s, force, trace.line, config.quality)
         used = not any(fault.action == "stroke left out" for fault in found)
         if used:
             found += rising_faults(row["left"], row["force_N"], unit)
         if used and OWN_SPEED in row:
             found += speed_column_faults(row["speed_mm_s"], row[OWN_SPEED], config)
         rows.append({**row, "used": used})
-        faults += [
-            replace(fault, file=ref.file, stroke=stroke.number if several else None) for fault in found
-        ]
+        number = stroke.number if several else None
+        faults += [replace(fault, file=ref.file, stroke=number) for fault in found]
     return tuple(rows), faults + _load_faults(trace, rows, config)
 
 
@@ -419,9 +416,8 @@ def _load_faults(trace: Trace, rows: Sequence[Mapping[str, object]], config: Con
 def _means(stroke: Stroke, samples: Mapping[str, np.ndarray]) -> dict[str, object]:
     """Return the means of the samples of a stroke over its steady window, and what else is found there."""
     rows = stroke.rows
-    window = {
-        name: values[rows] for name, values in samples.items() if name not in ("steady", "sliding", ALONG)
-    }
+    names = [name for name in samples if name not in ("steady", "sliding", ALONG)]
+    window = {name: samples[name][rows] for name in names}
     window["force_N"] = force = window["force_N"] - window["presliding_N"]
     place, n = window["displacement_mm"], len(rows)
     whole = slice(stroke.start, stroke.stop)

@@ -100,9 +100,9 @@ class Rise(NamedTuple):
 
     def at(self, distance_mm: np.ndarray) -> np.ndarray:
         """Return what is left of the rise, in N, shape (n,)."""
-        return (
-            self.left_N * np.exp(-distance_mm / self.length_mm) if self.left_N else np.zeros(len(distance_mm))
-        )
+        if not self.left_N:
+            return np.zeros(len(distance_mm))
+        return self.left_N * np.exp(-distance_mm / self.length_mm)
 
 
 def rise_of(start: Start) -> Rise:
@@ -238,9 +238,7 @@ def _rise_from_rest(start: Start) -> Rise:
         return Rise(0.0)
     slow = _slow(start, level, scale)
     length = _rise_length_mm(start, 12.0 * scale, scale * LENGTHS, not slow)
-    end = (
-        MARGIN * _arrival_mm(start.distance_mm, start.force_N) if slow else _settled_mm(start, level, length)
-    )
+    end = MARGIN * _arrival_mm(start) if slow else _settled_mm(start, level, length)
     if not end > 0.0:
         return Rise(end)
     ramp = start.plateau_mm if start.plateau_mm > length else 0.0  # along a short one nothing else happens
@@ -354,12 +352,13 @@ def _below(plateau_N: np.ndarray, begin_N: float) -> bool:
     return begin_N < np.quantile(plateau_N, 0.01) - 4.0 * (np.median(steps) * to_noise)
 
 
-def _arrival_mm(distance_mm: np.ndarray, force_N: np.ndarray) -> float:
+def _arrival_mm(start: Start) -> float:
     """Return the distance at which the force first enters the band in which it stays late in the stroke."""
-    low, high = np.searchsorted(distance_mm, [share * distance_mm[-1] for share in LATE])
+    distance, force = start.distance_mm, start.force_N
+    low, high = np.searchsorted(distance, [share * distance[-1] for share in LATE])
     if high - low < 8:
         return 0.0
-    return float(distance_mm[int(np.argmax(force_N >= np.quantile(force_N[low:high], 0.02)))])
+    return float(distance[int(np.argmax(force >= np.quantile(force[low:high], 0.02)))])
 
 
 def _scale_mm(start: Start, level_N: float | None) -> float:

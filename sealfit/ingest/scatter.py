@@ -128,9 +128,8 @@ def fit_scatter(layout: Layout, force_N: np.ndarray, kept: np.ndarray) -> Scatte
     sd = scatter.sd_N(mean)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(share > 0.0, residual / (sd * np.sqrt(np.where(share > 0.0, share, 1.0))), 0.0)
-    return ScatterFit(
-        scatter, covariance, mean, residual, share, np.nan_to_num(t, nan=0.0, posinf=np.inf, neginf=-np.inf)
-    )
+    t[np.isnan(t)] = 0.0
+    return ScatterFit(scatter, covariance, mean, residual, share, t)
 
 
 def _run_mean(layout: Layout, values: np.ndarray, kept: np.ndarray, count: np.ndarray) -> np.ndarray:

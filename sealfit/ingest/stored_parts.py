@@ -87,10 +87,8 @@ def strokes_of(traces: pd.DataFrame, strokes: pd.MultiIndex) -> tuple[np.ndarray
         file, names = pd.factorize(file)
     stroke = traces["stroke"].to_numpy()
     first = np.flatnonzero(np.r_[True, (file[1:] != file[:-1]) | (stroke[1:] != stroke[:-1])])
-    own = strokes.get_indexer(
-        pd.MultiIndex.from_arrays([np.asarray(names, object)[file[first]], stroke[first]])
-    )
-    return np.r_[first, file.size], own
+    there = pd.MultiIndex.from_arrays([np.asarray(names, object)[file[first]], stroke[first]])
+    return np.r_[first, file.size], strokes.get_indexer(there)
 
 
 def noise_from_bends(bends: np.ndarray) -> float:
@@ -173,9 +171,8 @@ def part_key(listing: Listing, hashes: Sequence[str | None], seen: str) -> str |
 
 
 def _file_name(key: str | None, asked: Asked) -> str:
-    variant = hashlib.sha256(
-        json.dumps([sorted(asked.unused), asked.columns], sort_keys=True).encode()
-    ).hexdigest()
+    about = json.dumps([sorted(asked.unused), asked.columns], sort_keys=True)
+    variant = hashlib.sha256(about.encode()).hexdigest()
     return f"{key or uuid.uuid4().hex[:20]}-{variant[:8]}{PARQUET}"
 
 

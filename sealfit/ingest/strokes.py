@@ -225,10 +225,10 @@ def steady_speeds(
     if len(found) < 2:
         return whole
     cuts = [a.stop - 1 + int(speed[a.stop - 1 : b.start + 1].argmin()) for a, b in pairwise(found)]
-    rested = [
-        speed[cut] < STANDSTILL * np.median(speed[rows]) for cut, rows in zip(cuts, found[1:], strict=True)
-    ]
-    begins = [cut if rest else rows.start for cut, rest, rows in zip(cuts, rested, found[1:], strict=True)]
+    begins = []
+    for cut, rows in zip(cuts, found[1:], strict=True):
+        rested = speed[cut] < STANDSTILL * np.median(speed[rows])
+        begins.append(cut if rested else rows.start)
     return list(zip(map(slice, [0, *cuts], [*cuts, n]), [0, *begins], strict=True))
 
 
@@ -355,8 +355,6 @@ def _too_short(along_mm: np.ndarray, steady: np.ndarray, settings: Strokes) -> s
     covered = np.abs(np.diff(along_mm))[steady[1:] & steady[:-1]].sum()
     share = covered / max(float(np.ptp(along_mm)), 1e-300)
     if share < settings.min_steady_share:
-        return (
-            f"the steady window is {share:.0%} of the stroke; "
-            f"at least {settings.min_steady_share:.0%} is needed"
-        )
+        needed = f"at least {settings.min_steady_share:.0%} is needed"
+        return f"the steady window is {share:.0%} of the stroke; {needed}"
     return None

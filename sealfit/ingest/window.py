@@ -98,9 +98,8 @@ def steady_window(
     if n < LEAST_SAMPLES:
         return Window(steady, sliding, left, length)
     # A glitch of one sample is not a rest.
-    speed, half, blurred = local_speed(
-        time_s, median_filter(along_mm, 5, mode="nearest"), noise_mm, tolerance
-    )
+    smooth = median_filter(along_mm, 5, mode="nearest")
+    speed, half, blurred = local_speed(time_s, smooth, noise_mm, tolerance)
     # The speed below which half of the distance is slid: blind to rests and ramps.
     plateau = weighted_median(speed, np.maximum(speed, 0.0) * np.gradient(time_s))
     moves = speed > REST * plateau
@@ -292,9 +291,8 @@ def speed_along(
     parts = stretches(window.steady)
     if len(parts) == 1 and abs(speed) > 0.0 and parts[0][1] - parts[0][0] >= SPEED_PIECES[0] * LEAST_ROWS:
         rows = slice(*parts[0])
-        made[rows] += _off_speed(
-            time_s[rows], displacement_mm[rows], speed, noise_mm, window.rise_mm / abs(speed)
-        )
+        lag_s = window.rise_mm / abs(speed)
+        made[rows] += _off_speed(time_s[rows], displacement_mm[rows], speed, noise_mm, lag_s)
     return made
 
 
