@@ -169,9 +169,8 @@ def ingest_campaign(
         raise CampaignError(turned)
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
-    faults += incomplete_columns(steady, config.series_columns if config.aging else ()) + improbable_loads(
-        steady, config
-    )
+    faults += incomplete_columns(steady, config.series_columns if config.aging else ())
+    faults += improbable_loads(steady, config)
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)
     strokes = strokes.assign(used=used)
@@ -189,9 +188,8 @@ def ingest_campaign(
         "steady": shaped(steady, STEADY),
     }
     if place.folder is None:
-        tables |= {
-            name: _stacked([part.tables[name] for part in parts if name in part.tables]) for name in SAMPLED
-        }
+        for name in SAMPLED:
+            tables[name] = _stacked([part.tables[name] for part in parts if name in part.tables])
     stored = {name: size for part in parts for name, size in part.stored.items()}
     return Ingested(tables, [fault for fault in faults if fault.severity != "info"], marks, stored)
 
@@ -295,7 +293,6 @@ def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:
     errors = [fault for fault in faults if fault.severity == "error"]
     shown = [fault for group in grouped(errors)[:SHOWN] for fault in group]
     more = len(errors) - len(shown)
-    reason = f"none of {files} trace files can be used" + (
-        f"; {more} more faults are not shown." if more > 0 else "."
-    )
+    rest = f"; {more} more faults are not shown." if more > 0 else "."
+    reason = f"none of {files} trace files can be used{rest}"
     return [*shown, Fault("nothing_left", reason, fix=FIX)]

@@ -184,19 +184,16 @@ class _Checked:
             case ast.Compare():
                 raise self.refusal(f"'{ast.unparse(node)}'")
         self.number(node, depth + 1)  # refuses with its own words what is not even a number
-        raise ConfigError(
-            f"in \"{self.text}\": '{ast.unparse(node)}' compares nothing.",
-            fix="Write for example load_N > 4.9.",
-        )
+        reason = f"in \"{self.text}\": '{ast.unparse(node)}' compares nothing."
+        raise ConfigError(reason, fix="Write for example load_N > 4.9.")
 
     def call(self, name: str, arguments: list[ast.expr], depth: int) -> Computed:
         """Return what computes a call of a function."""
         function, fewest, most = FUNCTIONS[name]
         if not fewest <= len(arguments) <= most:
             wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
-            raise ConfigError(
-                f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.', fix=_FIX
-            )
+            reason = f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.'
+            raise ConfigError(reason, fix=_FIX)
         inner = [self.number(part, depth + 1) for part in arguments]
         return lambda values: function(*(part(values) for part in inner))
 
@@ -216,11 +213,8 @@ class _Checked:
 def _as_number(value: object, name: str, text: str) -> np.ndarray:
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
-        raise ConfigError(
-            f"in {text!r}: '{name}' is text, not a number.",
-            column=name,
-            fix=f"Map it to numbers first, or compare it: {name} == 'B'.",
-        )
+        fix = f"Map it to numbers first, or compare it: {name} == 'B'."
+        raise ConfigError(f"in {text!r}: '{name}' is text, not a number.", column=name, fix=fix)
     return array.astype(float, copy=False)
 
 

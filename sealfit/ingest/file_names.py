@@ -190,8 +190,6 @@ def _value(text: str) -> float | str:
 
 def _part(name: str, texts: Mapping[str, str], template: str) -> str:
     if name not in texts:
-        known = ", ".join(texts) or "none"
-        raise ConfigError(
-            f"template {template!r} reads a part '{name}' that the name has not.", fix=f"Parts: {known}."
-        )
+        reason = f"template {template!r} reads a part '{name}' that the name has not."
+        raise ConfigError(reason, fix=f"Parts: {', '.join(texts) or 'none'}.")
     return texts[name]

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from sealfit.config import Config
 from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, Fault, nearest, printable
-from sealfit.ingest.columns import Columns, mapped, suggestion
+from sealfit.ingest.columns import NO_COLUMN, Columns, mapped, suggestion
 from sealfit.ingest.files import as_number, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
 from sealfit.store.manifest import glob_names
@@ -90,9 +90,8 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
     """Return a sort key that puts `run2` before `run10`."""
-    return [
-        (0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
-    ]
+    parts = [part for part in re.split(r"(\d+)", name) if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def stopped(check: str, reason: str, fix: str, **place) -> CampaignError:
@@ -136,7 +135,7 @@ def read_table(
     names, faults = _our_names(header, table, config)
     if needed and needed not in names:
         fix = suggestion(needed, header)
-        raise stopped("missing_column", "there is no such column.", fix, file=table, line=1, column=needed)
+        raise stopped("missing_column", NO_COLUMN, fix, file=table, line=1, column=needed)
     lines, columns, found = _rows(text, names, delimiter, table, needed)
     # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
     if delimiter != ",":
@@ -267,9 +266,8 @@ def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
     if PurePosixPath(glob).is_absolute() or ".." in PurePosixPath(glob).parts or not glob:
         reason = f"files.glob = {glob!r} leads outside the campaign folder."
         raise stopped("path_outside", reason, "Make it relative.")
-    files = sorted(
-        (p.relative_to(campaign).as_posix() for p in campaign.glob(glob) if not p.is_dir()), key=natural
-    )
+    found = [path for path in campaign.glob(glob) if not path.is_dir()]
+    files = sorted((path.relative_to(campaign).as_posix() for path in found), key=natural)
     if not files:
         reason = f"no file in '{campaign}' matches files.glob = {glob!r}, "
         reason += "which stands for paths below that folder."

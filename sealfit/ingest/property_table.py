@@ -11,7 +11,7 @@ import pandas as pd
 from sealfit.config import Config
 from sealfit.errors import KEPT, CampaignError, Fault, nearest
 from sealfit.ingest.cells import LISTED
-from sealfit.ingest.columns import Columns, keys_of, known, suggestion, where
+from sealfit.ingest.columns import NO_COLUMN, Columns, keys_of, known, suggestion, where
 from sealfit.ingest.derived_columns import (
     NUMBERS,
     empty_cells,
@@ -67,9 +67,7 @@ def read_properties(
     faults += found
     if DAYS not in columns:
         fix = suggestion(DAYS, [*columns, *words]) + " Name it in files.runs_columns of a --config."
-        raise stopped(
-            "missing_column", "there is no such column.", fix.strip(), file=table, line=1, column=DAYS
-        )
+        raise stopped("missing_column", NO_COLUMN, fix.strip(), file=table, line=1, column=DAYS)
     config = _of_table(config, columns)
     try:
         chosen = _properties(table, columns, config, properties)
@@ -77,7 +75,7 @@ def read_properties(
         raise CampaignError([*(f for f in faults if f.severity != "info"), *error.faults]) from error
     if batch != BATCH and batch not in words:
         fix = suggestion(batch, [*columns, *words])
-        raise stopped("missing_column", "there is no such column.", fix, file=table, line=1, column=batch)
+        raise stopped("missing_column", NO_COLUMN, fix, file=table, line=1, column=batch)
     if batch not in words and (close := nearest(batch, list(columns))):
         reason, fix = f"is not used; it looks like '{batch}'.", f"Write '{batch}' if that is meant."
         faults.append(Fault("column_name", reason, file=table, line=1, column=close, fix=fix, **KEPT))
@@ -112,7 +110,7 @@ def _properties(table: str, columns: Columns, config: Config, named: Sequence[st
     ]
     for name in named:
         if name not in numbers:
-            what = "is no column of numbers." if name in columns else "there is no such column."
+            what = "is no column of numbers." if name in columns else NO_COLUMN
             raise stopped("missing_column", what, suggestion(name, numbers), file=table, line=1, column=name)
     if named:
         return list(dict.fromkeys(named))
@@ -122,9 +120,8 @@ def _properties(table: str, columns: Columns, config: Config, named: Sequence[st
         fix = "Add one of numbers, or correct the cells that are none."
         raise stopped("missing_column", "there is no column of a property.", fix, file=table, line=1)
     reason = f"which column is the property is not said: {', '.join(numbers)}."
-    raise stopped(
-        "missing_column", reason, f"Name it, or several: --property {numbers[0]}.", file=table, line=1
-    )
+    fix = f"Name it, or several: --property {numbers[0]}."
+    raise stopped("missing_column", reason, fix, file=table, line=1)
 
 
 def _lacking(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:

@@ -73,10 +73,8 @@ def stroke_faults(
 
 
 def _unsettled(stroke: Stroke) -> Fault:
-    reason = (
-        "the speed never settles: where it is highest it still changes by more than the tolerance. "
-        "Its steady force is a mean over these speeds; bins have a speed each."
-    )
+    reason = "the speed never settles: where it is highest it still changes by more than the tolerance. "
+    reason += "Its steady force is a mean over these speeds; bins have a speed each."
     fix = "Drive at a constant speed; lower strokes.speed_tolerance where steps of the speed are smaller."
     speed = float(stroke.speed_mm_s)
     return Fault("no_plateau", reason, column="speed_mm_s", value=speed, fix=fix, **KEPT)
@@ -90,10 +88,8 @@ def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
     """
     if not abs(left_N) > STILL_RISING * abs(force_N):
         return []
-    reason = (
-        f"the stroke ends before its friction is steady: {abs(left_N):.3g} of {abs(force_N):.4g} {unit} "
-        "are still to come. Its steady force is extrapolated by the bristle model."
-    )
+    reason = f"the stroke ends before its friction is steady: {abs(left_N):.3g} of {abs(force_N):.4g} {unit} "
+    reason += "are still to come. Its steady force is extrapolated by the bristle model."
     fix = "Slide further at this speed: five times the rise's length to 63 %, better eleven times."
     return [Fault("never_steady", reason, column="force_N", value=abs(left_N), fix=fix, **NOTED)]
 
@@ -106,10 +102,8 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
         return []
     hidden = float((steps[gaps] - usual).sum() / (time_s[-1] - time_s[0]))
     widest, count = int(np.argmax(steps)), int(gaps.sum())
-    reason = (
-        f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; "
-        f"the longest, after this line, is {steps[widest]:.3g} where {usual:.3g} is usual."
-    )
+    reason = f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; "
+    reason += f"the longest, after this line, is {steps[widest]:.3g} where {usual:.3g} is usual."
     place = {"line": int(line[widest]), "column": "time_s", "value": hidden}
     fix = "Look for lost packets or a full buffer in the logger."
     done = STROKE_OUT if hidden > settings.max_gap_share else KEPT
@@ -150,10 +144,8 @@ def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list
     if coarse or not _shows_noise(force_N, ~top, FINE) or not _piled_up(size):
         return []
     value = float(force_N[np.argmax(size)])
-    reason = (
-        f"{share:.0%} of the steady samples lie exactly at the extreme {value:g}: "
-        "the end of the sensor's range."
-    )
+    reason = f"{share:.0%} of the steady samples lie exactly at the extreme {value:g}: "
+    reason += "the end of the sensor's range."
     fix = "Use a larger range and measure again."
     return [_broken("saturated", reason, line[np.argmax(top)], value, fix)]
 
@@ -187,9 +179,8 @@ def _stuck(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fau
         return []
     first, count = place
     value = float(force_N[first])
-    reason = (
-        f"{count} samples in a row are exactly {value:g} while the platform moves; elsewhere they change."
-    )
+    reason = f"{count} samples in a row are exactly {value:g} while the platform moves; "
+    reason += "elsewhere they change."
     return [_broken("stuck", reason, line[first], value, MEASURE_AGAIN)]
 
 
@@ -277,11 +268,9 @@ def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
     for wrong, fix in ((mu > MU_RANGE[1], _HEAVIER), (mu < MU_RANGE[0], _LIGHTER)):
         if wrong.any():
             middle = float(mu[wrong].median())
-            reason = (
-                f"the friction force is {middle:.2g} times the load "
-                f"in {wrong.sum()} of {len(mu)} conditions; "
-                f"coefficients of friction are {MU_RANGE[0]:g} to {MU_RANGE[1]:g}."
-            )
+            where = f"in {wrong.sum()} of {len(mu)} conditions"
+            reason = f"the friction force is {middle:.2g} times the load {where}; "
+            reason += f"coefficients of friction are {MU_RANGE[0]:g} to {MU_RANGE[1]:g}."
             faults.append(Fault("improbable_load", reason, column="load_N", value=middle, fix=fix, **KEPT))
     return faults
 

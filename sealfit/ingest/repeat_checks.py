@@ -152,10 +152,8 @@ def _judge(
     force = fit.mean[worst]
     sd = np.sqrt((1.0 - gone) * fit.scatter.sd_N(force) ** 2 + gone * apart.scatter.sd_N(force) ** 2)
     t = fit.residual[worst] / (np.maximum(sd, tiny) * np.sqrt(fit.share[worst]))
-    df = [
-        (1.0 - n) * fit.df_at(f) + n * apart.df_at(f)
-        for n, f in zip(number.tolist(), force.tolist(), strict=True)
-    ]
+    each = zip(number.tolist(), force.tolist(), strict=True)
+    df = [(1.0 - n) * fit.df_at(f) + n * apart.df_at(f) for n, f in each]
     p_one = 2.0 * stdtr(df, -np.abs(t))
     judged = []
     for k, rows in enumerate(taken):
@@ -174,10 +172,8 @@ def _outliers(
         one = found[last - 1]
         if level / NEAR < one.p < level * NEAR:
             kept = _less(np.ones(len(force_N), bool), [other.rows for other in found[: last - 1]])
-            with_it, without = (
-                fit_scatter(layout, force_N, rows) for rows in (kept, _less(kept, [one.rows]))
-            )
-            one = _judge(with_it, without, [one.rows], one.tests, tiny)[0]
+            fits = [fit_scatter(layout, force_N, rows) for rows in (kept, _less(kept, [one.rows]))]
+            one = _judge(*fits, [one.rows], one.tests, tiny)[0]
         if one.p < level:
             return [*found[: last - 1], one]
     return []
@@ -320,10 +316,9 @@ def turned_sign(strokes: pd.DataFrame) -> list[Fault]:
     friction = float(against.groupby(used["direction"] > 0).median().mean())
     if not friction < 0.0:
         return []
-    reason = (
-        f"the mean force has the direction of the motion in {int((against < 0.0).sum())} of {len(used)} "
-        "strokes; friction opposes it."
-    )
+    count = int((against < 0.0).sum())
+    reason = f"the mean force has the direction of the motion in {count} of {len(used)} strokes; "
+    reason += "friction opposes it."
     fix = 'Change its sign in the config: force_N = "-force_N" under [trace.compute].'
     return [Fault("turned_sign", reason, column="force_N", value=friction, fix=fix)]
 

@@ -125,9 +125,8 @@ def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[C
     }
     columns = columns | {"started_at": mapped(texts, as_iso.__getitem__)}
     if any(time.tzinfo for time in times if time is not None):
-        times = mapped(
-            times, lambda time: (time if time.tzinfo else time.replace(tzinfo=UTC)).astimezone(UTC)
-        )
+        in_zones = mapped(times, lambda time: time if time.tzinfo else time.replace(tzinfo=UTC))
+        times = mapped(in_zones, lambda time: time.astimezone(UTC))
     moments = pd.Series(pd.to_datetime(pd.Series(times, dtype=object), utc=True))
     if not moments.notna().any():
         return columns, faults
