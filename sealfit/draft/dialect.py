@@ -322,9 +322,8 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
             values = _found(pattern, headers)
             if "" not in values and len(set(values)) > 1:
                 counts = len(set(values)) == len(values)
-                found.setdefault(
-                    "specimen_id", Setting("specimen_id", pattern, None, number, line.strip(), counts)
-                )
+                specimen = Setting("specimen_id", pattern, None, number, line.strip(), counts)
+                found.setdefault("specimen_id", specimen)
             continue
         number_found = _NUMBER.match(match["value"].strip()) if match else None
         if number_found is None or as_number(number_found.group(), decimal or ".") is None:

@@ -6,6 +6,7 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -113,9 +114,8 @@ def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]
     """Return those of the files not looked at that are named as the traces are, or have their suffix."""
     kinds, known = {_kind(file) for file in same}, {_kind(file) for file in looked_at}
     suffixes = {kind[0] for kind in kinds}
-    return [
-        file for file in rest if (kind := _kind(file)) in kinds or (kind not in known and kind[0] in suffixes)
-    ]
+    named = [(file, _kind(file)) for file in rest]
+    return [file for file, kind in named if kind in kinds or (kind not in known and kind[0] in suffixes)]
 
 
 def _files(folder: Path) -> list[str]:
@@ -286,7 +286,7 @@ class RunsTable:
     file: str
     ours: Mapping[str, str]
     units: Mapping[str, Unit]
-    cells: Mapping[str, tuple[str, ...]]
+    cells: Mapping[str, Sequence[str]]
     named: int
 
     @property
@@ -313,9 +313,8 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
         return None
     delimiter = max((",", ";", "\t"), key=lines[0].count)
     names, *rows = ([cell.strip() for cell in split_line(line, delimiter)] for line in lines)
-    cells = {
-        name: tuple(row[i] if i < len(row) else "" for row in rows) for i, name in enumerate(names) if name
-    }
+    columns = zip_longest(names, *rows, fillvalue="")
+    cells = {name: column for name, *column in columns if name}
     naming = {name: _names_files(column, traces) for name, column in cells.items()}
     best = max(naming, key=lambda name: naming[name], default=None)
     if best is None or naming[best] < NAMING * len(rows):

@@ -309,9 +309,8 @@ def _specimens(names: Names, notes: Notes) -> str:
     if any(part.ours == "specimen_id" for part in names.parts):
         evidence = "the number of the piece of rubber, within its condition"
         reason = "files of a condition are taken as different pieces."
-        fix = (
-            "If they are repeats with one piece, call the part `repeat` in name_pattern and delete this line."
-        )
+        fix = "If they are repeats with one piece, call the part `repeat` in name_pattern "
+        fix += "and delete this line."
     else:
         evidence = "unaged rubber was tested with several series, in files that are alike otherwise"
         reason = "each series is taken to have a piece of unaged rubber of its own."
@@ -348,12 +347,10 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
     if "started_at" not in table.given:
         _dates_doubt(table, clock, notes)
     if unknown := [f"'{name}'" for name in table.cells if name not in table.ours and not name.isidentifier()]:
-        reason = (
-            f"what {', '.join(unknown)} of {table.file} hold{'s' * (len(unknown) == 1)} is not known here."
-        )
-        notes.doubt(
-            "files.runs_columns", reason, "Name a load, a temperature or the like by our name for it."
-        )
+        hold = "holds" if len(unknown) == 1 else "hold"
+        reason = f"what {', '.join(unknown)} of {table.file} {hold} is not known here."
+        fix = "Name a load, a temperature or the like by our name for it."
+        notes.doubt("files.runs_columns", reason, fix)
 
 
 def _compressed(theirs: str, table: RunsTable, notes: Notes) -> bool:

@@ -61,15 +61,12 @@ def _sheet_key(found: Found, notes: Notes) -> None:
     """Add the sheet of the workbooks, if they have several."""
     if kind_of(found.traces[0]) == "xlsx":
         file = found.traces[0]
-        sheet, *others = rows_of_sheets(read_bytes(found.folder, file), file).items()
+        (sheet, most), *others = rows_of_sheets(read_bytes(found.folder, file), file).items()
         if filled := sum(rows > 0 for _, rows in others):
-            notes.guess(
-                "trace.sheet", sheet[0], f"has the most rows of the {filled + 1} sheets of a workbook"
-            )
-        if alike := [f"'{name}'" for name, rows in others if rows > AS_LONG * sheet[1]]:
-            reason = (
-                f"only '{sheet[0]}' of {file} is read, and {', '.join(alike[:5])} may be recordings, too."
-            )
+            evidence = f"has the most rows of the {filled + 1} sheets of a workbook"
+            notes.guess("trace.sheet", sheet, evidence)
+        if alike := [f"'{name}'" for name, rows in others if rows > AS_LONG * most]:
+            reason = f"only '{sheet}' of {file} is read, and {', '.join(alike[:5])} may be recordings, too."
             notes.doubt("trace.sheet", reason, "If so, save each sheet in a file of its own.")
 
 
@@ -300,21 +297,18 @@ def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:
 
 def _other_columns(found: Found, roles: Roles, clock: str, notes: Notes) -> None:
     """Add the columns kept as channels and say which are not used; `clock` is that of times of day."""
-    ignored, taken = [], {""}
+    one, ignored, taken = found.dialect, [], {""}
     for column in roles.others:
         if name := _channel(column, taken):
             taken.add(name)
             notes.guess(f"trace.columns.{name}", column.key, f"{column.place}: kept as a channel")
         else:
             ignored.append(column)
-    texts = [
-        name
-        for i, name in enumerate(found.dialect.names)
-        if name and name != clock and i not in found.dialect.numbers
-    ]
+    words = [name for i, name in enumerate(one.names) if i not in one.numbers]
+    texts = [name for name in words if name and name != clock]
     if roles.speed is not None and roles.displacement is not None:
         ignored.append(roles.speed)
-    if ignored or texts or found.dialect.width > len(found.dialect.numbers):
+    if ignored or texts or one.width > len(one.numbers):
         same = {c.position: f", the same signal as column {c.copy_of}" for c in ignored if c.copy_of}
         shown = [c.place + same.get(c.position, "") for c in ignored]
         shown += [f"'{name}' (text)" for name in texts]
