@@ -7,7 +7,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 from sealfit.config import AGING_CONDITION, Files
@@ -31,19 +31,6 @@ AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
 SPEED_UNITS = ("mm/min", "m/s", "cm/s", "um/s", "in/min", "in/s")
 _WHOLE_DAY = re.compile(r"\d{4}-\d\d-\d\d(?:[ T]00:00(?::00)?)?")  # a workbook's date is a midnight
-
-
-@dataclass(frozen=True)
-class Source:
-    """What is known of each file before it is read: file names, a table of runs, whether the table counts."""
-
-    names: Names
-    table: RunsTable | None
-
-    @property
-    def given(self) -> set[str]:
-        """Our columns that are given."""
-        return self.names.given | (self.table.given if self.table is not None else set())
 
 
 def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, float | str]]:
@@ -198,18 +185,19 @@ def _without(names: Names, part: Part) -> Names:
 # ---------------------------------------------------------------- keys
 
 
-def source_keys(found: Found, source: Source, header: Collection[str], notes: Notes) -> None:
+def source_keys(
+    found: Found, names: Names, table: RunsTable | None, header: Collection[str], notes: Notes
+) -> None:
     """Add where files are, and what names and the table of runs say; `header` is what header lines give."""
-    table = source.table
     if table is not None:
         if table.file != RUNS_CSV:
             notes.guess("files.runs_table", table.file, f"lists {table.named} of {len(found.traces)} traces")
         _table_keys(table, notes)
     else:
-        _glob_keys(found, source.names, notes)
+        _glob_keys(found, names, notes)
     if table is None or not set(AGING_CONDITION) <= table.given:
         told = table is not None or bool(set(header) & set(AGING_CONDITION))
-        _name_keys(source.names, len(found.traces), told, notes)
+        _name_keys(names, len(found.traces), told, notes)
     _otherwise({f: one for f, one in found.otherwise.items() if table is None or f != table.file}, notes)
     for file, reason in list(found.unreadable.items())[:3]:
         notes.doubt("files", f"{file} {reason}", "It is in no run.")
@@ -386,24 +374,24 @@ def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> None:
 # ---------------------------------------------------------------- condition
 
 
-def condition_keys(source: Source, header: Collection[str], notes: Notes) -> None:
+def condition_keys(names: Names, table: RunsTable | None, header: Collection[str], notes: Notes) -> None:
     """Add which columns make a condition, and which tell rubbers apart."""
-    given = source.given | set(header)
+    of_table = set() if table is None else table.given
+    given = names.given | of_table | set(header)
     aging = [name for name in AGING_CONDITION if name in given]
-    varied = {part.ours for part in source.names.parts if len(part.texts) > 1}
-    if "rubber" in given and (source.table is not None or "rubber" in varied):
+    varied = {part.ours for part in names.parts if len(part.texts) > 1}
+    if "rubber" in given and (table is not None or "rubber" in varied):
         notes.guess("rubber", ["rubber"], "a column of its own for each rubber")
     if aging:
-        found = [f"{name} from {_origin(name, source)}" for name in aging]
+        found = [f"{name} from {_origin(name, names, table)}" for name in aging]
         notes.guess("condition", aging, ", ".join(found))
         missing = [name for name in AGING_CONDITION if name not in given]
         if missing:
             reason = f"nothing says {' or '.join(missing)}: the same is assumed for all files."
             notes.doubt("condition", reason, "Add it to a runs.csv if it differs.")
         return
-    own = [part.ours for part in source.names.parts if part.ours and part.ours not in NO_CONDITION]
-    if source.table is not None:
-        own += [name for name in source.table.given if name not in NO_CONDITION]
+    own = [part.ours for part in names.parts if part.ours and part.ours not in NO_CONDITION]
+    own += [name for name in of_table if name not in NO_CONDITION]
     if own:
         notes.guess("condition", own, "what names give besides speed and repeat")
         reason = "nothing says temperature, compression or days: there is no aging to fit."
@@ -416,10 +404,10 @@ def condition_keys(source: Source, header: Collection[str], notes: Notes) -> Non
                 f"Write a {RUNS_CSV} with temperature_C, compression_ratio_pct and aging_days.")  # fmt: skip
 
 
-def _origin(name: str, source: Source) -> str:
-    if source.table is not None and name in source.table.given:
-        return source.table.file
-    return "the names of files" if name in source.names.given else "the header"
+def _origin(name: str, names: Names, table: RunsTable | None) -> str:
+    if table is not None and name in table.given:
+        return table.file
+    return "the names of files" if name in names.given else "the header"
 
 
 def needs_no_load(names: Names, roles: Roles) -> Names:
