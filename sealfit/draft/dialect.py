@@ -2,17 +2,15 @@
 
 Its header lines may say when the file was started and how the rig was set.
 
-The separator is found by clevercsv (van den Burg, Nazabal & Sutton 2019, doi:10.1007/s10618-019-00646-y): on
-60 lines from the top, header included, and on 40 lines of data alone it was right for 14 of the 14 programs
-in `tests/draft/exports.py`. It says nothing of decimal signs, headers of many lines and footers; for these
-there is a plain rule: the data are the lines that hold numbers where the last lines of the sample do.
+The data are the lines that hold numbers where the last lines of the sample do; separator and decimal sign are
+those that leave nothing but numbers there, else the most of them.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -24,16 +22,13 @@ from sealfit.units import conversion
 SAMPLE_LINES = 200
 # Lines at either end of a file that are looked at for lines that are no data.
 ENDS = 1000
-# Lines given to clevercsv, whose time grows with the square of their number.
-SNIFFED_LINES = 60
 # Fewer rows of numbers are a table of settings or results, not a trace.
 MIN_ROWS = 8
 # Header lines above the data in which names and units are looked for.
 NAMES_ABOVE = 12
 # What lines end in without meaning: separators of empty columns, and those that a spreadsheet adds.
 STRAYS = ",;| \t"
-DELIMITERS = ("tab", ";", ",", "|", "whitespace")
-_OF_SNIFFER = {"\t": "tab", " ": "whitespace", "": "whitespace"}
+DELIMITERS = ("tab", ";", ",", "|", "whitespace")  # of equally good ones the first is taken
 
 # What header lines may set, and what its unit measures.
 SETTINGS = {
@@ -94,47 +89,24 @@ class Dialect:
     grouped: str = ""
 
 
-def sniff(text: str, *, likely: str | None = None) -> Dialect | None:
+def sniff(text: str) -> Dialect | None:
     """Return how a text is written; None if it holds no table of numbers with at least two columns.
 
-    Lines end in a line feed. `likely` is the separator of files that are named alike: it is tried first, as
-    clevercsv takes longer than all the rest.
+    Lines end in a line feed.
     """
     lines = text.split("\n")
     if len(lines) > 2 * ENDS:
         lines = lines[:ENDS] + lines[-ENDS:]
     sample = lines[:SAMPLE_LINES]
-    mixed = None  # with columns of text: right only where no other separator leaves nothing but numbers
-    for delimiter in _in_turn(sample, likely):
-        found = [_block(sample, delimiter, decimal) for decimal in (".", ",") if decimal != delimiter]
-        # Most cells that are numbers; the first, a point, where there are whole numbers only.
-        best = max(found, key=lambda block: block.rows * len(block.numbers))
-        if best.rows >= MIN_ROWS and len(best.numbers) >= 2:
-            if best.pure:
-                return _dialect(lines, delimiter, best)
-            mixed = mixed or (delimiter, best)
-    return _dialect(lines, *mixed) if mixed else None
-
-
-def sniffed_delimiter(lines: Sequence[str]) -> str | None:
-    """Return the separator that clevercsv finds in some lines; None if it finds none."""
-    import clevercsv  # 0.8 s
-
-    try:
-        found = clevercsv.Sniffer().sniff("\n".join(lines))
-    except clevercsv.Error:
-        return None
-    return None if found is None else _OF_SNIFFER.get(found.delimiter or "", found.delimiter)
-
-
-def _in_turn(sample: Sequence[str], likely: str | None) -> Iterator[str]:
-    """Yield the separators to try, the likeliest first."""
-    if likely is not None:
-        yield likely
-    middle = len(sample) // 2
-    first = sniffed_delimiter([line for line in sample[middle : middle + SNIFFED_LINES] if line.strip()])
-    yield from (first,) if first in DELIMITERS else ()
-    yield from (other for other in DELIMITERS if other not in (first, likely))
+    found = [
+        _block(sample, delimiter, decimal)
+        for delimiter in DELIMITERS
+        for decimal in (".", ",")  # a point, where there are whole numbers only
+        if decimal != delimiter
+    ]
+    tables = [block for block in found if block.rows >= MIN_ROWS and len(block.numbers) >= 2]
+    best = max(tables, key=lambda block: (block.pure, block.rows * len(block.numbers)), default=None)
+    return None if best is None else _dialect(lines, best)
 
 
 # ---------------------------------------------------------------- data
@@ -144,6 +116,7 @@ def _in_turn(sample: Sequence[str], likely: str | None) -> Iterator[str]:
 class _Block:
     """Data lines under one separator and decimal sign: where they begin and which positions hold numbers."""
 
+    delimiter: str
     decimal: str
     start: int
     rows: int
@@ -160,12 +133,12 @@ def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
     data = [(i, found is not None and core <= found) for i, found in enumerate(numbers) if found is not None]
     start = _first_of_many([is_data for _, is_data in data])
     if len(core) < 2 or start is None:
-        return _Block(decimal, 0, 0, ())
+        return _Block(delimiter, decimal, 0, 0, ())
     rows = sum(is_data for _, is_data in data[start:])
     rows_of_cells = [split_line(lines[i], delimiter) for i, good in data[start:] if good]
     full = [sum(bool(cell.strip()) for cell in cells) for cells in rows_of_cells]
     pure = sum(count == len(core) for count in full) > 0.9 * len(full)
-    return _Block(decimal, data[start][0], rows, tuple(sorted(core)), pure)
+    return _Block(delimiter, decimal, data[start][0], rows, tuple(sorted(core)), pure)
 
 
 def _numeric(line: str, delimiter: str, decimal: str) -> frozenset[int] | None:
@@ -193,8 +166,8 @@ def _first_of_many(data: Sequence[bool]) -> int | None:
 _GROUPED = re.compile(r"[+-]?\d{1,3}([., '\u00a0\u202f\u2019])\d{3}(?:\1\d{3})*(?:[.,]\d*)?")
 
 
-def _dialect(lines: list[str], delimiter: str, block: _Block) -> Dialect:
-    core, start = frozenset(block.numbers), block.start
+def _dialect(lines: list[str], block: _Block) -> Dialect:
+    core, start, delimiter = frozenset(block.numbers), block.start, block.delimiter
     numeric = [_numeric(line, delimiter, block.decimal) for line in lines[start:]]
     is_data = [found is not None and core <= found for found in numeric]
     last = max(i for i, good in enumerate(is_data) if good)

@@ -150,12 +150,9 @@ def _sniffed(folder: Path, texts: Sequence[str]) -> tuple[dict[str, Dialect | No
     for members in sorted(kinds.values(), key=len, reverse=True):
         if len(dialects) + len(unreadable) >= MOST:
             break
-        likely = None
         for file in evenly(members, SNIFFED):
             try:
-                likely = "tab" if kind_of(file) in OF_ARRAYS else likely
-                dialects[file] = found = sniff(text_of(folder, file), likely=likely)
-                likely = found.delimiter if found is not None else likely
+                dialects[file] = sniff(text_of(folder, file))
             except BadFile as error:
                 unreadable[file] = f"{error.fault.reason} {error.fault.fix}".strip()
     return dialects, unreadable

@@ -7,7 +7,7 @@ import pytest
 from sealfit.config import parse_config
 from sealfit.draft import draft
 from sealfit.draft.columns import plateau_speeds, stroke_count
-from sealfit.draft.dialect import sniff, sniffed_delimiter
+from sealfit.draft.dialect import sniff
 from sealfit.draft.vocabulary import AFTER, UNITS, column_role, name_and_unit, setting
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import as_utf8
@@ -291,11 +291,11 @@ SEPARATORS = {
 
 
 @pytest.mark.parametrize("name", SEPARATORS)
-def test_clevercsv_finds_the_separator_with_the_header_and_without(name, tmp_path):
+def test_the_separator_is_found_with_the_header_and_without(name, tmp_path):
     file = min(exports.EXPORTS[name](tmp_path))
     lines = as_utf8((tmp_path / file).read_bytes(), "auto", file).decode().split("\n")
-    assert sniffed_delimiter(lines[:60]) == SEPARATORS[name]
-    assert sniffed_delimiter(lines[60:100]) == SEPARATORS[name]
+    assert sniff("\n".join(lines[:60])).delimiter == SEPARATORS[name]
+    assert sniff("\n".join(lines[60:100])).delimiter == SEPARATORS[name]
 
 
 def text_of(delimiter, comma=False, header="t x F\n"):
