@@ -391,7 +391,7 @@ def condition_keys(names: Names, table: RunsTable | None, header: Collection[str
             notes.doubt("condition", reason, "Add it to a runs.csv if it differs.")
         return
     own = [part.ours for part in names.parts if part.ours and part.ours not in NO_CONDITION]
-    own += [name for name in of_table if name not in NO_CONDITION]
+    own += sorted(of_table - set(NO_CONDITION))
     if own:
         notes.guess("condition", own, "what names give besides speed and repeat")
         reason = "nothing says temperature, compression or days: there is no aging to fit."
