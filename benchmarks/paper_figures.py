@@ -13,7 +13,7 @@ from paper_numbers import MEASURED, SERIES, UNAGED, as_printed, condition, print
 from sealfit.config import Config
 from sealfit.physics import aging_law, stribeck_force
 from sealfit.report.figures.aging import aging_points, draw_aging
-from sealfit.report.figures.speed import Line, curve_lines, draw_force_speed, run_points
+from sealfit.report.figures.speed import Line, draw_force_speed, run_points
 from sealfit.report.notation import ConditionNames, symbol_math
 from sealfit.report.style import BLACK, CYCLE, FLOOR, QUIET, Key, Panel, Plot, shades
 
@@ -38,11 +38,20 @@ class Found:
     def line(self, at: At | None, label: str, colour: str) -> Line:
         """Return one condition for a panel of force against speed: run means and the steady fit."""
         name = condition(at)
-        curves = curve_lines({**self.tables, "curves": pd.DataFrame()})
         points = run_points(self.tables["steady"])
-        return Line(
-            label, colour, (curves[curves["condition"] == name],), points[points["condition"] == name]
-        )
+        return Line(label, colour, (self.curve(name),), points[points["condition"] == name])
+
+    def curve(self, name: str) -> pd.DataFrame:
+        """Return the steady fit of one condition over its speeds, as a curve of `Line`."""
+        fit, steady = self.tables["steady_fit"], self.tables["steady"]
+        rows = fit[(fit["condition"] == name) & (fit["quantity"] == "steady")]
+        values = rows.set_index("parameter")["value"][["mu_s", "mu_c", "v_s", "sigma_2"]]
+        here = steady[(steady["condition"] == name) & steady["used"].astype(bool)]
+        speeds = here["speed_mm_s"].abs()
+        speed = np.geomspace(speeds.min() / 1.2, speeds.max() * 1.05, 80)
+        force = stribeck_force(speed, here["load_N"].mean(), **values)
+        curve = {"direction": 1.0, "speed": speed, "before": force, "after": force}
+        return pd.DataFrame({**curve, "lo": np.nan, "hi": np.nan})
 
     def values(self, quantity: str, places: Sequence[At | None]) -> pd.DataFrame:
         """Return value, lo95 and hi95 of a coefficient at some conditions."""

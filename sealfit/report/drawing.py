@@ -58,7 +58,7 @@ def run_traces(tables: Mapping[str, pd.DataFrame], config: Config) -> dict:
 
     The model is that of the first of tables `residuals_after` and `residuals_before` that has rows. Returned
     are labels `x` and `y`, and `runs`: by run_id its label and its strokes with file, x, force and model at
-    every `every`-th bin. There are no runs where the loop was not run or there are too many bins.
+    every `every`-th bin. There are no runs of properties, or where there are too many bins.
     """
     units = config.units
     made = {"x": plain(units.label("displacement_mm")), "y": plain(units.label("force_N")), "runs": {}}

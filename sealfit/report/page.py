@@ -128,29 +128,21 @@ def _finding(group: list[Fault], config: Config) -> dict:
 
 
 def provenance_facts(provenance: Mapping, config: Config) -> dict:
-    """Return provenance.json with every key that the page reads, and the config's name, or the folder's."""
-    found = {"version": "", "python": "", "system": "", "packages": {}, "campaign": "", "table": None}
-    found |= {"config": {"name": "", "path": None, "text": ""}, "inputs": [], "steps": [], **provenance}
+    """Return provenance.json as the page shows it, and the config's name, or the table's or folder's."""
+    own = config.name if config.name != Config().name else ""
+    campaign, inputs = provenance["campaign"], provenance["inputs"]
     return {
-        **found,
-        "name": _own_name(config) or found["table"] or PurePath(found["campaign"]).name or found["campaign"],
-        "inputs": found["inputs"][:MOST_INPUTS],
-        "inputs_in_all": len(found["inputs"]),
-        "bytes": sum(entry["size"] for entry in found["inputs"]),
+        **provenance,
+        "name": own or provenance["table"] or PurePath(campaign).name or campaign,
+        "inputs": inputs[:MOST_INPUTS],
+        "inputs_in_all": len(inputs),
+        "bytes": sum(entry["size"] for entry in inputs),
         "steps": [
-            {**step, "finished_at": _instant(step["finished_at"])}
-            for step in found["steps"]
+            {**step, "finished_at": step["finished_at"].replace("T", " ").replace("+00:00", " UTC")}
+            for step in provenance["steps"]
             if step["step"] != "report"  # an earlier report is no part of this one
         ],
     }
-
-
-def _own_name(config: Config) -> str:
-    return config.name if config.name != Config().name else ""
-
-
-def _instant(text: str) -> str:
-    return text.replace("T", " ").replace("+00:00", " UTC")
 
 
 def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict[str, pd.DataFrame]:
@@ -178,7 +170,6 @@ VERDICTS = {
     "nothing_missing": "Nothing missing",
     "unexplained": "Unexplained",
     "cannot_tell": "Cannot tell",
-    None: "Loop not run",
 }
 
 
@@ -199,13 +190,12 @@ def build_report(
     """Return the report of one campaign.
 
     `tables` are those of OUT by name, which may be missing or empty; `closure` and `provenance` are its JSON
-    files, `closure` None where the loop was not run. The page loads nothing. Figures are drawn once; the page
-    shows their panels.
+    files, `closure` None of properties. The page loads nothing. Figures are drawn once; the page shows their
+    panels.
     """
     tables, closure = answered(tables, closure)
-    content = _content(tables, closure, provenance, config)
-    if len(tables["property_values"]):
-        content |= _of_properties(tables)
+    content = _of_properties(tables) if closure is None else _of_loop(tables, closure, config)
+    content |= _of_fits(tables, config) | {"provenance": provenance_facts(provenance, config)}
     plots = draw_all(tables, closure, config)
     with timed("plots", rows=len(plots), of="plots"):
         figures = {name: draw(plot) for name, plot in plots.items()}
@@ -230,8 +220,11 @@ def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
         "of_properties": True,
         "badge": "Fit: not known" if not known else "The law fits" if fits else "The law does not fit",
         "tone": "" if not known else "within_scatter" if fits else "above_scatter",
+        "fit": ("", ""),
         "verdict": Markup(" ").join(map(_of_property, properties)),
+        "undecided": "",
         "facts": [f"{one['quantity']}: {values_clause(one)}" for one in properties],
+        "references": [],
     }
 
 
@@ -267,63 +260,64 @@ def with_after_fits(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFram
     return found
 
 
-def _content(
-    tables: Mapping[str, pd.DataFrame],
-    closure: Mapping | None,
-    provenance: Mapping,
-    config: Config,
-) -> dict:
-    before = {name: tables.get(f"{name}_before") for name in FITS}
-    fitted = parameter_tables(tables["steady_fit"], "condition", config, before["steady_fit"])
-    fitted += parameter_tables(tables["aging_fit"], "series", config, before["aging_fit"])
-    dynamic = tables["dynamic_fit"]
-    rises = dynamic[dynamic["quantity"] == "dynamic"]
-    fitted += parameter_tables(rises, "condition", config, before["dynamic_fit"])
-    break_aways, break_aways_in_all = break_away_rows(dynamic, config)
-    findings, in_all = quality_findings(tables["quality"], config)
+def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> dict:
+    """Return what the page says of the campaign and its loop."""
+    findings, findings_in_all = quality_findings(tables["quality"], config)
+    break_aways, break_aways_in_all = break_away_rows(tables["dynamic_fit"], config)
     return {
         "of_properties": False,
         "closure": closure,
-        "badge": VERDICTS[closure["verdict"] if closure else None],
-        "tone": closure["verdict"] if closure else "",
+        "badge": VERDICTS[closure["verdict"]],
+        "tone": closure["verdict"],
         "fit": fit_badge(closure),
         "verdict": verdict(closure, tables["shapes"], config),
         "undecided": undecided(closure, config),
         "facts": campaign_facts(tables, config),
-        "errors": error_rows(closure, config) if closure else [],
-        "cards": effect_cards(closure, tables["shapes"], config) if closure else [],
-        "scatter": scatter_rows(closure) if closure else [],
-        "sensitivity": sensitivity_rows(closure, config) if closure else [],
-        "refused": refused_rows(closure, config) if closure else [],
-        "left": left_over(closure, config) if closure else "",
-        "next_runs": next_runs(closure, config) if closure else [],
+        "errors": error_rows(closure, config),
+        "cards": effect_cards(closure, tables["shapes"], config),
+        "scatter": scatter_rows(closure),
+        "sensitivity": sensitivity_rows(closure, config),
+        "refused": refused_rows(closure, config),
+        "left": left_over(closure, config),
+        "next_runs": next_runs(closure, config),
         "tests": channel_tests(tables["levels"], tables["channels"]["channel"].dropna(), config),
         "more_channels": max(0, tables["channels"]["channel"].nunique() - MOST_CHANNELS),
-        "parameter_tables": sorted(fitted, key=lambda table: table.single),  # goodness of fit comes last
-        "aging_fitted": len(tables["aging_fit"]) > 0,
-        "aging": config.aging,
-        "laws": law_rows(tables["aging_laws"], before["aging_laws"]),
-        "references": references(closure, config) if before["steady_fit"] is not None else [],
+        "references": references(closure, config) if "steady_fit_before" in tables else [],
         "break_aways": break_aways,
         "break_aways_in_all": break_aways_in_all,
-        "condition_key": ConditionNames.of(config).key,
-        "sensor": config.sensor,
-        "unit": config.units.unit("force"),
         "speed_unit": config.units.unit("speed"),
         "force": config.units.quantity("force"),
         "counts": quality_counts(tables["quality"]),
         "findings": findings,
-        "findings_in_all": in_all,
-        "provenance": provenance_facts(provenance, config),
+        "findings_in_all": findings_in_all,
     }
 
 
-def fit_badge(closure: Mapping | None) -> tuple[str, str]:
-    """Return how well the model fits: the state, and a few words; both empty if the loop was not run."""
-    quality = (closure or {}).get("fit_quality") or {"state": ""}
-    ratio = quality.get("ratio") or 0
+def _of_fits(tables: Mapping[str, pd.DataFrame], config: Config) -> dict:
+    """Return the tables of the page with fitted parameters and aging laws."""
+    dynamic = tables["dynamic_fit"]
+    fits = {"steady_fit": tables["steady_fit"], "aging_fit": tables["aging_fit"]}
+    fits["dynamic_fit"] = dynamic[dynamic["quantity"] == "dynamic"]
+    fitted = []
+    for name, fit in fits.items():
+        key = "series" if name == "aging_fit" else "condition"
+        fitted += parameter_tables(fit, key, config, tables.get(f"{name}_before"))
+    return {
+        "parameter_tables": sorted(fitted, key=lambda table: table.single),  # goodness of fit comes last
+        "aging_fitted": len(tables["aging_fit"]) > 0,
+        "aging": config.aging,
+        "laws": law_rows(tables["aging_laws"], tables.get("aging_laws_before")),
+        "condition_key": ConditionNames.of(config).key,
+        "sensor": config.sensor,
+        "unit": config.units.unit("force"),
+    }
+
+
+def fit_badge(closure: Mapping) -> tuple[str, str]:
+    """Return how well the model fits: the state, and a few words."""
+    quality = closure["fit_quality"]
+    ratio = quality["ratio"] or 0
     words = {
-        "": "",
         "unknown": "Fit: not known",
         "within_scatter": "Fit: within the scatter of repeats",
         "above_scatter": f"Fit: {ratio:.2g} times the scatter of repeats"

@@ -87,14 +87,10 @@ def telling(
 
 
 def condition_misfits(tables: Mapping[str, pd.DataFrame]) -> dict[str, float]:
-    """Return every condition's rms misfit: of the closed loop, or of its steady fit if that was not run."""
+    """Return every condition's rms misfit to the model after."""
     residuals = tables["residuals_after"]
-    if len(residuals):
-        squares = residuals["residual_N"].astype(float) ** 2
-        return np.sqrt(squares.groupby(residuals["condition"]).mean()).to_dict()
-    fit = tables["steady_fit"]
-    rows = fit[fit["parameter"].isin(["rmse_N", "rmse"])]
-    return dict(zip(rows["condition"], rows["value"].astype(float), strict=True))
+    squares = residuals["residual_N"].astype(float) ** 2
+    return np.sqrt(squares.groupby(residuals["condition"]).mean()).to_dict()
 
 
 def rms(values: Iterable[float]) -> float:

@@ -52,10 +52,8 @@ COUNTED = dict(enumerate(["two", "three", "four", "five", "six", "seven", "eight
 DETAILED = 2
 
 
-def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Markup:
+def verdict(closure: Mapping, shapes: pd.DataFrame, config: Config) -> Markup:
     """Return the verdict in a few sentences; table `shapes` gives the sizes of the effects."""
-    if closure is None:
-        return Markup("The loop has not been run, so the lack of fit of the declared model is not known.")
     errors = [error_clause(closure, config)]
     if known(closure["noise_floor_N"]):
         errors.append(quality_clause(closure))
@@ -83,9 +81,9 @@ def verdict(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> Ma
     return _sentences(lacked, better, left, *errors)
 
 
-def undecided(closure: Mapping | None, config: Config) -> Markup:
+def undecided(closure: Mapping, config: Config) -> Markup:
     """Return what the files do not decide beside the effects that were found, in a sentence; may be empty."""
-    untold = untold_clause(closure, config.units) if closure and closure["verdict"] == "closed" else ""
+    untold = untold_clause(closure, config.units) if closure["verdict"] == "closed" else ""
     lead = Markup("not decided by these files: {}")
     return _sentences(lead.format(in_words(untold, closure, config)) if untold else "")
 

@@ -64,8 +64,10 @@ PROVENANCE = {
     "system": "Linux x86_64",
     "packages": {"numpy": "2.4.0", "pandas": "3.1.0", "scipy": "1.17.0", "matplotlib": "3.10.0"},
     "campaign": "/data/hydrothermal-2024",
+    "table": None,
     "config": {"name": "default", "path": None, "text": 'name = "default"\n'},
     "inputs": [],
+    "own_effects": [],
     "steps": [
         {"step": "ingest", "version": "0.1.0", "finished_at": "2024-05-02T09:31:10+00:00", "seconds": 12.4},
         {
@@ -84,7 +86,7 @@ class Made:
     """What build_report takes."""
 
     tables: dict
-    closure: dict | None
+    closure: dict
     provenance: dict
     config: Config
 
@@ -331,6 +333,7 @@ def torque_campaign(seed=3):
         "rmse_N": 1.31,
         "rmse_runs_N": 0.97,
         "heldout_rmse_N": 1.52,
+        "heldout_extrapolated_rmse_N": None,
         "max_abs_N": 4.2,
         "mean_abs_pct": 1.3,
         "lack_of_fit_p": 0.31,
@@ -338,6 +341,9 @@ def torque_campaign(seed=3):
     closure = {
         "schema": 1,
         "verdict": "nothing_missing",
+        "fit_quality": {"state": "within_scatter", "ratio": 1.1, "p_value": 0.31},
+        "sensitivity": [],
+        "refused": [],
         "units": {
             "force_N": "mN m",
             "displacement_mm": "turn",
@@ -351,30 +357,18 @@ def torque_campaign(seed=3):
         "heldout_unit": "run",
         "effects": [],
         "scatter": [],
-        "left": {"rmse_N": 1.31, "level": None, "channel": None, "p_value": None},
+        "left": {
+            "rmse_N": 1.31,
+            "level": None,
+            "channel": None,
+            "p_value": None,
+            "significant": False,
+        },
         "outlier_files": [],
         "next_runs": [],
+        "incomplete_channels": [],
     }
     return Made(tables, closure, PROVENANCE, config)
-
-
-def not_run(**options):
-    """Return the aging campaign as it stands when the loop was not run and nothing was fitted across days."""
-    made = aging_campaign(**options)
-    for name in (
-        "effects",
-        "residuals_before",
-        "residuals_after",
-        "levels",
-        "channels",
-        "shapes",
-        "shape_points",
-        "curves",
-        "aging_curves",
-        "aging_fit",
-    ):
-        made.tables[name] = empty(name)
-    return Made(made.tables, None, made.provenance, made.config)
 
 
 HIGHER = 1.04  # values after the loop, to those before

@@ -178,6 +178,7 @@ def closure_document(found, verdict):
             "rmse_N": rms(rows["residual_N"]),
             "rmse_runs_N": rms(runs),
             "heldout_rmse_N": rms(rows["heldout_residual_N"]),
+            "heldout_extrapolated_rmse_N": None,
             "max_abs_N": float(rows["residual_N"].abs().max()),
             "mean_abs_pct": float((rows["residual_N"].abs() / rows["force_N"].abs()).mean() * 100),
             "lack_of_fit_p": 0.0001 if stage == "before" and verdict != "nothing_missing" else 0.42,
@@ -191,6 +192,7 @@ def closure_document(found, verdict):
         "channels": ["time_s"],
         "acts_on": "mu",
         "operation": "multiply",
+        "reference": "time 0",
         "form": "-A (1 - exp(-t / tau))",
         "named": True,
         "candidate": False,
@@ -212,16 +214,19 @@ def closure_document(found, verdict):
         "channels": ["aging_days"],
         "acts_on": "a",
         "operation": "multiply",
+        "reference": "day 0",
         "form": "max(0, t - t_i)",
         "named": True,
         "candidate": True,
         "parameters": [{"name": "t_i", "value": 0.8, "ci95": [0.1, 1.6], "unit": "d"}],
         "p_value": 0.03,
         "heldout_gain_N": None,
+        "heldout_rmse_N": None,
         "alternatives": [],
     }
     left = {"rmse_N": numbers["after"]["rmse_N"], "level": None, "channel": None, "p_value": None}
-    if verdict == "unexplained":
+    left["significant"] = verdict == "unexplained"
+    if left["significant"]:
         left |= {"level": "trace", "channel": "displacement_mm", "p_value": 0.0005}
     runs = [
         {
@@ -232,6 +237,9 @@ def closure_document(found, verdict):
     return {
         "schema": 1,
         "verdict": verdict,
+        "fit_quality": {"state": "within_scatter", "ratio": 1.1, "p_value": 0.42},
+        "sensitivity": [],
+        "refused": [],
         "units": {
             "force_N": "N",
             "displacement_mm": "mm",
@@ -250,6 +258,7 @@ def closure_document(found, verdict):
         "left": left,
         "outlier_files": [],
         "next_runs": runs if verdict == "closed" else [],
+        "incomplete_channels": [],
     }
 
 

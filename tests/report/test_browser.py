@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from report.made_campaigns import HIGHER, after_campaign, aging_campaign, not_run, torque_campaign
+from report.made_campaigns import HIGHER, after_campaign, aging_campaign, torque_campaign
 
 from sealfit.report import page as report_page
 from sealfit.report.page import build_report
@@ -131,7 +131,7 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize("make", [aging_campaign, after_campaign, torque_campaign, not_run])
+@pytest.mark.parametrize("make", [aging_campaign, after_campaign, torque_campaign])
 def test_nothing_overflows_and_every_image_shows(make, tmp_path):
     found = measured(html_of(make), [1400, 800, 400], tmp_path)
     for width, (client, scroll, right, shown, images, cut) in found.items():

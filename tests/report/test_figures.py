@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from report.made_campaigns import Made, aging_campaign, not_run, torque_campaign
+from report.made_campaigns import Made, aging_campaign, torque_campaign
 from report.made_tables import DROP, empty, shape_points, shapes, table
 
 from sealfit.config import Config
@@ -120,20 +120,6 @@ def test_bands_of_backward_motion_are_not_upside_down():
     assert (curves["after"] > 0).all()
 
 
-def test_without_the_loop_the_steady_fit_is_drawn():
-    made = not_run()
-    curves = curve_lines(made.tables)
-    fit = made.tables["steady_fit"]
-    values = fit[(fit["condition"] == "unaged") & (fit["quantity"] == "steady")].set_index("parameter")[
-        "value"
-    ]
-    line = curves[curves["condition"] == "unaged"].iloc[0]
-    # Eq. 14 by hand at the slowest point
-    mu = values["mu_c"] + (values["mu_s"] - values["mu_c"]) * np.exp(-((line["speed"] / values["v_s"]) ** 2))
-    npt.assert_allclose(line["after"], 49.03 * mu + values["sigma_2"] * line["speed"], rtol=1e-12)
-    assert curves["lo"].isna().all()
-
-
 def test_many_conditions_of_one_kind_get_panels_of_their_own():
     rows = pd.DataFrame({"batch": np.repeat([f"b{k}" for k in range(14)], 2)})
     rows = rows.assign(
@@ -141,7 +127,7 @@ def test_many_conditions_of_one_kind_get_panels_of_their_own():
         run_id=rows["batch"], file=[f"{k}.csv" for k in range(28)], speed_mm_s=5.0, force_N=10.0,
         load_N=1.0, used=True,
     )  # fmt: skip
-    tables = {"steady": rows} | {name: empty(name) for name in ("curves", "steady_fit", "residuals_after")}
+    tables = {"steady": rows} | {name: empty(name) for name in ("curves", "residuals_after")}
     plot = force_speed(tables, Config(condition=["batch"]))
     assert [panel.title for panel in plot.panels][:3] == ["b0", "b1", "b10"]
     assert len(plot.panels) == 12

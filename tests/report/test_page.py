@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
-from report.made_campaigns import NAMES, aging_campaign, not_run, paper_sized, torque_campaign
+from report.made_campaigns import NAMES, PROVENANCE, aging_campaign, paper_sized, torque_campaign
 from report.made_tables import empty
 
 from sealfit.config import Config
@@ -57,7 +57,6 @@ MADE = {
     "nothing_missing": lambda: aging_campaign(verdict="nothing_missing", **FEW),
     "unexplained": lambda: aging_campaign(verdict="unexplained", **FEW),
     "torque": torque_campaign,
-    "not_run": lambda: not_run(**FEW),
 }
 
 
@@ -223,13 +222,6 @@ def test_without_a_load_effects_act_on_friction_and_the_forces(unsaved):
     assert "μ" not in text.split("Next runs")[0].split("Not distinguishable")[0]
 
 
-def test_a_loop_that_was_not_run_is_said_not_guessed(pages):
-    text = pages["not_run"].text
-    assert "The loop has not been run" in text
-    assert "No aging law was fitted" in text
-    assert "verdict" not in text
-
-
 def test_parameters_say_what_is_not_identified(pages):
     text = pages["closed"].text
     assert "v s not identified: fewer than two speeds lie below 2 v s" in text
@@ -264,9 +256,10 @@ def test_any_table_may_be_missing(missing, small, unsaved):
 
 
 def test_with_no_tables_at_all_it_still_says_so():
-    page = Page(build_report({}, None, {}, Config()).html)
+    page = Page(build_report({}, torque_campaign().closure, PROVENANCE, Config()).html)
     for words in (
         "no steady window to draw",
+        "No aging law was fitted",
         "No parameters were fitted",
         "no averaged traces",
         "no quality table",

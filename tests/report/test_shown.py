@@ -2,7 +2,7 @@ import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
-from report.made_campaigns import aging_campaign
+from report.made_campaigns import PROVENANCE, aging_campaign
 from report.made_tables import table
 
 from sealfit.config import Config
@@ -54,12 +54,10 @@ def test_without_misfit_or_heat_the_shown_are_spread_evenly():
     assert spread(range(23), 12) == picked
 
 
-def test_the_misfit_is_that_of_the_loop_else_that_of_the_fit():
+def test_the_misfit_is_that_of_the_loop():
     residuals = pd.DataFrame({"condition": ["a", "a", "b"], "residual_N": [3.0, 4.0, 1.0]})
-    fit = pd.DataFrame({"condition": ["a", "b"], "parameter": ["rmse_N", "mu_s"], "value": [0.3, 0.9]})
-    found = condition_misfits({"residuals_after": residuals, "steady_fit": fit})
+    found = condition_misfits({"residuals_after": residuals})
     npt.assert_allclose([found["a"], found["b"]], [np.sqrt(12.5), 1.0])
-    assert condition_misfits({"residuals_after": residuals.iloc[:0], "steady_fit": fit}) == {"a": 0.3}
 
 
 @pytest.mark.parametrize("figure", [force_speed, aging])
@@ -92,7 +90,7 @@ def steady_rows(days, runs=1):
 
 
 def drawn_of(rows):
-    names = ("curves", "steady_fit", "residuals_after")
+    names = ("curves", "residuals_after")
     return force_speed({**page.complete({}, names), "steady": rows}, Config())
 
 
@@ -157,14 +155,14 @@ def test_break_aways_are_cut_and_counted():
 
 def test_inputs_are_cut_and_counted():
     every = [{"file": f"{k}.csv", "size": 10, "sha256": "ab"} for k in range(2500)]
-    found = page.provenance_facts({"inputs": every}, Config())
+    found = page.provenance_facts({**PROVENANCE, "inputs": every}, Config())
     assert (len(found["inputs"]), found["inputs_in_all"], found["bytes"]) == (2000, 2500, 25000)
-    html = build_report({}, None, {"inputs": every}, Config()).html
+    html = build_report({}, None, {**PROVENANCE, "inputs": every}, Config()).html
     assert "The first 2000 of 2500; inputs.parquet has all." in html
 
 
 def test_the_page_is_called_what_the_config_is():
-    facts = {"campaign": "/data/csv", "table": None}
+    facts = {**PROVENANCE, "campaign": "/data/csv"}
     assert page.provenance_facts(facts, Config(name="emps"))["name"] == "emps"
     assert page.provenance_facts(facts, Config())["name"] == "csv"
 

@@ -192,10 +192,6 @@ def test_without_held_out_errors_the_fitted_ones_are_named_so():
     assert "the in-sample rms error (nothing could be held out) falls from 1.30 N to 0.31 N" in said(closure)
 
 
-def test_not_run_claims_nothing():
-    assert "has not been run" in said(None)
-
-
 def test_the_units_are_the_declared_ones():
     made = torque_campaign()
     text = said(made.closure, made.tables["shapes"], made.config)

@@ -28,18 +28,14 @@ def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config
     tables : mapping of str to DataFrame
         The report's tables, all of them present, some perhaps empty.
     closure : mapping or None
-        closure.json, or None where the loop was not run.
+        closure.json, or None of properties.
     config : Config
         Gives the labels their true units.
     """
-    plots = (
-        finding(tables, closure, config),
-        before_after(tables, closure, config),
-        effect_shapes(tables, closure, config),
-        refused(tables, closure, config),
-        variance_levels(tables, config),
-        residual_channels(tables, config),
-        force_speed(tables, config),
-        *(make(tables, config) for make in (aging, master_curve, starts, traces_mean)),
-    )
+    of_tables = (
+        variance_levels, residual_channels, force_speed, aging, master_curve, starts, traces_mean,
+    )  # fmt: skip
+    of_loop = () if closure is None else (finding, before_after, effect_shapes, refused)
+    plots = [make(tables, closure, config) for make in of_loop]
+    plots += [make(tables, config) for make in of_tables]
     return {plot.name: plot for plot in plots if plot is not None}

@@ -107,9 +107,9 @@ def run_means(residuals: pd.DataFrame, column: str) -> pd.Series:
     return files.groupby(level="run_id", sort=True).mean().dropna()
 
 
-def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
-    """Return the errors before and after with the noise floor, or None if the loop was not run."""
-    if closure is None or not any(known(closure["before"].get(key)) for key, _ in ERRORS):
+def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
+    """Return the errors before and after with the noise floor, or None if no error is known."""
+    if not any(known(closure["before"].get(key)) for key, _ in ERRORS):
         return None
     unit, floor = config.units.unit("force"), closure.get("noise_floor_N")
     alt = "Rms errors: "
@@ -138,12 +138,12 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, co
 
 
 # ---------------------------------------------------------------- finding
-def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
+def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
     """Return the evidence for the verdict: the residual along one variable, and the errors.
 
     The variable is that of the effect that reduces the held-out error most, or, without an effect, the one
     along which the residual is largest relative to its error. Of the direction it is the signed speed, over
-    which an offset, a factor and viscous friction of one direction differ. None if the loop was not run.
+    which an offset, a factor and viscous friction of one direction differ. None if there is no residual.
     """
     errors, channels = before_after(tables, closure, config), tables["channels"]
     if errors is None or channels.empty:
@@ -167,13 +167,13 @@ def _own_panel(name: str, tables: Mapping[str, pd.DataFrame], config: Config) ->
     return replace(panel, title=f"{panel.title}, negative backward") if backward else panel
 
 
-def refused(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
+def refused(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
     """Return the residual along the variables of effects that were not accepted, a panel for each variable.
 
     Beside another variable, the direction has none. None if there is no panel.
     """
     drawn = dict.fromkeys(tables["channels"]["channel"])
-    entries = [entry["channels"] for entry in (closure or {}).get("refused") or ()]
+    entries = [entry["channels"] for entry in closure["refused"]]
     names = {name for own in entries for name in own if name != "direction" or len(own) == 1}
     panels = tuple(_own_panel(name, tables, config) for name in drawn if name in names)
     title = "Residual by variable of effects not accepted"
@@ -225,7 +225,7 @@ def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
 
 
 def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
-    """Return the residual's variance by level, or None if the loop was not run."""
+    """Return the residual's variance by level, or None of properties."""
     levels = tables["levels"]
     whole = levels[levels["channel"].isna() & levels["sd_N"].notna()]
     if whole.empty:
@@ -306,7 +306,7 @@ def channel_order(channels: pd.DataFrame) -> list[str]:
 
 
 def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
-    """Return the residual along every channel, before and after, or None if the loop was not run."""
+    """Return the residual along every channel, before and after, or None of properties."""
     channels = tables["channels"]
     if channels.empty:
         return None
@@ -411,10 +411,10 @@ def shape_label(
     return f"added {force}{tail}" if target == "force" else f"change of {symbol(target)}{tail}"
 
 
-def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> Plot | None:
+def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
     """Return the shape of every effect, a panel for each channel it is drawn along; None if there is none."""
     shapes, points = tables["shapes"], tables["shape_points"]
-    if closure is None or shapes.empty:
+    if shapes.empty:
         return None
     panels = []
     for (index, channel), rows in shapes.groupby(["effect", "channel"], sort=False):

@@ -22,7 +22,6 @@ from sealfit.report.notation import (
     given,
     is_number,
     is_unaged,
-    known,
     natural,
     number,
     plain,
@@ -171,12 +170,11 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     legend.append(Key("run means, forward" if both else "run means", FLOOR, "point"))
     if both:
         legend.append(Key("run means, backward", FLOOR, "left"))
-    band = curves["lo"].notna().any()
     if len(curves):
-        legend.append(Key("model" if band else "steady fit", FLOOR))
+        legend.append(Key("model", FLOOR))
     if curves["direction"].nunique() > 1:
         legend.append(Key("model, backward", FLOOR, "dashed"))
-    if band:
+    if curves["lo"].notna().any():
         legend.append(Key("95 % band", FLOOR, "band"))
     gap = (curves["after"] - curves["before"]).abs().max()
     if gap > 1e-9 * max(curves["after"].abs().max(), 1e-300):
@@ -213,10 +211,8 @@ def run_points(steady: pd.DataFrame) -> pd.DataFrame:
 
 
 def curve_lines(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Return the loop's curves, or the steady fit's where the loop was not run, by magnitude of the speed."""
+    """Return the curves of the loop by magnitude of the speed."""
     curves = tables["curves"]
-    if curves.empty:
-        return _steady_curves(tables["steady_fit"], tables["steady"])
     sign = np.sign(curves["speed_mm_s"]).replace(0.0, 1.0)
     ends = curves[["force_after_lo95_N", "force_after_hi95_N"]].mul(sign, axis=0)
     return pd.DataFrame(
@@ -231,28 +227,6 @@ def curve_lines(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
             "hi": ends.max(axis=1),
         }
     ).sort_values(["condition", "direction", "speed"])
-
-
-def _steady_curves(fit: pd.DataFrame, steady: pd.DataFrame) -> pd.DataFrame:
-    from sealfit.physics.lugre import stribeck_force
-
-    columns = ["condition", "direction", "load", "speed", "before", "after", "lo", "hi"]
-    found = []
-    for condition, rows in fit[fit["quantity"] == "steady"].groupby("condition", sort=False):
-        values = rows.set_index("parameter")["value"].to_dict()
-        here = steady[(steady["condition"] == condition) & steady["used"].astype(bool)]
-        load = here["load_N"].mean()
-        top = {f"mu_{end}": values.get(f"mu_{end}", values.get(f"F_{end}")) for end in "sc"}
-        top |= {name: values.get(name) for name in ("v_s", "sigma_2")}
-        if here.empty or not all(map(known, top.values())) or top["v_s"] <= 0:
-            continue
-        speeds = here["speed_mm_s"].abs()
-        speed = np.geomspace(max(speeds.min(), 1e-6) / 1.2, speeds.max() * 1.05, 80)
-        force = stribeck_force(speed, 1.0 if np.isnan(load) else load, **top)
-        found.append(pd.DataFrame({"condition": condition, "direction": 1.0, "load": load, "speed": speed,
-                                   "before": force, "after": force, "lo": np.nan, "hi": np.nan}))  # fmt: skip
-    empty = pd.DataFrame(columns=columns).astype({"speed": float})
-    return pd.concat(found, ignore_index=True) if found else empty
 
 
 def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict[str, list[str]]:
