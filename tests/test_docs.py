@@ -130,14 +130,20 @@ def test_the_effect_of_ones_own_is_searched_and_predicted_with(desk, tmp_path, m
 def test_the_verdicts_that_a_page_quotes_are_said_so():
     limit = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.1, "smallest_pct": 0.2}
     above = {"state": "above_scatter", "ratio": 1.6, "p_value": 1e-21}
+    unknown = {"state": "unknown", "ratio": None, "p_value": None}
     found = {
-        "nothing_missing": {"effects": [], "sensitivity": [{**limit, "cannot_tell": False}]},
-        "closed": {"effects": [{"candidate": False}], "fit_quality": above, "left": {}},
+        "nothing_missing": {
+            "effects": [],
+            "fit_quality": unknown,
+            "sensitivity": [{**limit, "cannot_tell": False}],
+        },
+        "closed": {"effects": [{"candidate": False}], "fit_quality": above, "sensitivity": []},
     }
+    others = {"refused": [], "outlier_files": [], "noise_floor_N": None, "left": {"significant": False}}
     text = (DOCS / "how-to" / "verdict.md").read_text("utf-8")
     shown = dict(re.findall(r"^    verdict     (\w+): (.*)$", text, re.MULTILINE))
     for verdict, closure in found.items():
-        assert has(shown[verdict], verdict_sentence({"verdict": verdict, **closure}, Units()))
+        assert has(shown[verdict], verdict_sentence({"verdict": verdict, **others, **closure}, Units()))
     assert set(shown) == set(found)
 
 

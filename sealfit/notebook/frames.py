@@ -70,12 +70,12 @@ def verdict(closure: Mapping, units: Units) -> pd.DataFrame:
 
 def errors(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per error: before, after, the noise floor where it compares with it, unit and meaning."""
-    held, floor = closure["heldout_unit"] or "run", closure["noise_floor_N"]
+    held, floor = closure["heldout_unit"], closure["noise_floor_N"]
     rows = [
         {
             "error": name,
-            "before": closure["before"].get(name),
-            "after": closure["after"].get(name),
+            "before": closure["before"][name],
+            "after": closure["after"][name],
             "noise_floor": floor if name in FLOORED else None,
             "unit": units.of(name),
             "meaning": meaning.format(held=held),

@@ -42,8 +42,8 @@ FREE = {
 
 def error_rows(closure: Mapping, config: Config) -> list[dict]:
     """Return the rows of the table before and after: label, note, before, after, change."""
-    unit, held = config.units.unit("force"), closure.get("heldout_unit") or "run"
-    floor, stages = closure.get("noise_floor_N"), ("before", "after")
+    unit, held = config.units.unit("force"), closure["heldout_unit"]
+    floor, stages = closure["noise_floor_N"], ("before", "after")
     rows = (
         ("heldout_rmse_N", f"rms error, held-out {held}s", unit),
         ("rmse_N", "rms error of all bins, in sample", unit),
@@ -53,11 +53,11 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
     )
     found = []
     for key, label, of in rows:
-        before, after = (closure[stage].get(key) for stage in stages)
+        before, after = (closure[stage][key] for stage in stages)
         texts = together([before, after, floor if key in ("rmse_N", "heldout_rmse_N") else None])
         change = _change(before, after) if known(before) and known(after) and before else NOTHING
         found.append({"label": label, "unit": of, "before": texts[0], "after": texts[1], "change": change})
-    p = {stage: _p(closure[stage].get("lack_of_fit_p")) for stage in stages}
+    p = {stage: _p(closure[stage]["lack_of_fit_p"]) for stage in stages}
     return [*found, {"label": "lack of fit, p", "unit": "", **p, "change": ""}]
 
 
@@ -76,7 +76,7 @@ def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
             "share": _sized(entry["smallest_pct"], "%", NOTHING),
             "files": given(entry["files_needed"]),
         }
-        for entry in closure.get("sensitivity") or ()
+        for entry in closure["sensitivity"]
     ]
 
 
@@ -94,7 +94,7 @@ def refused_rows(closure: Mapping, config: Config) -> list[dict]:
             "p": p_value(entry["p_value"]),
             "reason": in_words(entry["reason"], closure, config),
         }
-        for entry in closure.get("refused") or ()
+        for entry in closure["refused"]
     ]
 
 
@@ -117,24 +117,23 @@ def effect_cards(closure: Mapping, shapes: pd.DataFrame, config: Config) -> list
     """
     cards, unit = [], config.units.unit("force")
     for effect in by_gain(closure["effects"]):
-        gain, left = effect.get("heldout_gain_N"), effect.get("heldout_rmse_N")
-        rivals = [_rival(rival, config) for rival in effect.get("alternatives") or []]
+        gain, left = effect["heldout_gain_N"], effect["heldout_rmse_N"]
+        rivals = [_rival(rival, config) for rival in effect["alternatives"]]
         cards.append(
             {
                 "index": closure["effects"].index(effect),
                 "title": capital(effect_label(effect, config.units)),
                 "named": effect["named"],
                 "candidate": effect["candidate"],
-                "note": effect.get("note") or "",
                 "acts": acts(effect, config),
                 "given": _given(effect, config),
                 "form": with_symbols(effect["form"], formula=True),
-                "reference": effect.get("reference") or "",
+                "reference": effect["reference"],
                 "level": level_words(effect["level"]),
                 "channels": _labels(effect["channels"], config),
                 "parameters": [_parameter(p, effect) for p in effect["parameters"] if effect["named"]],
                 "curve": None if effect["named"] else _curve(effect, shapes, closure, config),
-                "p": p_value(effect.get("p_value")),
+                "p": p_value(effect["p_value"]),
                 "gain": _sized(gain, unit),
                 "left": of_unit(number(left), unit) if known(left) else "",
                 "rivals": list(dict.fromkeys(rivals)),
@@ -161,9 +160,14 @@ def _given(effect: Mapping, config: Config) -> str | Markup:
 
 
 def _parameter(p: Mapping, effect: Mapping) -> dict:
-    value, interval = measured(p["value"], *(p.get("ci95") or (None, None)))
-    return {"symbol": symbol_html(p["name"]), "meaning": meaning(effect["id"], p["name"]), "value": value,
-            "interval": interval, "unit": p.get("unit") or ""}  # fmt: skip
+    value, interval = measured(p["value"], *p["ci95"])
+    return {
+        "symbol": symbol_html(p["name"]),
+        "meaning": meaning(effect["id"], p["name"]),
+        "value": value,
+        "interval": interval,
+        "unit": p["unit"] or "",
+    }
 
 
 def _curve(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Config) -> dict | None:
@@ -188,7 +192,7 @@ def _curve(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Conf
 def _rival(rival: Mapping, config: Config) -> Markup:
     from sealfit.effects import EFFECTS
 
-    names = [channel_words(name, config.units) for name in rival.get("channels") or []]
+    names = [channel_words(name, config.units) for name in rival["channels"]]
     channels, label = joined(names), FREE.get(rival["id"], str(rival["id"]).replace("_", " "))
     if effect := EFFECTS.get(rival["id"]):
         first = names[0] if "{z}" in effect.label else channels
@@ -196,7 +200,7 @@ def _rival(rival: Mapping, config: Config) -> Markup:
     text = Markup("{}, acting on {}").format(label, target_html(rival["acts_on"], config))
     if channels and channels not in label:
         text += Markup(" along {}").format(channels)
-    if known(error := rival.get("heldout_rmse_N")):
+    if known(error := rival["heldout_rmse_N"]):
         text += Markup(" (held-out error {})").format(of_unit(number(error), config.units.unit("force")))
     return text
 
@@ -206,11 +210,11 @@ def scatter_rows(closure: Mapping) -> list[dict]:
     return [
         {
             "level": level_words(entry["level"]),
-            "sd": number(entry.get("sd_N"), 2),
-            "share": f"{number(100 * entry['sd_rel'], 2)} %" if known(entry.get("sd_rel")) else NOTHING,
-            "df": number(entry.get("df"), 2),
+            "sd": number(entry["sd_N"], 2),
+            "share": f"{number(100 * entry['sd_rel'], 2)} %" if known(entry["sd_rel"]) else NOTHING,
+            "df": number(entry["df"], 2),
         }
-        for entry in closure.get("scatter") or []
+        for entry in closure["scatter"]
     ]
 
 

@@ -345,10 +345,10 @@ def effect_label(effect: Mapping, units: Units) -> str:
     >>> effect_label(effect, Units())
     'ripple along displacement'
     """
-    target = rf", (?:added to|factor on) {re.escape(str(effect.get('acts_on')))}(?=,|$)"
+    target = rf", (?:added to|factor on) {re.escape(effect['acts_on'])}(?=,|$)"
     force = units.quantity("force").removeprefix("friction ")
-    label = re.sub(r"\bforce\b", force, re.sub(target, "", str(effect["label"])))
-    return _slot(effect.get("channels", ())).sub(lambda found: channel_words(found[0], units), label)
+    label = re.sub(r"\bforce\b", force, re.sub(target, "", effect["label"]))
+    return _slot(effect["channels"]).sub(lambda found: channel_words(found[0], units), label)
 
 
 @dataclass(frozen=True)

@@ -177,7 +177,7 @@ def of_after(store: Store) -> dict:
 
 def by_gain(effects: Sequence[Mapping]) -> list[Mapping]:
     """Return effects of closure.json, the largest reduction of the held-out error first."""
-    return sorted(effects, key=lambda effect: -(effect.get("heldout_gain_N") or 0.0))
+    return sorted(effects, key=lambda effect: -(effect["heldout_gain_N"] or 0.0))
 
 
 def verdict_sentence(closure: Mapping, units: Units) -> str:
@@ -197,7 +197,7 @@ def _verdict_clause(closure: Mapping, units: Units) -> str:
     if closure["verdict"] == "closed":
         beside = f"; not decided by these files: {untold}" if untold else ""
         remains = "no significant residual remains"
-        if closure["left"].get("significant"):
+        if closure["left"]["significant"]:
             remains = f"what remains{_where(closure['left'], units)} is less than repeats scatter by"
         return f"{added}; {remains}; {quality}{beside}"
     return f"{added}; a significant residual remains{_where(closure['left'], units)}; {quality}"
@@ -257,7 +257,7 @@ NAMED = 3
 
 def outlier_clause(closure: Mapping) -> str:
     """Return which files the loop left out; empty if none."""
-    outliers = closure.get("outlier_files") or []
+    outliers = closure["outlier_files"]
     if not outliers:
         return ""
     named = [f"{one['file']} ({one['deviation_pct']:+.2g} %)" for one in outliers[:NAMED]]
@@ -273,9 +273,9 @@ def level_words(level: str) -> str:
 
 def quality_clause(closure: Mapping) -> str:
     """Return how the error compares with the scatter of repeats, in a clause."""
-    quality = closure.get("fit_quality") or {"state": "unknown"}
+    quality = closure["fit_quality"]
     if quality["state"] == "unknown":
-        if closure.get("noise_floor_N") is not None:
+        if closure["noise_floor_N"] is not None:
             return "the model has too many parameters for these runs to test its lack of fit"
         return "without repeats it is not known whether the error exceeds the scatter"
     if quality["state"] == "within_scatter":
@@ -291,7 +291,7 @@ def power_clause(closure: Mapping, units: Units) -> str:
 
     It is empty if none is known.
     """
-    known = [s for s in closure.get("sensitivity") or () if s["smallest_N"] is not None]
+    known = [s for s in closure["sensitivity"] if s["smallest_N"] is not None]
     texts = [
         f"{s['smallest_pct']:.2g} % for {units.label(s['variable'])} {level_words(s['level'])}"
         for s in sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
@@ -310,10 +310,10 @@ def untold_clause(closure: Mapping, units: Units) -> str:
     texts += [
         f"{item['label']} (p = {item['p_value']:.1g}, "
         f"{'weak evidence: test more' if item['weak'] else 'refused: ' + item['reason']})"
-        for item in closure.get("refused") or ()
+        for item in closure["refused"]
         if item["weak"] or undecided
     ][:NAMED]
-    for entry in [s for s in closure.get("sensitivity") or () if s["cannot_tell"]][:NAMED]:
+    for entry in [s for s in closure["sensitivity"] if s["cannot_tell"]][:NAMED]:
         smallest, files = entry["smallest_pct"], entry["files_needed"]
         if smallest is None:
             size, more = "no effect is detectable", f"; at least {files} files are needed"

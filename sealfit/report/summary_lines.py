@@ -195,7 +195,7 @@ def _setting(name: str, value: object, units: Mapping[str, str]) -> str:
 def _left(left: Mapping, unit: str) -> str:
     """Return the remaining residual: its size above the floor, the variable, and the p-value."""
     above = f"rms {_number(left['rmse_N'])} {unit} above the noise floor, " if left["rmse_N"] else ""
-    significant = "" if left.get("significant") else ", not significant"
+    significant = "" if left["significant"] else ", not significant"
     return f"{above}along {left['channel']} (p = {left['p_value']:.2g}{significant})"
 
 

@@ -76,7 +76,7 @@ def verdict(closure: Mapping, shapes: pd.DataFrame, config: Config) -> Markup:
         better = Markup("with {}, {}").format("them" if len(added) > 1 else "it", errors.pop(0))
     if closure["verdict"] != "closed":
         left = f"a significant residual remains that no effect explains: {_where(closure['left'], config)}"
-    elif closure["left"].get("significant"):
+    elif closure["left"]["significant"]:
         left = f"{_where(closure['left'], config)}, by less than repeats scatter"
     return _sentences(lacked, better, left, *errors)
 
@@ -90,7 +90,7 @@ def undecided(closure: Mapping, config: Config) -> Markup:
 
 def in_words(text: str, closure: Mapping, config: Config) -> Markup:
     """Return a sentence of closure.json with quantities and units for columns, and parameters as symbols."""
-    names = [entry["variable"] for entry in closure.get("sensitivity") or ()]
+    names = [entry["variable"] for entry in closure["sensitivity"]]
     force = config.units.quantity("force").removeprefix("friction ")
     return with_symbols(true_units(re.sub(r"\bforce\b", force, text), config.units, names))
 
@@ -116,10 +116,10 @@ def _missed(label: str, does: Markup) -> Markup:
 def error_clause(closure: Mapping, config: Config) -> Markup:
     """Return the held-out error before and after, and the noise floor, in a clause."""
     unit = config.units.unit("force")
-    key, what = "heldout_rmse_N", f"rms error on held-out {closure.get('heldout_unit') or 'run'}s"
-    if not known(closure["before"].get(key)):
+    key, what = "heldout_rmse_N", f"rms error on held-out {closure['heldout_unit']}s"
+    if not known(closure["before"][key]):
         key, what = "rmse_N", "in-sample rms error (nothing could be held out)"
-    before, after, floor = closure["before"].get(key), closure["after"].get(key), closure.get("noise_floor_N")
+    before, after, floor = closure["before"][key], closure["after"][key], closure["noise_floor_N"]
     texts = together([before, after, floor])
     if before == after or not known(after):
         change = f"the {what} is {of_unit(texts[0], unit)}"
@@ -136,7 +136,7 @@ def does(index: int, effect: Mapping, shapes: pd.DataFrame, config: Config) -> M
     The values of a free shape at its knots are not among them.
     """
     change = _change(effect, shapes[shapes["effect"] == index] if len(shapes) else shapes, config)
-    rest = [p for p in effect["parameters"] if effect["named"] and p.get("unit") != "rad"]
+    rest = [p for p in effect["parameters"] if effect["named"] and p["unit"] != "rad"]
     if change:  # which says how large the amplitudes are
         found = [_catalogued(effect["id"], p["name"]) for p in rest]
         rest = [p for p, own in zip(rest, found, strict=True) if own is None or not own.linear]
@@ -146,13 +146,13 @@ def does(index: int, effect: Mapping, shapes: pd.DataFrame, config: Config) -> M
 def parameter(p: Mapping, effect: Mapping) -> Markup:
     """Return "time constant τ = 4.0 s [3.6, 4.5]", in words for an effect of the catalogue."""
     words = meaning(effect["id"], p["name"])
-    value = _measured(p["value"], p.get("ci95"), p.get("unit"))
+    value = _measured(p["value"], p["ci95"], p["unit"])
     text = Markup("{} = {}").format(symbol_html(p["name"]), value)
     return Markup("{} {}").format(words, text) if words and len(words) <= 40 else text
 
 
-def _measured(value: float | None, ends: Sequence[float | None] | None, unit: str | None) -> str:
-    text, interval = measured(value, *(ends or (None, None)), digits=1)
+def _measured(value: float | None, ends: Sequence[float | None], unit: str | None) -> str:
+    text, interval = measured(value, *ends, digits=1)
     tail = f" {interval}".replace(", ", ",\u00a0") if interval != NOTHING else ""
     return of_unit(text, unit or "") + tail
 
@@ -231,23 +231,23 @@ def _catalogued(effect_id: str, name: str) -> Parameter | None:
 
 def left_over(closure: Mapping, config: Config) -> Markup:
     """Return the size of the remaining residual, and the variable that explains it if any, in sentences."""
-    left, unit, floor = closure["left"], config.units.unit("force"), closure.get("noise_floor_N")
-    rmse = closure["after"].get("rmse_N")
+    left, unit, floor = closure["left"], config.units.unit("force"), closure["noise_floor_N"]
+    rmse = closure["after"]["rmse_N"]
     said = []
     if known(rmse):
         size, ground = together([rmse, floor])
         beside = f"; the noise floor is {of_unit(ground, unit)}" if known(floor) else ""
         said.append(f"the rms error of all bins is {of_unit(size, unit)}{beside}")
-        if known(floor) and known(left.get("rmse_N")) and 0 < left["rmse_N"] < rmse:
+        if known(floor) and known(left["rmse_N"]) and 0 < left["rmse_N"] < rmse:
             excess = of_unit(number(left["rmse_N"], 2), unit)
             said.append(
                 f"the excess over the noise floor is {excess} (root of the difference of the squares)"
             )
-    if left.get("significant"):
+    if left["significant"]:
         said.append(f"a significant residual remains: {_where(left, config)}")
-    elif left.get("channels") and any(effect["candidate"] for effect in closure["effects"]):
+    elif left["channels"] and any(effect["candidate"] for effect in closure["effects"]):
         said.append(f"the evidence rests on too few specimens: {_where(left, config)}")
-    elif left.get("channels"):
+    elif left["channels"]:
         said.append(f"no variable is significant. The smallest p-value: {_where(left, config)}")
     else:
         said.append("no variable explains it: it is consistent with scatter")
@@ -255,14 +255,16 @@ def left_over(closure: Mapping, config: Config) -> Markup:
 
 
 def _where(left: Mapping, config: Config) -> str:
-    names, level = left.get("channels") or [], left.get("level")
+    names, level = left["channels"], left["level"]
     text = "the residual varies"
     if names:
         text += f" with {joined([channel_label(name, config.units) for name in names])}"
     if level:
         text += f" {level_words(level)}"
-    p = p_value(left.get("p_value")).replace(" ", "\u00a0")  # on one line
-    return f"{text} (p\u00a0{p})" if known(left.get("p_value")) else text
+    if not known(left["p_value"]):
+        return text
+    p = p_value(left["p_value"]).replace(" ", "\u00a0")  # on one line
+    return f"{text} (p\u00a0{p})"
 
 
 def without_load(closure: Mapping) -> dict:
@@ -274,7 +276,7 @@ def without_load(closure: Mapping) -> dict:
 def with_left_channels(closure: Mapping, channels: Collection[str]) -> dict:
     """Return closure.json with `left.channels`: `left.channel` split into the names in `channels`."""
     left = closure["left"]
-    return {**closure, "left": {**left, "channels": split_channels(left.get("channel"), channels)}}
+    return {**closure, "left": {**left, "channels": split_channels(left["channel"], channels)}}
 
 
 def _sentences(*clauses: str | Markup) -> Markup:

@@ -87,6 +87,7 @@ def closure(**changed):
         "rmse_N": 0.4,
         "rmse_runs_N": 0.3,
         "heldout_rmse_N": None,
+        "heldout_extrapolated_rmse_N": None,
         "max_abs_N": 1.5,
         "mean_abs_pct": 2.0,
     }
@@ -95,12 +96,14 @@ def closure(**changed):
         "fit_quality": {"state": "unknown", "ratio": None, "p_value": None},
         "left": {"rmse_N": None, "level": None, "channel": None, "p_value": None},
         "noise_floor_N": None,
-        "heldout_unit": None,
+        "heldout_unit": "run",
         "before": errors,
         "after": errors,
         "effects": [],
         "scatter": [],
         "sensitivity": [],
+        "refused": [],
+        "outlier_files": [],
     }
     return {**found, **changed}
 

@@ -270,14 +270,15 @@ def test_with_no_tables_at_all_it_still_says_so():
 def test_null_everywhere_is_a_page_too(small, unsaved):
     made = small
     nothing = dict.fromkeys(made.closure["before"])
-    made.closure.update(
-        before=nothing, after=dict(nothing), noise_floor_N=None, heldout_unit=None, scatter=[]
-    )
-    made.closure["left"] = dict.fromkeys(made.closure["left"])
+    unknown = {"state": "unknown", "ratio": None, "p_value": None}
+    made.closure.update(before=nothing, after=dict(nothing), noise_floor_N=None, fit_quality=unknown)
+    made.closure["left"] = {**dict.fromkeys(made.closure["left"]), "significant": False}
     for effect in made.closure["effects"]:
         effect.update(p_value=None, heldout_gain_N=None)
         for p in effect["parameters"]:
             p.update(value=None, ci95=[None, None])
+    for entry in made.closure["scatter"]:
+        entry.update(sd_rel=None, sd_N=None, df=None)
     text = Page(build_report(*made.arguments).html).text
     assert "the noise floor and the lack of fit are unknown" in text
     assert not re.search(r"\b(nan|None)\b", text)
@@ -361,7 +362,8 @@ def test_the_page_states_the_sensitivity_and_the_effects_not_accepted():
     assert [row["files"] for row in rows] == ["44", "–"]
     label = "ripple along displacement_mm, factor on mu_s"
     refused = {"label": label, "acts_on": "mu_s", "channels": ["displacement_mm"], "p_value": 1e-6}
-    (row,) = refused_rows({"refused": [{**refused, "reason": "it is too small"}]}, Config())
+    refused = {**refused, "reason": "it is too small"}
+    (row,) = refused_rows({"refused": [refused], "sensitivity": []}, Config())
     assert row["label"] == "ripple along displacement, acting on <i>μ</i><sub>s</sub>"
 
 

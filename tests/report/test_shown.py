@@ -175,7 +175,8 @@ def test_a_free_shape_is_a_table_of_its_curve_and_has_no_coefficients():
     free = {
         "id": "smooth", "label": "smooth in time_s, factor on mu", "channels": ["time_s"], "acts_on": "mu",
         "operation": "multiply", "named": False, "candidate": False, "parameters": coefficients,
-        "form": "natural cubic spline", "level": "trace", "reference": "mean",
+        "form": "natural cubic spline", "level": "trace", "reference": "mean", "p_value": 0.001,
+        "heldout_gain_N": 0.1, "heldout_rmse_N": 0.4, "alternatives": [],
     }  # fmt: skip
     (card,) = effect_cards({"effects": [free]}, shapes, Config())
     assert card["parameters"] == []

@@ -74,7 +74,7 @@ def test_sentences_of_others_lose_slot_names():
     ],
 )
 def test_labels_of_effects_are_in_words_of_the_rig(label, words):
-    assert effect_label({"label": label, "acts_on": "force"}, TORQUE) == words
+    assert effect_label({"label": label, "acts_on": "force", "channels": []}, TORQUE) == words
 
 
 def test_conditions_are_values_with_units():

@@ -47,13 +47,16 @@ RIPPLE = {
 
 def document(kind="closed", effects=(WARMING,), floor=0.2899, **left):
     after = {**NUMBERS, "heldout_rmse_N": 0.3121, "rmse_N": 0.31} if effects else NUMBERS
-    left = {"rmse_N": 0.31, "level": None, "channel": None, "p_value": None, **left}
+    left = {"rmse_N": 0.31, "level": None, "channel": None, "p_value": None, "significant": False, **left}
     found = {
         "verdict": kind,
         "before": NUMBERS,
         "after": after,
         "noise_floor_N": floor,
         "heldout_unit": "run",
+        "sensitivity": [],
+        "refused": [],
+        "outlier_files": [],
     }
     found["fit_quality"] = {"state": "above_scatter", "ratio": 1.07, "p_value": 0.0002}
     return with_left_channels(

@@ -59,14 +59,14 @@ STAGES = (Key("before", BEFORE, "open"), Key("after", AFTER, "point"))
 # ---------------------------------------------------------------- before and after
 def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
     """Draw each error as a step from before to after, with the noise floor as a line."""
-    rows = [(key, label) for key, label in ERRORS if known(closure["before"].get(key))]
-    values = [closure[stage].get(key) for key, _ in rows for stage in ("before", "after")]
+    rows = [(key, label) for key, label in ERRORS if known(closure["before"][key])]
+    values = [closure[stage][key] for key, _ in rows for stage in ("before", "after")]
     texts = together(values)
     above = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
     box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85}
     largest = max(value for value in values if known(value))
     for k, (key, _) in enumerate(rows):
-        before, after = closure["before"][key], closure["after"].get(key)
+        before, after = closure["before"][key], closure["after"][key]
         y = len(rows) - 1 - k
         if known(after) and after != before:
             ax.plot([before, after], [y, y], color=QUIET, linewidth=1.2, zorder=1)
@@ -74,7 +74,7 @@ def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
             ax.annotate(texts[2 * k + 1], (after, y), color=AFTER, bbox=box, **above)
         ax.plot(before, y, "o", color=BEFORE, markersize=6.5, zorder=2)
         ax.annotate(texts[2 * k], (before, y), color=BEFORE, bbox=box, **above)
-    floor = closure.get("noise_floor_N")
+    floor = closure["noise_floor_N"]
     if known(floor):
         ax.axvline(floor, color=FLOOR, linestyle="--", linewidth=1.0, zorder=0)
         largest = max(largest, floor)
@@ -109,12 +109,12 @@ def run_means(residuals: pd.DataFrame, column: str) -> pd.Series:
 
 def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
     """Return the errors before and after with the noise floor, or None if no error is known."""
-    if not any(known(closure["before"].get(key)) for key, _ in ERRORS):
+    if not any(known(closure["before"][key]) for key, _ in ERRORS):
         return None
-    unit, floor = config.units.unit("force"), closure.get("noise_floor_N")
+    unit, floor = config.units.unit("force"), closure["noise_floor_N"]
     alt = "Rms errors: "
     for key, label in ERRORS:
-        before, after = (number(closure[stage].get(key)) for stage in ("before", "after"))
+        before, after = (number(closure[stage][key]) for stage in ("before", "after"))
         alt += f"{label} {before} before, {after} {unit} after; "
     alt += f"noise floor {f'{number(floor)} {unit}' if known(floor) else 'unknown'}."
     draw = partial(draw_errors, closure=closure, units=config.units)
@@ -395,16 +395,16 @@ def draw_shape(
 
 def shape_scale(effect: Mapping) -> float:
     """Return 100 where a shape is a factor minus one, drawn in percent, else 1."""
-    return 100.0 if effect.get("operation") == "multiply" else 1.0
+    return 100.0 if effect["operation"] == "multiply" else 1.0
 
 
 def shape_label(
     rows: pd.DataFrame, effect: Mapping, units: Units, symbol: Callable[[str], str] = symbol_plain
 ) -> str:
     """Return the axis label of a shape, with the unit: "added force (N)", "change of μ (%)"."""
-    target = effect.get("acts_on", "force")
+    target = effect["acts_on"]
     force = plain(units.quantity("force"))
-    if effect.get("operation") == "multiply":
+    if effect["operation"] == "multiply":
         return f"change of {force if target == 'force' else symbol(target)} (%)"
     unit = next((u for u in rows["unit"] if isinstance(u, str) and u), "")
     tail = f" ({plain(unit)})" if unit else ""
