@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sealfit import tables as schemas
 from sealfit.engine import claim_memory
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault
@@ -20,9 +21,8 @@ from sealfit.store.staged_writes import Staged
 if TYPE_CHECKING:
     import pandas as pd
 
-INGESTED = ("inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins")
-CLOSED = ("effects", "residuals_before", "residuals_after", "levels", "channels", "shapes", "shape_points",
-          "curves")  # fmt: skip
+INGESTED = tuple(table.name for table in schemas.INGESTED)
+CLOSED = tuple(table.name for table in schemas.LOOP)
 FITS = {
     "fit-steady": ("steady_fit", "steady_covariance", "steady_shift"),
     "fit-aging": ("aging_fit", "aging_covariance", "aging_curves", "aging_laws", "master_curve"),
@@ -33,9 +33,9 @@ AFTER = tuple(f"{name}_after" for name in ("steady", *FITTED))
 MADE = {"ingest": INGESTED, **FITS, "close-loop": (*CLOSED, *AFTER)}  # tables by the step that makes them
 TABLES = tuple(name for names in MADE.values() for name in names)
 OF_PROPERTIES = ("property_values", "aging_fit", "aging_curves", "aging_laws", "master_curve")
-BESIDE = ("steady_covariance", "steady_shift", "aging_covariance")  # of the parameters of a fit
+BESIDE = tuple(table.name for table in schemas.BESIDE)
 UNREPORTED = (  # of many rows, and the report needs nothing of them but a few traces
-    "traces", "bins", "steady_after", *BESIDE, *(f"{name}_after" for name in BESIDE),
+    "traces", "traces_mean", "bins", "steady_after", *BESIDE, *(f"{name}_after" for name in BESIDE),
 )  # fmt: skip
 TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
 REPORTED = {  # of tables with a row per bin, what the report looks at
@@ -339,7 +339,7 @@ def report_tables(store: Store) -> dict[str, pd.DataFrame]:
     """Return by name what the report shows and draws of the tables in OUT."""
     if store.state.properties is not None:
         return {name: store.read(name) for name in OF_PROPERTIES}
-    names = [name for name in TABLES if name not in (*UNREPORTED, "traces_mean")]
+    names = [name for name in TABLES if name not in UNREPORTED]
     tables = {name: store.read(name, REPORTED.get(name)) for name in names}
     return {**tables, **_example_traces(store, tables["runs"])}
 

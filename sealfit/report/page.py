@@ -44,7 +44,7 @@ from sealfit.report.style import WIDTH, Plot
 from sealfit.report.summary import of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
 from sealfit.report.words import left_over, undecided, verdict, with_left_channels, with_symbols, without_load
-from sealfit.tables import SCHEMAS
+from sealfit.tables import FITTED, SCHEMAS
 
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
 MOST_INPUTS = 2000  # listed with their hashes; inputs.parquet has all
@@ -145,26 +145,8 @@ def provenance_facts(provenance: Mapping, config: Config) -> dict:
     }
 
 
-def complete(tables: Mapping[str, pd.DataFrame], names: tuple[str, ...]) -> dict[str, pd.DataFrame]:
-    """Return every table of `names`; an empty one with its columns replaces a missing one."""
-    found = {name: tables[name] for name in names if len(tables.get(name, ()))}
-    for name in names:
-        if name not in found:
-            columns = SCHEMAS[name].columns
-            found[name] = pd.DataFrame({c.name: pd.Series(dtype=c.dtype.to_pandas_dtype()) for c in columns})
-    return found
-
-
 # ---------------------------------------------------------------- page
 
-TABLES = (
-    "inputs", "runs", "quality", "traces", "traces_mean", "steady", "steady_fit", "aging_fit", "aging_curves",
-    "aging_laws", "property_values", "master_curve", "dynamic_fit", "dynamic_curves", "effects",
-    "residuals_before", "residuals_after", "levels", "channels", "shapes", "shape_points", "curves",
-)  # fmt: skip
-FITS = (
-    "steady_fit", "aging_fit", "aging_curves", "aging_laws", "master_curve", "dynamic_fit", "dynamic_curves",
-)  # fmt: skip
 VERDICTS = {
     "closed": "Closed",
     "nothing_missing": "Nothing missing",
@@ -249,14 +231,17 @@ def answered(
 
 
 def with_after_fits(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Return the report's tables, with the fits after the loop in place of those before it, if there are any.
+    """Return all tables, with the fits after the loop in place of those before it, if there are any.
 
-    Those before then have the suffix `_before`.
+    Those before then have the suffix `_before`. A missing table is an empty one with its columns.
     """
-    found = complete(tables, TABLES)
-    if len(tables.get("steady_fit_after", ())):
-        before = {f"{name}_before": found[name] for name in FITS}
-        found |= complete({name: tables[f"{name}_after"] for name in FITS}, FITS) | before
+    found = {name: tables[name] for name in SCHEMAS if len(tables.get(name, ()))}
+    for name in SCHEMAS.keys() - found.keys():
+        columns = SCHEMAS[name].columns
+        found[name] = pd.DataFrame({c.name: pd.Series(dtype=c.dtype.to_pandas_dtype()) for c in columns})
+    if len(found["steady_fit_after"]):
+        for name in (fit.name for fit in FITTED):
+            found[f"{name}_before"], found[name] = found[name], found[f"{name}_after"]
     return found
 
 

@@ -31,7 +31,7 @@ from report.made_tables import (
 from sealfit.config import Config
 from sealfit.fit.aging.all_series import joint_laws
 from sealfit.ingest.columns import add_keys
-from sealfit.report.page import FITS
+from sealfit.tables import FITTED
 
 NAMES = (
     "inputs",
@@ -378,7 +378,7 @@ def after_campaign():
     """The aging campaign with fits after the loop beside those before it."""
     before = aging_campaign()
     tables = dict(before.tables)
-    for name in FITS:
+    for name in (fit.name for fit in FITTED):
         table = before.tables[name]
         numbers = [c for c in ("value", "lo95", "hi95") if c in table]
         tables[f"{name}_after"] = table.assign(**{c: table[c] * HIGHER for c in numbers})

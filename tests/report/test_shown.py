@@ -90,8 +90,7 @@ def steady_rows(days, runs=1):
 
 
 def drawn_of(rows):
-    names = ("curves", "residuals_after")
-    return force_speed({**page.complete({}, names), "steady": rows}, Config())
+    return force_speed(page.with_after_fits({"steady": rows}), Config())
 
 
 def test_many_days_of_a_series_are_thinned():
