@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.report.summary import NOT_PARAMETERS, verdict_sentence
+from sealfit.report.summary import STATISTICS, verdict_sentence
 from sealfit.tables import Schema
 from sealfit.units import Units
 
@@ -154,7 +154,7 @@ def laws(fit: pd.DataFrame, before: pd.DataFrame, config: Config) -> pd.DataFram
     config : Config
         Names the columns that tell series apart.
     """
-    rows, earlier = (own[~own["quantity"].isin(NOT_PARAMETERS)] for own in (fit, before))
+    rows, earlier = (own[own["quantity"] != STATISTICS] for own in (fit, before))
     rows = _with_before(rows, earlier, ["series", "quantity", "parameter"])
     keys = [name for name in (*config.series_columns, *config.rubber) if name in rows]
     columns = dict.fromkeys(["series", "rubber", *keys, "quantity", "parameter", *ESTIMATE])

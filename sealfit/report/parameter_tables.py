@@ -91,8 +91,6 @@ STATISTICS = {
 }  # fmt: skip
 ENDS = ("value", "lo95", "hi95")
 MOST_BREAK_AWAYS = 600
-# not shown: for programs that read the Parquet tables
-HIDDEN = ("covariance", "sensor_shift", "effect_shift")
 
 SHARED = 3  # rows with one note, from which it is said once
 _NUMBERS = re.compile(r"(?<![\w<;&#.])\d+(?:\.\d+)?(?![\w.]*[<;])")  # not those in symbols or in markup
@@ -168,7 +166,6 @@ def parameter_tables(
     another unit than in the head's row it has a column of its own. `before` is the same table without the
     loop's effects, for its values beside those of `fit`.
     """
-    fit = fit[~fit["quantity"].isin(HIDDEN)]
     if fit.empty:
         return []
     names = ConditionNames.of(config)

@@ -15,9 +15,7 @@ if TYPE_CHECKING:
     from sealfit.effects.contract import Effect
     from sealfit.store import Store
 
-# `quantity` of rows about the fit itself
-NOT_PARAMETERS = ("statistics", "covariance", "sensor_shift", "effect_shift")
-
+STATISTICS = "statistics"  # `quantity` of rows about the fit itself
 OF_INGEST = {  # columns that its summary counts
     "inputs": ["status"],
     "runs": ["used", "run_id"],
@@ -70,7 +68,7 @@ def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
 
 def of_fit(fit: pd.DataFrame, of: str) -> dict:
     """Return the range of each parameter over the conditions or series of `fit` in which it is identified."""
-    rows = fit[~fit["quantity"].isin(NOT_PARAMETERS)]
+    rows = fit[fit["quantity"] != STATISTICS]
     ranges = []
     keys = ["quantity", "parameter", "unit"]
     for (quantity, parameter, unit), group in rows.groupby(keys, sort=False, dropna=False):

@@ -68,9 +68,6 @@ def steady_rows(temperature, compression, day, values, rng):
         "identified": True,
     }
     rows.append({**shared, "quantity": "statistics", "parameter": "rmse_N", "value": 0.31, "unit": "N"})
-    # the same names stand in rows that are no coefficients
-    rows.append({**shared, "quantity": "sensor_shift", "parameter": "mu_s", "value": 0.0024, "unit": ""})
-    rows.append({**shared, "quantity": "covariance", "parameter": "mu_s,mu_s", "value": 3.6e-5, "unit": ""})
     return rows
 
 

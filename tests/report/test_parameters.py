@@ -50,12 +50,6 @@ def test_forces_carry_the_declared_unit():
     assert [unit for _, unit in table.groups] == ["mN m", "mN m", "rpm", "mN m/rpm"]
 
 
-def test_covariances_and_shifts_are_for_programs():
-    made = aging_campaign(speeds=(1, 10))
-    tables = parameter_tables(made.tables["steady_fit"], "condition", made.config)
-    assert [len(table.groups) for table in tables] == [4, 1]
-
-
 def test_conditions_stand_in_the_order_of_their_numbers():
     made = aging_campaign(days=(1, 16, 4), compressions=(100, 80), speeds=(1, 10))
     rows = parameter_tables(made.tables["steady_fit"], "condition", made.config)[0].rows
