@@ -6,7 +6,7 @@ import difflib
 import errno
 import re
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -31,6 +31,12 @@ class Fault:
     severity: Literal["info", "warning", "error"] = "error"
     action: Literal["kept", "row left out", "file left out", "stroke left out", "stopped"] = "stopped"
     fix: str = ""
+
+    @classmethod
+    def of_row(cls, row: Mapping) -> Fault:
+        """Return the fault of a row of table `quality`, whose numbers may have become floats beside NaN."""
+        known = {name: value for name, value in row.items() if value is not None and value == value}
+        return cls(**{**known, **{name: int(known[name]) for name in ("stroke", "line") if name in known}})
 
     def __str__(self) -> str:
         place = shortened(self.file or "", LONGEST_PATH)

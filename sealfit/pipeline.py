@@ -181,10 +181,8 @@ def _do_steps(store: Store, steps: tuple[str, ...], options: Options, progress: 
 
 def faults_of(quality: pd.DataFrame) -> list[Fault]:
     """Return the faults that a quality table holds; rows of severity "info" are none."""
-    rows = quality[quality["severity"].isin(FAULTY)].astype(object)
-    rows = rows.where(rows.notna(), None)
-    whole = {name: rows[name].map(lambda n: None if n is None else int(n)) for name in ("stroke", "line")}
-    return [Fault(**row) for row in rows.assign(**whole).to_dict("records")]
+    rows = quality[quality["severity"].isin(FAULTY)]
+    return [Fault.of_row(row) for row in rows.to_dict("records")]
 
 
 # ---------------------------------------------------------------- the work of each step

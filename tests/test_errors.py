@@ -76,7 +76,8 @@ def test_the_terminal_and_the_report_list_it_once_and_quality_has_every_row(caps
     assert lines == ["warning: is odd.", f"error: {told(faults[:30])} [row left out]"]
     table = quality_table(faults, [f"raw/{i}.csv" for i in range(30)])
     assert len(table) == 31
-    rows, count = quality_findings(table, Config())
+    # The lines are floats in a table that was stored, as some rows have none.
+    rows, count = quality_findings(table.astype({"line": float}), Config())
     assert count == 2
     assert (rows[0]["file"], rows[0]["place"]) == (
         "30 files",

@@ -102,14 +102,8 @@ def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict],
         return [], 0
     told = quality[(quality["severity"] != "info") | (quality["action"].fillna("kept") != "kept")]
     told = told.sort_values("severity", key=lambda names: names.map(RANK).fillna(9), kind="stable")
-    told = told.astype(object).where(told.notna(), None)
-    groups = grouped(_fault(row) for row in told.to_dict("records"))
+    groups = grouped(Fault.of_row(row) for row in told.to_dict("records"))
     return [_finding(group, config) for group in groups[:MOST_FINDINGS]], len(groups)
-
-
-def _fault(row: Mapping) -> Fault:
-    texts = {name: row[name] or "" for name in ("check", "reason", "fix", "severity")}
-    return Fault(**{**row, **texts, "action": row["action"] or "kept"})
 
 
 def _finding(group: list[Fault], config: Config) -> dict:
@@ -121,7 +115,7 @@ def _finding(group: list[Fault], config: Config) -> dict:
     row["check"] = first.check.replace("_", " ")
     if len(group) == 1:
         numbers = {"stroke": first.stroke, "line": first.line}
-        places = [f"{what} {int(n)}" for what, n in numbers.items() if n is not None]
+        places = [f"{what} {n}" for what, n in numbers.items() if n is not None]
         return {**row, "place": ", ".join(places)}
     row |= {"file": how_many(group), "value": None, "place": "; ".join(examples(group))}
     return row if one_reason(group) else {**row, "reason": ""}
