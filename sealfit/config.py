@@ -427,16 +427,16 @@ class Config(Strict):
         # Here, so that commands that read no config start quickly.
         from sealfit.ingest.expression import parse
 
-        rows = {f"trace.compute.{k}": (v, False) for k, v in self.trace.compute.items()}
-        rows |= {f"files.compute.{k}": (v, False) for k, v in self.files.compute.items()}
-        rows |= {f"runs.compute.{k}": (v, False) for k, v in self.runs.compute.items()}
+        texts = {f"trace.compute.{k}": v for k, v in self.trace.compute.items()}
+        texts |= {f"files.compute.{k}": v for k, v in self.files.compute.items()}
+        texts |= {f"runs.compute.{k}": v for k, v in self.runs.compute.items()}
         if self.trace.keep is not None:
-            rows["trace.keep"] = (self.trace.keep, True)
+            texts["trace.keep"] = self.trace.keep
         if isinstance(self.trace.rate_Hz, str):
-            rows["trace.rate_Hz"] = (self.trace.rate_Hz, False)
-        for place, (text, condition) in rows.items():
+            texts["trace.rate_Hz"] = self.trace.rate_Hz
+        for place, text in texts.items():
             try:
-                parse(text, condition=condition)
+                parse(text, condition=place == "trace.keep")
             except ConfigError as error:
                 raise ValueError(f"{place}: {error}") from None
         return self
@@ -526,15 +526,13 @@ def read_config(path: Path | None = None) -> str:
 
 def parse_config(text: str, name: str) -> Config:
     """Return the config written in `text`, which messages call `name`; errors as `load_config`."""
+    fix = "docs/reference/config.md has every key."
     try:
         return Config.model_validate(tomllib.loads(text))
     except ValidationError as error:
-        fix = "docs/reference/config.md has every key."
         raise ConfigError(explain(error, Config), file=name, line=line_of(error, text), fix=fix) from error
     except (ValueError, RecursionError) as error:  # a number of thousands of digits, or lists in lists
-        raise ConfigError(
-            f"is not TOML: {error}.", file=name, fix="docs/reference/config.md has every key."
-        ) from error
+        raise ConfigError(f"is not TOML: {error}.", file=name, fix=fix) from error
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:

@@ -320,26 +320,19 @@ def _report(store: Store, staged: Staged, options: Options, progress: Silent) ->
 
 
 def reported(store: Store) -> tuple[dict[str, pd.DataFrame], dict | None]:
-    """Return the tables of the report and closure.json, None of properties.
+    """Return what the report shows and draws of the tables, by name, and closure.json, None of properties.
 
     OutError if closure.json lacks an effect whose shape is in the tables.
     """
-    tables = report_tables(store)
     if store.state.properties is not None:
-        return tables, None
+        return {name: store.read(name) for name in OF_PROPERTIES}, None
+    names = [name for name in TABLES if name not in UNREPORTED]
+    tables = {name: store.read(name, REPORTED.get(name)) for name in names}
+    tables |= _example_traces(store, tables["runs"])
     closure = store.read_json("closure")
     if tables["shapes"]["effect"].nunique() > len(closure["effects"]):
         raise store.not_ours("closure")
     return tables, closure
-
-
-def report_tables(store: Store) -> dict[str, pd.DataFrame]:
-    """Return by name what the report shows and draws of the tables in OUT."""
-    if store.state.properties is not None:
-        return {name: store.read(name) for name in OF_PROPERTIES}
-    names = [name for name in TABLES if name not in UNREPORTED]
-    tables = {name: store.read(name, REPORTED.get(name)) for name in names}
-    return {**tables, **_example_traces(store, tables["runs"])}
 
 
 def _example_traces(store: Store, runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
