@@ -56,7 +56,7 @@ CSS = 96
 def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[str]:
     """Return the campaign in a few short phrases: files, runs, conditions, speeds, load."""
     steady, inputs, units = tables["steady"], tables["inputs"], config.units
-    used = steady[steady["used"].astype(bool)] if len(steady) else steady
+    used = steady[steady["used"].astype(bool)]
     columns = {"file": "file", "run_id": "run", "condition": "condition"}
     facts = [count(used[column].nunique(), what) for column, what in columns.items()]
     if len(used):
@@ -72,7 +72,7 @@ def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[s
             force = units.quantity("force")
             what = "forces are" if force == "friction force" else f"{force} is"
             facts.append(f"no load given: {what} fitted instead of coefficients")
-    left_out = int((inputs["status"] == "left out").sum()) if len(inputs) else 0
+    left_out = int((inputs["status"] == "left out").sum())
     return [*facts, f"{count(left_out, 'file')} left out"] if left_out else facts
 
 
@@ -83,8 +83,6 @@ def _range(values: pd.Series, digits: int = 3) -> str:
 
 def quality_counts(quality: pd.DataFrame) -> list[dict]:
     """Return the number of findings per check, severity and action, the most severe first."""
-    if quality.empty:
-        return []
     names = ["check", "severity", "action"]
     keys = quality[names].fillna("").astype(str)
     keys["check"] = keys["check"].str.replace("_", " ")
@@ -98,8 +96,6 @@ def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict],
 
     What many files share is one row with a count and examples.
     """
-    if quality.empty:
-        return [], 0
     told = quality[(quality["severity"] != "info") | (quality["action"].fillna("kept") != "kept")]
     told = told.sort_values("severity", key=lambda names: names.map(RANK).fillna(9), kind="stable")
     groups = grouped(Fault.of_row(row) for row in told.to_dict("records"))

@@ -265,8 +265,6 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     `traces` has columns run_id and condition, one row or more of a run; table `runs` gives the speeds. The
     result has columns run_id, condition and speed; of six runs or fewer it has all, in their order.
     """
-    if traces.empty:
-        return pd.DataFrame(columns=["run_id", "condition", "speed"])
     speed = runs["speed_set_mm_s"].fillna(runs["speed_mm_s"].abs()).astype(float)
     speed = speed.groupby(runs["run_id"]).mean()
     known = traces.drop_duplicates("run_id")[["run_id", "condition"]]

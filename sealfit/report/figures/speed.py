@@ -197,9 +197,6 @@ def _force_alt(title: str, lines: Sequence[Line], config: Config) -> str:
 def run_points(steady: pd.DataFrame) -> pd.DataFrame:
     """Return mean and scatter of every run: condition, direction, speed, force (along the motion), sd, n."""
     used = steady[steady["used"].astype(bool)]
-    if used.empty:
-        columns = ["condition", "direction", "speed", "force", "sd", "n"]
-        return pd.DataFrame(columns=columns).astype({"force": float})
     rows = used.assign(speed=used["speed_mm_s"].abs(), force=used["force_N"] * used["direction"])
     run = ["condition", "run_id", "direction"]
     files = rows.groupby([*run, "file"], sort=False)[["speed", "force"]].mean().reset_index()
