@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 from bins_helpers import make_bins, make_traces
 
+from sealfit.closure import loop
 from sealfit.closure.confirm import Context
-from sealfit.closure.loop import _Folds
 from sealfit.closure.ripple_selection import numbered, steady_samples
 from sealfit.closure.subsampling import Subsample
 from sealfit.config import Config
@@ -58,22 +58,22 @@ def test_a_campaign_without_traces_has_no_samples():
     assert {"stroke_id", "unit", "direction", "displacement_mm", "time_s", "force_N"} <= set(samples)
 
 
-def test_a_fold_holds_all_bins_and_samples_only_where_it_searches():
+def test_a_fold_is_searched_without_its_strokes(monkeypatch):
     bins = numbered(make_bins(repeats=1, bins=6))
     rows, coarse = make_rows(bins, has_aging=True), make_rows(thin(bins, len(bins) // 3), has_aging=True)
-    out = rows.codes("run") % 5 == 0
     samples = steady_samples(make_traces(bins), rows)
-    part = Subsample(rows, coarse, coarse)
-    context = Context(Config(), EFFECTS)
-    campaign = SimpleNamespace(masks=[out], rows=rows, part=part, samples=samples, context=context)
-    before = SimpleNamespace(model=None, scatter=None)
-    searching, refitting = (_Folds(campaign, before, rounds)[0] for rounds in (2, 0))
+    heldout = loop._HeldOut(rows, Subsample(rows, coarse, coarse), samples, Context(Config(), EFFECTS))
+    out = rows.codes("run") % 5 == 0
+    used = {}
+
+    def search(train, seen, context, **others):
+        used.update(others, train=train, seen=seen)
+        return SimpleNamespace(before=None, after=SimpleNamespace(model="model"), added=())
+
+    monkeypatch.setattr(loop, "select_effects", search)
+    monkeypatch.setattr(heldout, "predicted", lambda fitted, out: (rows.force[out], rows.force[out] > 0))
+    assert heldout.searched(None, 2, out)[-1] == "model"
     kept = set(rows.table["stroke_id"][~out])
-    assert set(searching.seen["stroke_id"]) == kept
-    assert not len(refitting.seen)
-    for fold in (searching, refitting):
-        assert set(fold.train.table["stroke_id"]) == kept
-        assert fold.train.force.size == 2 * len(kept)
-        assert fold.test.force.size == out.sum()
-    assert searching.fine.force.size == 6 * len(kept)
-    assert refitting.fine is None
+    assert set(used["seen"]["stroke_id"]) == set(used["train"].table["stroke_id"]) == kept
+    assert used["train"].force.size == 2 * len(kept)
+    assert used["fine"].force.size == 6 * len(kept)

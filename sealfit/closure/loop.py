@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -169,7 +170,8 @@ class _HeldOut:
     """Cross-validation: the loop is repeated without some groups, and these are predicted."""
 
     def __init__(self, rows: Rows, part: Subsample, samples: pd.DataFrame, context: Context) -> None:
-        self.rows, self.part, self.samples, self.context = rows, part, samples, context
+        self.rows, self.part, self.samples, self.workers = rows, part, samples, context.workers
+        self.context = replace(context, say=silent, compare=False, workers=1)  # of the search in a fold
         self.level = heldout_level(rows)
         loop = context.config.loop
         self.masks = list(folds(rows, self.level, loop.folds, loop.seed))
@@ -197,22 +199,57 @@ class _HeldOut:
             before, determined = self.refitted(selection.before)
             after, also = self.refitted(selection.after) if selection.added else (before, determined)
             return before, after, determined & also, None
+        start = Start(selection.before.model, selection.before.scatter)
         rounds = max(a.round for a in selection.added)
-        parts = run_map(_held_out, _Folds(self, selection.before, rounds), workers=self.context.workers)
+        parts = run_map(partial(self.searched, start, rounds), self.masks, workers=self.workers)
         before, after = np.full((2, self.rows.force.size), np.nan)
         determined, models = np.zeros(self.rows.force.size, dtype=bool), []
         for k, (out, part) in enumerate(zip(self.masks, parts, strict=True)):
             say(f"  fold {k + 1} of {len(self.masks)}")
-            before[out], after[out], determined[out] = part.before, part.after, part.determined
-            models.append(part.model)
+            before[out], after[out], determined[out], model = part
+            models.append(model)
         return before, after, determined, models
+
+    def searched(
+        self, start: Start, rounds: int, out: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Model]:
+        """Return the forces before and after at the rows held out, where determined, and the model after.
+
+        The search is repeated without these rows.
+        """
+        fine = self.without(out, self.part.rows) if self.part.coarse is not self.part.rows else None
+        seen = self.samples[~self.samples["stroke_id"].isin(self.strokes(out))]
+        train = self.without(out, self.part.coarse)
+        found = select_effects(train, seen, self.context, fine=fine, start=start, rounds=rounds)
+        before, determined = self.predicted(found.before, out)
+        after, also = self.predicted(found.after, out) if found.added else (before, determined)
+        return before, after, determined & also, found.after.model
 
     def refitted(self, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
         """Return each row's force by a model refitted without its fold, and where it is determined, (n,)."""
         force, determined = np.full(self.rows.force.size, np.nan), np.zeros(self.rows.force.size, dtype=bool)
-        for out, part in zip(self.masks, map(_held_out, _Folds(self, fitted, rounds=0)), strict=True):
-            force[out], determined[out] = part.before, part.determined
+        for out in self.masks:
+            own = fit(fitted.model, self.without(out, self.part.coarse), fitted.scatter, turns=1)
+            force[out], determined[out] = self.predicted(own, out)
         return force, determined
+
+    def predicted(self, fitted: Fitted, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the force at the rows held out, and where the other rows determine it.
+
+        A model of some runs is fitted to all others first.
+        """
+        if not self.part.whole:
+            fitted = fit(fitted.model, self.without(out, self.part.every), fitted.scatter, turns=0)
+        force, tangent = evaluate(fitted.model, self.rows.subset(out))
+        return force, mean_se(tangent, fitted.covariance) < DETERMINED * fitted.rmse_N
+
+    def without(self, out: np.ndarray, rows: Rows) -> Rows:
+        """Return rows of the campaign without the strokes held out."""
+        return rows.subset(~rows.table["stroke_id"].isin(self.strokes(out)).to_numpy())
+
+    def strokes(self, out: np.ndarray) -> np.ndarray:
+        """Return the `stroke_id` of each row held out."""
+        return self.rows.table["stroke_id"].to_numpy()[out]
 
     def covered(self, model: Model) -> np.ndarray:
         """Return which rows were held out and are covered by the others, shape (n,)."""
@@ -221,82 +258,6 @@ class _HeldOut:
         for out in self.masks:
             found |= covered(self.rows, out, channels)
         return found
-
-
-@dataclass(frozen=True)
-class _Fold:
-    """One fold: rows and samples to fit to, and rows to predict."""
-
-    train: Rows
-    fine: Rows | None
-    every: Rows | None  # all rows to fit to, if `train` has some runs only
-    seen: pd.DataFrame
-    test: Rows
-    context: Context
-    start: Start
-    rounds: int  # of the search; with 0, `start` is refitted
-
-
-class _Folds(Sequence):
-    """The folds of a campaign. Each is created on access, as it contains most of the campaign."""
-
-    def __init__(self, campaign: _HeldOut, before: Fitted, rounds: int) -> None:
-        self.campaign, self.start, self.rounds = campaign, Start(before.model, before.scatter), rounds
-
-    def __len__(self) -> int:
-        return len(self.campaign.masks)
-
-    def __getitem__(self, number):
-        if isinstance(number, slice):
-            return [self[k] for k in range(*number.indices(len(self)))]
-        own, out = self.campaign, self.campaign.masks[number]
-        part, gone = own.part, own.rows.table["stroke_id"].to_numpy()[out]
-
-        def kept(rows: Rows) -> Rows:
-            return rows.subset(~rows.table["stroke_id"].isin(gone).to_numpy())
-
-        fine, seen = None, own.samples.head(0)
-        if self.rounds:  # not needed without a search
-            fine = kept(part.rows) if part.coarse is not part.rows else None
-            seen = own.samples[~own.samples["stroke_id"].isin(gone)]
-        every = None if part.whole else kept(part.every)
-        test = own.rows.subset(out)
-        quiet = replace(own.context, say=silent, compare=False, workers=1)
-        return _Fold(kept(part.coarse), fine, every, seen, test, quiet, self.start, self.rounds)
-
-
-@dataclass(frozen=True)
-class _Prediction:
-    """Forces at the rows that a fold holds out, shape (n,) each, and the model after."""
-
-    before: np.ndarray
-    after: np.ndarray
-    determined: np.ndarray  # whether the other rows determine both forces
-    model: Model
-
-
-def _held_out(fold: _Fold) -> _Prediction:
-    """Return the forces before and after at a fold's rows; without a search they are equal."""
-    if fold.rounds:
-        part = select_effects(
-            fold.train, fold.seen, fold.context, fine=fold.fine, start=fold.start, rounds=fold.rounds
-        )
-        before, after = part.before, part.after
-    else:
-        before = after = fit(fold.start.model, fold.train, fold.start.scatter, turns=1)
-
-    def on_every(fitted: Fitted) -> Fitted:
-        return fitted if fold.every is None else fit(fitted.model, fold.every, fitted.scatter, turns=0)
-
-    def predicted(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
-        own = on_every(fitted)
-        force, tangent = evaluate(own.model, fold.test)
-        scatter = np.sqrt(own.rows.weight @ own.residual**2)
-        return force, mean_se(tangent, own.covariance) < DETERMINED * scatter
-
-    first, determined = predicted(before)
-    second, also = (first, determined) if after is before else predicted(after)
-    return _Prediction(first, second, determined & also, after.model)
 
 
 def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
