@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -27,7 +27,6 @@ from sealfit.closure.search import (
     search_masked_pairs,
     search_pairs,
 )
-from sealfit.effects.contract import Effect
 from sealfit.fit.joint import Fitted, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.rows import ALONG, Rows
@@ -136,6 +135,12 @@ class _Loop:
         """Return every candidate of a single channel on the current model."""
         return tuple(search(self.tests, list(self.channels.values()), self.rng))
 
+    def propose(
+        self, base: Fitted, candidates: Sequence[Candidate], also: Sequence[Proposal] = ()
+    ) -> list[Proposal]:
+        """Return refitted proposals for some candidates, best first."""
+        return propose(base, candidates, self.channels, self.context.effects, also)
+
     def confirm(
         self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
     ) -> AcceptedEffect | None:
@@ -148,7 +153,12 @@ class _Loop:
             self.tests, self.found = ScoreTests(self.fitted), None
             self.last = self.search_single()
         if self.found is None:  # else the last round added nothing
-            self.found = self.search_model(number)
+            found = self.found = self.search_model()
+            self.context.say(
+                f"round {number}: {len(self.last)} candidates on {len(self.channels)} channels, "
+                f"{len(found.pairs)} on pairs of them; {len(found.significant)} significant, "
+                f"{len(found.masked)} mask each other"
+            )
             if self.add_pair_of_direction(number):
                 return False
         open_ = self.open_candidates()
@@ -156,7 +166,7 @@ class _Loop:
             return not self.rename_earlier()
         claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
         open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
-        proposals = propose(self.fitted, open_, self.channels, self.context.effects, laws)
+        proposals = self.propose(self.fitted, open_, laws)
         failed: list[RefusedEffect] = []
         accepted = self.confirm(self.fitted, proposals, number, failed)
         self.unconfirmed += failed
@@ -175,18 +185,23 @@ class _Loop:
                 self.refused |= _no_stronger(open_, accepted.proposal) | {accepted.proposal.source}
         return False
 
-    def search_model(self, number: int) -> _SearchResult:
+    def search_model(self) -> _SearchResult:
         """Return the result of all searches on the current model."""
-        found = _search_all(self.tests, self.last, self.channels, self.context.effects, self.alpha, self.rng)
-        tried = (
-            f"{len(self.last)} candidates on {len(self.channels)} channels, "
-            f"{len(found.pairs)} on pairs of them"
-        )
-        self.context.say(
-            f"round {number}: {tried}; {len(found.significant)} significant, "
-            f"{len(found.masked)} mask each other"
-        )
-        return found
+        inconsistent = _inconsistent_channels(self.last, self.alpha)
+        claimable = _claimable(self.last, inconsistent)
+        significant = [c for c in claimable if c.p_value <= self.alpha]
+        aged = not significant or any(c.channels == (AGING,) for c in significant)
+        laws = richer_laws(self.fitted, self.channels, self.context.effects) if aged else []
+        if significant and significant[0].p_value <= PAIRS_FROM_P:
+            return _SearchResult(claimable, laws, [], significant, [])
+        pairs = search_pairs(self.tests, list(self.channels.values()), self.last, self.rng)
+        pairs = _claimable(pairs, inconsistent)
+        level = self.alpha * min((c.p_value for c in significant), default=1.0)
+        significant += [c for c in pairs if c.p_value <= level]
+        significant = sorted(significant, key=lambda c: c.p_value)
+        level = self.alpha * min((c.p_value for c in significant), default=1.0)
+        masked = search_masked_pairs(self.tests, self.channels, [*claimable, *pairs], level)
+        return _SearchResult(claimable, laws, pairs, significant, masked)
 
     def add_pair_of_direction(self, number: int) -> bool:
         """Add two effects of the direction that mask each other; return whether that was done."""
@@ -196,9 +211,7 @@ class _Loop:
         if self.masked or two is None:
             return False
         pending = _pending_candidates([two], self.found.claimable)
-        both = _confirmed_pair(
-            self.fitted, pending, self.channels, self.context.effects, self.confirm, number
-        )
+        both = self.confirmed_pair(pending, number) if len(pending) == 2 else None
         if both:
             later, earlier = both
             own = earlier.proposal.fitted
@@ -206,6 +219,20 @@ class _Loop:
             self.added = [*self.added, later]
             self.add(earlier)
         return bool(both)
+
+    def confirmed_pair(
+        self, two: Sequence[Candidate], number: int
+    ) -> tuple[AcceptedEffect, AcceptedEffect] | None:
+        """Return two effects of which each is confirmed given the other; None if they are not."""
+        first, second = two
+        base = self.propose(self.fitted, [first])[0].fitted
+        later = self.confirm(base, self.propose(base, [second]), number, [])
+        if later is None:
+            return None
+        alone = later.proposal.fitted.model.without_term(len(self.fitted.model.terms))
+        base = fit(alone, self.rows, self.fitted.scatter, turns=1)
+        earlier = self.confirm(base, self.propose(base, [first]), number, [])
+        return None if earlier is None else (later, earlier)
 
     def open_candidates(self) -> list[Candidate]:
         """Return the significant candidates not refused; if there are none, those of masked pairs."""
@@ -263,61 +290,13 @@ class _Loop:
         tested = (*self.last, *(c for c, _ in laws))
         unclaimable = [c for c in tested if c.p_value <= self.alpha and not c.claimable]
         if left is None and unclaimable:
-            proposals = propose(
-                self.fitted, unclaimable, self.channels, self.context.effects, [p for _, p in laws]
-            )
+            proposals = self.propose(self.fitted, unclaimable, [p for _, p in laws])
             others = tuple(rivals(proposals[0], proposals))
             left = unclaimable[0]
             inconclusive = AcceptedEffect(
                 proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1
             )
         return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
-
-
-def _search_all(
-    tests: ScoreTests,
-    last: Sequence[Candidate],
-    channels: Mapping[str, Channel],
-    effects: Mapping[str, Effect],
-    alpha: float,
-    rng: np.random.Generator,
-) -> _SearchResult:
-    """Return the result of all searches on a model; `last` is that of single channels."""
-    inconsistent = _inconsistent_channels(last, alpha)
-    claimable = _claimable(last, inconsistent)
-    significant = [c for c in claimable if c.p_value <= alpha]
-    aged = not significant or any(c.channels == (AGING,) for c in significant)
-    laws = richer_laws(tests.fitted, channels, effects) if aged else []
-    if significant and significant[0].p_value <= PAIRS_FROM_P:
-        return _SearchResult(claimable, laws, [], significant, [])
-    pairs = _claimable(search_pairs(tests, list(channels.values()), last, rng), inconsistent)
-    level = alpha * min((c.p_value for c in significant), default=1.0)
-    significant = sorted([*significant, *(c for c in pairs if c.p_value <= level)], key=lambda c: c.p_value)
-    level = alpha * min((c.p_value for c in significant), default=1.0)
-    masked = search_masked_pairs(tests, channels, [*claimable, *pairs], level)
-    return _SearchResult(claimable, laws, pairs, significant, masked)
-
-
-def _confirmed_pair(
-    fitted: Fitted,
-    two: Sequence[Candidate],
-    channels: Mapping[str, Channel],
-    effects: Mapping[str, Effect],
-    confirm: Callable[..., AcceptedEffect | None],
-    number: int,
-) -> list[AcceptedEffect]:
-    """Return two effects of which each is confirmed given the other; an empty list if they are not."""
-    if len(two) < 2:
-        return []
-    first, second = two
-    base = propose(fitted, [first], channels, effects)[0].fitted
-    later = confirm(base, propose(base, [second], channels, effects), number, [])
-    if later is None:
-        return []
-    alone = later.proposal.fitted.model.without_term(len(fitted.model.terms))
-    base = fit(alone, fitted.rows, fitted.scatter, turns=1)
-    earlier = confirm(base, propose(base, [first], channels, effects), number, [])
-    return [] if earlier is None else [later, earlier]
 
 
 def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set[str]:
