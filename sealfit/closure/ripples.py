@@ -24,7 +24,7 @@ from sealfit.closure.spectrum import (
     background,
     effective_count,
     smooth_background,
-    spectra_of,
+    spectrum_of,
     tops,
 )
 from sealfit.fit.joint.model import passes
@@ -94,12 +94,16 @@ def find_ripple(
     peaks, locked = [], []
     if common_phase and samples["unit"].nunique() < LEAST_GROUPS_HELD_OUT:
         samples = samples.assign(unit=samples["stroke_id"])  # strokes are held out, too
-    if common_phase:
-        peaks += _long_waves(samples, [length for axis, length in known if axis == "displacement_mm"])
-    for spectrum in spectra_of(samples, AXES, known):
-        if common_phase and spectrum.axis == "displacement_mm":
+    for axis in AXES:
+        lengths = [length for own, length in known if own == axis]
+        if common_phase and axis == "displacement_mm":
+            peaks += _long_waves(samples, lengths)
+        spectrum = spectrum_of(samples, axis, lengths)
+        if spectrum is None:
+            continue
+        if common_phase and axis == "displacement_mm":
             peaks += _coherent(spectrum)
-        elif spectrum.axis == "time_s":  # a wave may be locked to the start of the strokes
+        elif axis == "time_s":  # a wave may be locked to the start of the strokes
             locked = _coherent(spectrum)
         peaks.append(_incoherent(spectrum))
     if not peaks:

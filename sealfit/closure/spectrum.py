@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -176,10 +176,8 @@ class Spectrum:
     taken: np.ndarray  # (f,) whether it lies in the main lobe of a component in the model
 
 
-def spectra_of(
-    samples: pd.DataFrame, axes: Sequence[str], known: Sequence[tuple[str, float]] = ()
-) -> Iterator[Spectrum]:
-    """Yield the spectra along some axes, without those with too few strokes or frequencies.
+def spectrum_of(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -> Spectrum | None:
+    """Return the spectrum along an axis; None with too few strokes or frequencies.
 
     A parabola is subtracted from each stroke, which is then tapered (Hann) and transformed on a grid that
     divides twice the longest stroke. All strokes have the same frequencies then. The longest wavelength is
@@ -189,15 +187,27 @@ def spectra_of(
     ----------
     samples : DataFrame
         As for `sealfit.closure.ripples.find_ripple`.
-    axes : sequence of str
-        Columns along which to search.
-    known : sequence of (axis, wavelength)
-        Components in the model.
+    axis : str
+        Column along which to search.
+    known : sequence of float
+        Wavelengths of the components in the model along this axis.
     """
-    for axis in axes:
-        grid = _Grid.of(Strokes.of(samples, axis))
-        if grid is not None:
-            yield _spectrum(grid, axis, [wavelength for own, wavelength in known if own == axis])
+    grid = _Grid.of(Strokes.of(samples, axis))
+    if grid is None:
+        return None
+    sums = _Sums.none(grid.numbers.size, min(np.unique(grid.strokes.direction).size, 2))
+    for chosen in _parts(grid.strokes.unit, grid.points):
+        _add(sums, grid, chosen)
+    frequency, count = grid.numbers / grid.longest, np.maximum(sums.count, 1)
+    taken = np.zeros(frequency.size, dtype=bool)
+    for wavelength in known:
+        taken |= np.abs(frequency - 1 / wavelength) <= LOBE / grid.longest
+    common = tuple(
+        Common(k == 0, sums.total[k], sums.scaled[k], int(units), sums.amplitude[k] / count)
+        for k, units in enumerate(sums.units)
+    )
+    amplitude = np.sqrt(sums.square / count)
+    return Spectrum(axis, frequency, sums.count, sums.power / count, amplitude, common, taken)
 
 
 @dataclass(frozen=True)
@@ -263,17 +273,13 @@ class _Sums:
         total, amplitude = np.zeros((modes, f), dtype=complex), np.zeros((modes, f), dtype=complex)
         return cls(*np.zeros((3, f)), total, np.zeros((modes, f)), np.zeros(modes), amplitude)
 
-    def __add__(self, other: _Sums) -> _Sums:
-        return _Sums(*(getattr(self, part.name) + getattr(other, part.name) for part in fields(self)))
 
-
-def _sums_of(grid: _Grid, chosen: np.ndarray) -> _Sums:
-    """Return the sums over the chosen strokes, which are those of whole units."""
+def _add(sums: _Sums, grid: _Grid, chosen: np.ndarray) -> None:
+    """Add the chosen strokes, which are those of whole units, to the sums."""
     direction, reach = grid.strokes.direction[chosen], grid.reach[chosen]
     sides, width = np.unique(grid.strokes.direction), int(reach.max())
-    sums = _Sums.none(grid.numbers.size, min(sides.size, 2))
     if not width:  # the strokes reach none of the frequencies
-        return sums
+        return
     units, unit = np.unique(grid.strokes.unit[chosen], return_inverse=True)
     passes = unit * sides.size + np.searchsorted(sides, direction)
     each = np.arange(unit.size)
@@ -283,9 +289,9 @@ def _sums_of(grid: _Grid, chosen: np.ndarray) -> _Sums:
     wave, known = (part.reshape(units.size, sides.size, width) for part in (wave, known > 0))
     power = _power(wave)
     mean = power.sum(axis=2) / np.maximum(known.sum(axis=2), 1)
-    sums.count[:width] = known.sum(axis=(0, 1))
-    sums.square[:width] = power.sum(axis=(0, 1))
-    sums.power[:width] = (power / np.maximum(mean, 1e-300)[:, :, None]).sum(axis=(0, 1))
+    sums.count[:width] += known.sum(axis=(0, 1))
+    sums.square[:width] += power.sum(axis=(0, 1))
+    sums.power[:width] += (power / np.maximum(mean, 1e-300)[:, :, None]).sum(axis=(0, 1))
     most = np.zeros(units.size, dtype=int)
     np.maximum.at(most, unit, reach)
     for k in range(sums.units.size):
@@ -293,11 +299,10 @@ def _sums_of(grid: _Grid, chosen: np.ndarray) -> _Sums:
         power = _power(own)
         square = _medians(power, most)  # units are scaled, so that one noisy file does not dominate
         kept = square > 0
-        sums.total[k, :width] = (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
-        sums.scaled[k, :width] = (power[kept] / square[kept, None]).sum(axis=0)
-        sums.units[k] = own.any(axis=1).sum()
-        sums.amplitude[k, :width] = own.sum(axis=0)
-    return sums
+        sums.total[k, :width] += (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
+        sums.scaled[k, :width] += (power[kept] / square[kept, None]).sum(axis=0)
+        sums.units[k] += own.any(axis=1).sum()
+        sums.amplitude[k, :width] += own.sum(axis=0)
 
 
 def _transformed(grid: _Grid, chosen: np.ndarray) -> np.ndarray:
@@ -335,19 +340,3 @@ def _medians(values: np.ndarray, count: np.ndarray) -> np.ndarray:
         same_size = count == size
         found[same_size] = np.median(values[same_size, :size], axis=1)
     return found
-
-
-def _spectrum(grid: _Grid, axis: str, known: Sequence[float]) -> Spectrum:
-    sums = _Sums.none(grid.numbers.size, min(np.unique(grid.strokes.direction).size, 2))
-    for chosen in _parts(grid.strokes.unit, grid.points):
-        sums = sums + _sums_of(grid, chosen)
-    frequency, count = grid.numbers / grid.longest, np.maximum(sums.count, 1)
-    taken = np.zeros(frequency.size, dtype=bool)
-    for wavelength in known:
-        taken |= np.abs(frequency - 1 / wavelength) <= LOBE / grid.longest
-    common = tuple(
-        Common(k == 0, sums.total[k], sums.scaled[k], int(units), sums.amplitude[k] / count)
-        for k, units in enumerate(sums.units)
-    )
-    amplitude = np.sqrt(sums.square / count)
-    return Spectrum(axis, frequency, sums.count, sums.power / count, amplitude, common, taken)

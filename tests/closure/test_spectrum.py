@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from sealfit.closure import spectrum
-from sealfit.closure.spectrum import spectra_of
+from sealfit.closure.spectrum import spectrum_of
 
 LENGTH_MM, A_N, PHASE = 2.5, 0.3, 0.8
 
@@ -35,10 +35,6 @@ def samples_of(strokes):
     return pd.concat(tables, ignore_index=True)
 
 
-def spectrum_along(samples, axis, known=()):
-    return next(spectra_of(samples, [axis], known), None)
-
-
 def many_strokes():
     rng = np.random.default_rng(3)
     return [
@@ -50,7 +46,7 @@ def many_strokes():
 
 
 def test_a_wave_keeps_its_amplitude_and_phase_whatever_the_sampling():
-    found = spectrum_along(samples_of(many_strokes()), "displacement_mm")
+    found = spectrum_of(samples_of(many_strokes()), "displacement_mm")
     both_ways = found.common[0]
     k = int(np.argmax(np.abs(both_ways.amplitude)))
     assert 1 / found.frequency[k] == pytest.approx(LENGTH_MM, rel=0.03)
@@ -65,9 +61,9 @@ def test_a_wave_keeps_its_amplitude_and_phase_whatever_the_sampling():
 
 def test_sums_do_not_depend_on_how_many_strokes_are_transformed_together(monkeypatch):
     samples = samples_of(many_strokes())
-    whole = spectrum_along(samples, "displacement_mm")
+    whole = spectrum_of(samples, "displacement_mm")
     monkeypatch.setattr(spectrum, "MOST_NUMBERS", 1)
-    one_by_one = spectrum_along(samples, "displacement_mm")
+    one_by_one = spectrum_of(samples, "displacement_mm")
     for name in ("frequency", "count", "power", "amplitude"):
         npt.assert_allclose(getattr(one_by_one, name), getattr(whole, name), rtol=1e-9, err_msg=name)
     for one, other in zip(one_by_one.common, whole.common, strict=True):
@@ -77,7 +73,7 @@ def test_sums_do_not_depend_on_how_many_strokes_are_transformed_together(monkeyp
 def test_frequencies_that_a_stroke_cannot_show_are_none_of_it():
     fine = [(unit, 1.0, 0.3 * unit, 0.05, 400) for unit in range(6)]
     coarse = [(unit, 1.0, 0.3 * unit, 0.5, 40) for unit in range(6, 10)]
-    found = spectrum_along(samples_of(fine + coarse), "displacement_mm")
+    found = spectrum_of(samples_of(fine + coarse), "displacement_mm")
     npt.assert_array_equal(
         found.count[found.frequency < 0.9], 10
     )  # below half the sampling rate of the coarse ones
@@ -89,23 +85,19 @@ def test_a_block_of_strokes_that_reach_no_frequency_adds_nothing(monkeypatch):
     fine = [(unit, 1.0, 0.3 * unit, 0.05, 400) for unit in range(12)]
     coarse = [(unit, 1.0, 0.3 * unit, 18.0, 17) for unit in range(12, 14)]
     short = [(unit, 1.0, 0.3 * unit, 0.05, 400) for unit in range(12, 14)]
-    found, without = (spectrum_along(samples_of(fine + more), "displacement_mm") for more in (coarse, short))
+    found, without = (spectrum_of(samples_of(fine + more), "displacement_mm") for more in (coarse, short))
     assert found.count.max() == 12
     assert without.count.max() == 14
 
 
 def test_strokes_too_few_or_too_short_have_no_spectrum():
-    assert (
-        spectrum_along(samples_of([(0, 1.0, 0.0, 0.05, 400), (1, 1.0, 0.0, 0.05, 400)]), "displacement_mm")
-        is None
-    )
-    assert spectrum_along(samples_of([(k, 1.0, 0.0, 0.5, 15) for k in range(5)]), "displacement_mm") is None
-    assert spectrum_along(samples_of([(0, 1.0, 0.0, 0.5, 15)]).head(0), "displacement_mm") is None
+    two = [(0, 1.0, 0.0, 0.05, 400), (1, 1.0, 0.0, 0.05, 400)]
+    assert spectrum_of(samples_of(two), "displacement_mm") is None
+    assert spectrum_of(samples_of([(k, 1.0, 0.0, 0.5, 15) for k in range(5)]), "displacement_mm") is None
+    assert spectrum_of(samples_of([(0, 1.0, 0.0, 0.5, 15)]).head(0), "displacement_mm") is None
 
 
 def test_what_is_in_the_model_already_is_taken():
-    found = spectrum_along(
-        samples_of(many_strokes()), "displacement_mm", [("displacement_mm", 5.1), ("time_s", 3.0)]
-    )
+    found = spectrum_of(samples_of(many_strokes()), "displacement_mm", [5.1])
     step = found.frequency[1] - found.frequency[0]
     npt.assert_array_equal(found.taken, np.abs(found.frequency - 1 / 5.1) <= 4 * step)
