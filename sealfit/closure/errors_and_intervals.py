@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -198,20 +198,15 @@ def _residual_of_model(
     return basis.project_out(own.project_out(size)), basis.shape[1] + own.count
 
 
-def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.DataFrame:
+def level_table(stage: str, fitted: Fitted, candidates: Sequence[Candidate]) -> pd.DataFrame:
     """Return the residual's variance by level and, within the levels, by channel (table `levels`)."""
     rows, force = fitted.rows, fitted.force
-    parts = {"sample": float(rows.weight @ fitted.scatter.noise_sd(force) ** 2)}
-    df = {"sample": float(force.size - rows.groups.starts["stroke"].size)}
-    for level in LEVELS:
-        variance = float(rows.weight @ fitted.scatter.level_variance(level, force))
-        known = [c for c in fitted.scatter.components if c.level == level]
-        if known:
-            parts[level], df[level] = variance, known[0].df
-    total = sum(parts.values()) or 1.0
+    noise = float(rows.weight @ fitted.scatter.noise_sd(force) ** 2)
+    free = float(force.size - rows.groups.starts["stroke"].size)
+    parts = [("sample", noise, free), *_scatter_by_level(fitted)]
+    total = sum(variance for _, variance, _ in parts) or 1.0
     records = [
-        (stage, level, None, np.sqrt(variance), variance / total, df[level], None)
-        for level, variance in parts.items()
+        (stage, level, None, np.sqrt(variance), variance / total, df, None) for level, variance, df in parts
     ]
     best: dict[tuple, Candidate] = {}
     for candidate in candidates:
@@ -227,21 +222,27 @@ def level_table(stage: str, fitted: Fitted, candidates: list[Candidate]) -> pd.D
     return pd.DataFrame(records, columns=TABLE_OF_LEVELS.names())
 
 
+def _scatter_by_level(fitted: Fitted) -> Iterator[tuple[str, float, float]]:
+    """Yield each level that has a variance component, its mean variance and its degrees of freedom."""
+    for level in LEVELS:
+        df = next((c.df for c in fitted.scatter.components if c.level == level), None)
+        if df is not None:
+            yield level, float(fitted.rows.weight @ fitted.scatter.level_variance(level, fitted.force)), df
+
+
 def scatter_list(fitted: Fitted) -> list[dict]:
     """Return closure.json's `scatter`: per level the SD in force units, relative to the force, and its df."""
-    force = fitted.force
-    mean_square = float(fitted.rows.weight @ force**2)
-    result = []
-    for level in LEVELS:
-        known = [c for c in fitted.scatter.components if c.level == level]
-        if not known:
-            continue
-        variance = float(fitted.rows.weight @ fitted.scatter.level_variance(level, force))
-        if variance <= 0:
-            continue
-        sds = {"sd_rel": float(np.sqrt(variance / mean_square)), "sd_N": float(np.sqrt(variance))}
-        result.append({"level": level, **sds, "df": known[0].df})
-    return result
+    mean_square = float(fitted.rows.weight @ fitted.force**2)
+    return [
+        {
+            "level": level,
+            "sd_rel": float(np.sqrt(variance / mean_square)),
+            "sd_N": float(np.sqrt(variance)),
+            "df": df,
+        }
+        for level, variance, df in _scatter_by_level(fitted)
+        if variance > 0
+    ]
 
 
 # ---------------------------------------------------------------- intervals
