@@ -67,28 +67,14 @@ def at_reference(model: Model, config: Config) -> Model:
 def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.DataFrame:
     """Return table `steady_after`: the strokes' mean forces with the effects removed at their reference.
 
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady`.
-    after : Fitted
-        The after-model, fitted to all bins.
-    config : Config
-        Condition columns.
+    It is table `steady` with `force_N` less `effects_N`, the effects' mean over the steady window;
+    `effects_start_N`, their force at the start of the stroke; and columns `effects_u1_N`, ...: the change of
+    the force in the direction of motion for one standard error along each principal direction of the effects'
+    covariance. A stroke without bins is not used.
 
-    Returns
-    -------
-    DataFrame
-        `steady` with `force_N` less `effects_N`, the effects' mean over the steady window; `effects_start_N`,
-        their force at the start of the stroke; and columns `effects_u1_N`, ...: the change of the force in
-        the direction of motion for one standard error along each principal direction of the effects'
-        covariance. A stroke without bins is not used.
-
-    Notes
-    -----
-    The effects' covariance is that of the joint fit. In a linear model, a fit to the corrected forces, with
-    this covariance propagated through it, gives the estimate and the covariance of the joint fit (Frisch &
-    Waugh 1933, Econometrica 1(4), 387-401, doi:10.2307/1907330).
+    The effects' covariance is that of the joint fit to all bins, `after`. In a linear model, a fit to the
+    corrected forces, with this covariance propagated through it, gives the estimate and the covariance of the
+    joint fit (Frisch & Waugh 1933, Econometrica 1(4), 387-401, doi:10.2307/1907330).
     """
     model, rows = after.model, after.rows
     force, tangent = evaluate(model, rows)
@@ -153,17 +139,7 @@ WIDEST = 700.0  # Largest logarithm.
 def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return tables `aging_fit_after` and `aging_curves_after`; empty without aging.
 
-    Parameters
-    ----------
-    after : Fitted
-        The after-model, fitted to all bins.
-    steady_fit : DataFrame
-        Table `steady_fit_after`: the values of single conditions, which the laws are compared with.
-    config : Config
-        Condition columns and units.
-
-    Notes
-    -----
+    The laws are compared with the values of single conditions in `steady_fit`, table `steady_fit_after`.
     mu_0, a and b and their standard errors are those of the joint fit. Their intervals use Student's t with
     the number of specimens less the parameters of one coefficient; that of b is symmetric in its logarithm.
     Effects that are part of the condition (such as days) multiply or change the law; the curves include them.
@@ -349,24 +325,10 @@ def after_fits(
 ) -> dict[str, pd.DataFrame]:
     """Return the tables `*_after` by name; they have no rows if no effect was added.
 
-    Parameters
-    ----------
-    after : Fitted
-        The after-model, fitted to all bins.
-    steady : DataFrame
-        Table `steady`.
-    traces : DataFrame or sequence of StoredTraces
-        Table `traces`, or where it is stored.
-    config : Config
-        The rig.
-    workers : int
-        Processes.
-
-    Notes
-    -----
-    The laws of single series are those of the joint fit. Single conditions are fitted to the strokes' forces
-    without the effects, and the effects' covariance is propagated through these fits. The laws for all
-    series, the pre-sliding fits and the break-away forces follow from them.
+    `after` is the after-model, fitted to all bins; `steady` and `traces` are these tables, or where `traces`
+    is stored. The laws of single series are those of the joint fit. Single conditions are fitted to the
+    strokes' forces without the effects, and the effects' covariance is propagated through these fits. The
+    laws for all series, the pre-sliding fits and the break-away forces follow from them.
     """
     if not after.model.terms:
         return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}

@@ -94,19 +94,8 @@ def find_channels(
 ) -> list[Channel]:
     """Return every channel of the rows that varies and is not a grouping or a text with hundreds of values.
 
-    Columns of the condition are kept even if they are groupings: an offset between directions may differ
-    between conditions.
-
-    Parameters
-    ----------
-    rows : Rows
-        The rows.
-    ignore : iterable of str
-        Names that are left out.
-    conditions : iterable of str
-        Columns that make a condition.
-    rig_position : bool
-        Whether displacement means the same place in every file.
+    Columns of the condition, `conditions`, are kept even if they are groupings: an offset between directions
+    may differ between conditions. With `rig_position`, displacement means the same place in every file.
     """
     conditions = set(conditions)
     skip = set(ignore) | (set() if rig_position else {"displacement_mm"})

@@ -172,16 +172,8 @@ def _residual_of_model(
 ) -> tuple[np.ndarray, int]:
     """Return the residual of one number per run left by model and specimens, and their rank.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The model; its tangent at a file is the mean over the file's rows.
-    force : ndarray, shape (files,)
-        The model's mean force at each file of a run.
-    size, factor : ndarray, shape (runs,)
-        The numbers, and the factor on a file's tangent.
-    chosen : ndarray, shape (runs,)
-        Index of a file of each run.
+    The numbers are `size`, shape (runs,), `chosen` is a file of each run, and `factor` that on its tangent,
+    which is the mean over the file's rows. `force` is the model's mean force at each file, shape (files,).
     """
     rows = fitted.rows
     number = rows.table.groupby(["run_id", rows.codes("file")], sort=False).ngroup().to_numpy()
@@ -362,19 +354,9 @@ def mean_half_width(
 ) -> np.ndarray:
     """Return half the 95 % interval of the model's force, shape (n,): the largest of several.
 
-    One uses the variance components. The others are sandwiches of whole groups, each with Satterthwaite's
-    degrees of freedom at this point. They are not used where one group alone determines the force.
-
-    Parameters
-    ----------
-    tangent : Tangent, shape (n, p)
-        Tangent of the model at the points.
-    covariance : ndarray, shape (p, p)
-        Covariance by the variance components.
-    df : float
-        Its degrees of freedom.
-    others : sequence of Sandwich
-        Sandwich covariances of whole groups.
+    One uses the covariance by the variance components, shape (p, p), with `df` degrees of freedom. The others
+    are sandwiches of whole groups, each with Satterthwaite's degrees of freedom at this point. They are not
+    used where one group alone determines the force. The tangent at the points has shape (n, p).
     """
     half = t_quantile(df) * mean_se(tangent, covariance)
     for covariance_of_groups, information in others:

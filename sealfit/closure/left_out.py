@@ -239,14 +239,7 @@ def _edge(rows: Rows, condition: int) -> bool:
 def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.ndarray:
     """Return which held-out rows are covered by the other rows, shape (n,); the rest are extrapolated.
 
-    Parameters
-    ----------
-    rows : Rows
-        All rows.
-    out : ndarray of bool, shape (n,)
-        Which are held out.
-    channels : iterable of str
-        Channels of the effects in the model.
+    `out`, shape (n,), is true where rows are held out; `channels` are those of the effects in the model.
     """
     inside = out.copy()
     series = rows.conditions["series"].to_numpy()[rows.condition]

@@ -56,20 +56,10 @@ def close_loop(
     workers: int = 1,
     on_progress: Callable[[str], None] | None = None,
 ) -> Closure:
-    """Return the closed loop of one campaign.
+    """Return the closed loop of one campaign, from its tables `bins` and `traces`.
 
-    Parameters
-    ----------
-    bins : DataFrame
-        Table `bins`.
-    traces : DataFrame or sequence of StoredTraces
-        Table `traces`, the raw samples, or where it is stored.
-    config : Config
-        The rig.
-    workers : int
-        Processes for the folds.
-    on_progress : callable, optional
-        Called with a line on what is being done.
+    `traces` may also be where that table is stored. The folds are searched in `workers` processes, and
+    `on_progress` is called with a line on what is being done.
     """
     say = on_progress or silent
     effects = dict(EFFECTS)

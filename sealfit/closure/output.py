@@ -125,14 +125,9 @@ def _speeds(rows: Rows) -> dict[str, list[float]]:
 
 
 def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[Model, Model, pd.DataFrame]:
-    """Return the models before and after and the table of conditions from a record.
+    """Return the models before and after and the table of conditions from a record as of `to_record`.
 
-    Parameters
-    ----------
-    record : dict
-        As returned by `to_record`; none of it is executed.
-    own : mapping of str to Effect, optional
-        The user's own effects, by id.
+    None of the record is executed. `own` are the user's own effects, by id.
 
     Raises
     ------

@@ -34,14 +34,9 @@ class Ripples:
         self.found = self._find()  # significant, not in the model yet
 
     def added_to(self, fitted: Fitted, fine: Rows | None) -> Fitted:
-        """Return a fit with every ripple that is significant and confirmed on held-out data.
+        """Return a fit of the declared model with every ripple that is significant and confirmed.
 
-        Parameters
-        ----------
-        fitted : Fitted
-            The declared model.
-        fine : Rows, optional
-            Rows to fit ripples to; they are then fixed on the rows of `fitted`.
+        If there are `fine` rows, ripples are fitted to them, and fixed on the rows of `fitted`.
         """
         if self.found is None:
             return fitted
@@ -127,19 +122,9 @@ def steady_samples(
     The turns of a rotation are joined, since a wave of one period per stroke is hard to distinguish from a
     slow change: the displacement goes on past the turn, and they have the `stroke_id` of the first.
 
-    Parameters
-    ----------
-    traces : DataFrame or sequence of StoredTraces
-        Table `traces`, its samples ordered by stroke; or where it is stored, to be read part by part.
-    rows : Rows
-        Rows made from `numbered` bins.
-    turn : float, optional
-        Displacement of one turn, where strokes are turns (`[strokes] turn`).
-
-    Returns
-    -------
-    DataFrame
-        stroke_id, stroke, direction, unit (number of the file), displacement_mm, time_s, force_N.
+    `traces` is that table, its samples ordered by stroke, or where it is stored, to be read part by part.
+    `rows` are made from `numbered` bins. `turn` is the displacement of one turn, where strokes are turns
+    (`[strokes] turn`). The columns are stroke_id, stroke, direction, unit (number of the file) and `SAMPLED`.
     """
     first = rows.groups.starts["stroke"]
     strokes = rows.table.iloc[first]

@@ -82,14 +82,10 @@ def find_ripple(
 ) -> Peak | None:
     """Return the strongest periodic component of the samples' residual, or None if none can be tested.
 
-    Parameters
-    ----------
-    samples : DataFrame
-        Steady samples, ordered by stroke: stroke_id, direction, unit, the axes, `residual_N`.
-    common_phase : bool
-        Whether displacement means the same place in every file (`position_origin = "rig"`).
-    known : sequence of (axis, wavelength)
-        Components in the model. Near them the residual contains their scatter between files.
+    The samples are steady and ordered by stroke: stroke_id, direction, unit, the axes, `residual_N`. With
+    `common_phase`, displacement means the same place in every file (`position_origin = "rig"`). `known` are
+    axis and wavelength of the components in the model. Near them the residual contains their scatter between
+    files.
     """
     peaks, locked = [], []
     if common_phase and samples["unit"].nunique() < LEAST_GROUPS_HELD_OUT:
@@ -322,16 +318,9 @@ class Waves:
 
 
 def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
-    """Return the wave of each pass at m wavelengths.
+    """Return the wave of each pass at m wavelengths, `lengths` in the unit of the axis, shape (m,).
 
-    Parameters
-    ----------
-    samples : DataFrame
-        Samples ordered by stroke: stroke_id, unit, direction, the axis, `residual_N`.
-    lengths : ndarray, shape (m,)
-        Wavelengths in the unit of the axis.
-    axis : str
-        Column along which the wave runs.
+    The samples are those of `find_ripple`; the wave runs along their column `axis`.
     """
     strokes = Strokes.of(samples, axis)
     count = strokes.size.size
@@ -401,18 +390,8 @@ def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis:
     """Return per file the scalar product of the amplitudes of its two halves, shape (files,).
 
     Without a wave the phases of the halves are independent, and both signs are equally likely. With too few
-    files for a sign test the products are per pass (a file in one direction).
-
-    Parameters
-    ----------
-    samples : DataFrame
-        As for `waves_of`.
-    first : ndarray of bool, shape (n,)
-        Whether a sample belongs to the first half.
-    wavelength : float
-        In the unit of the axis.
-    axis : str
-        Column along which the wave runs.
+    files for a sign test the products are per pass (a file in one direction). `first`, shape (n,), is true
+    for the samples of the first half.
     """
     one, other = (waves_of(samples[mask], np.array([wavelength]), axis) for mask in (first, ~first))
     whole = [np.rec.fromarrays([part.unit, part.direction]) for part in (one, other)]

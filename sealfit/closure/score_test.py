@@ -183,18 +183,10 @@ class ScoreTests:
     def __call__(
         self, variants: Sequence[np.ndarray], between: str, level: str, target: tuple[str, str]
     ) -> ScoreTestResult | None:
-        """Return the weakest test of all variants of some columns; None if one of them cannot be tested.
+        """Return the weakest test of all `variants` of some columns; None if one of them cannot be tested.
 
-        Parameters
-        ----------
-        variants : sequence of ndarray, shape (n, k)
-            Columns as returned by `variants`.
-        between : str
-            Level of the units whose slopes along the columns may scatter.
-        level : str
-            Level of the units of evidence.
-        target : tuple of str
-            (acts_on, operation) of the columns.
+        `between` is the level of the units whose slopes along the columns may scatter, `level` that of the
+        units of evidence.
         """
         starts = self.fitted.rows.groups.starts
         few_units = starts[between].size < JACKKNIFE_UNITS

@@ -78,20 +78,9 @@ def select_effects(
 ) -> Selection:
     """Add effects until no channel explains the residual, and return the result.
 
-    Parameters
-    ----------
-    rows : Rows
-        Bins as arrays, merged along their strokes if there are many.
-    samples : DataFrame
-        Steady samples for the ripple search: as `steady_samples` gives them.
-    context : Context
-        Error rate, rounds, folds, and the catalogue.
-    fine : Rows, optional
-        Bins that are not merged, to which ripples are fitted; they are then fixed.
-    start : Start, optional
-        Start of the fit of the declared model, which then needs no search.
-    rounds : int, optional
-        Rounds after which the search of a fold ends. What is left is not determined then.
+    The rows are merged along their strokes if there are many; ripples are then fitted to the `fine` ones, and
+    fixed. The samples are those of `steady_samples`. From a `start` the declared model needs no search. The
+    search of a fold ends after `rounds`; what is left is not determined then.
     """
     loop = _Loop(rows, samples, context, fine, start)
     last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds

@@ -72,25 +72,13 @@ LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "
 
 
 def sensitivity(selection: Selection, alpha: float) -> list[dict]:
-    """Return an entry per variable and level.
+    """Return an entry per variable and level, at the family-wise level `alpha` of the search.
 
     Its keys are variable, level, acts_on, smallest_N, smallest_pct and files_needed. A variable that varies
-    at several levels has an entry for each, for an effect at that level only.
-
-    Parameters
-    ----------
-    selection : Selection
-        The result of the loop, with the candidates of its last search.
-    alpha : float
-        Family-wise level of the search.
-
-    Returns
-    -------
-    list of dict
-        `smallest_N` is the RMS over all rows of the smallest effect that is found with a power of 80 %,
-        `smallest_pct` the same in percent of the RMS force; None if the variable cannot be tested in this
-        campaign. `files_needed` is the number of files, made like these, that would show an effect of 1 % of
-        the force.
+    at several levels has an entry for each, for an effect at that level only. `smallest_N` is the RMS over
+    all rows of the smallest effect that is found with a power of 80 %, `smallest_pct` the same in percent of
+    the RMS force; None if the variable cannot be tested in this campaign. `files_needed` is the number of
+    files, made like these, that would show an effect of 1 % of the force.
     """
     fitted = selection.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))

@@ -80,16 +80,9 @@ class Prior(NamedTuple):
 
 
 def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest | None:
-    """Return the contrasts of projected columns, one by one; None with too few units.
+    """Return the contrasts of projected columns, one by one, in units of a level; None with too few.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The current model at its optimum.
-    left : ndarray, shape (n, k)
-        Columns of the force, whitened and projected; columns of zeros are ignored.
-    level : str
-        Level of the units.
+    The columns of the force, shape (n, k), are whitened and projected; columns of zeros are ignored.
     """
     groups = fitted.rows.groups
     if groups.starts[level].size < LEAST_UNITS_OF_SLOPES:
@@ -316,14 +309,8 @@ class Root:
     r"""Inverse root of the covariance 1 - T T' of many units' numbers.
 
     With :math:`T^T T = V S^2 V^T` it is :math:`1 + T V [(1 - S^2)^{-1/2} - 1] S^{-2} V^T T^T`, without the
-    directions that the model determines. All matrices have the size of the model.
-
-    Parameters
-    ----------
-    taken : Tangent, shape (units, p)
-        T; 0 where `moved` is false.
-    moved : ndarray of bool, shape (units,)
-        Which units the quantity changes.
+    directions that the model determines. All matrices have the size of the model. T is `taken`, shape
+    (units, p), 0 for the units that the quantity does not change: those not `moved`, shape (units,).
     """
 
     def __init__(self, taken: Tangent, moved: np.ndarray) -> None:

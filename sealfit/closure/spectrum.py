@@ -181,16 +181,8 @@ def spectrum_of(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -
 
     A parabola is subtracted from each stroke, which is then tapered (Hann) and transformed on a grid that
     divides twice the longest stroke. All strokes have the same frequencies then. The longest wavelength is
-    half the median stroke.
-
-    Parameters
-    ----------
-    samples : DataFrame
-        As for `sealfit.closure.ripples.find_ripple`.
-    axis : str
-        Column along which to search.
-    known : sequence of float
-        Wavelengths of the components in the model along this axis.
+    half the median stroke. The samples are those of `sealfit.closure.ripples.find_ripple`, and `known` the
+    wavelengths of the components in the model along this axis.
     """
     grid = _Grid.of(Strokes.of(samples, axis))
     if grid is None:
