@@ -106,7 +106,7 @@ def predict(
         If the points cannot be read, lack a column that the model needs, the answers cannot be written, or
         the model needs the user's own effects and no folder of them is given.
     """
-    from sealfit.closure.prediction_csv import read_points, write_answers
+    from sealfit.closure.prediction_csv import points_of, read_points, write_answers
 
     store = Store.open(existing_out(out), effects_folder)
     for warning in store.warnings:
@@ -114,12 +114,12 @@ def predict(
     store.require("close-loop")
     asked = read_points(points)
     try:
-        answers = answers_to(asked.values, store)
+        answers = answers_to(points_of(asked), store)
     except RequestError as error:
         place = {"file": points, "line": 1} if error.column else {}
         raise RequestError(error.message, column=error.column, fix=error.fix, **place) from error
     effects = [one["label"] for one in store.read_json("closure")["effects"] if not one["candidate"]]
-    written = write_answers(asked, answers, output)
+    written = write_answers(asked, answers, output, given=points)
     return {"out": str(store.out), "output": str(output), **written, "includes": effects}
 
 

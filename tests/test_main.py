@@ -61,7 +61,7 @@ def test_what_is_written_holds_no_formula_and_all_numbers(tmp_path):
     asked.write_text("\n".join(rows) + "\n", "utf-8")
     points = read_points(asked)
     answers = pd.DataFrame({name: [0.0] * 3 for name in ANSWERS})
-    write_answers(points, answers, tmp_path / "answers.csv")
+    write_answers(points, answers, tmp_path / "answers.csv", given=asked)
     written = [line.split(",")[:3] for line in (tmp_path / "answers.csv").read_text("utf-8").splitlines()]
     assert written == [
         ["oil", "'=x", "speed_mm_s"],
@@ -81,7 +81,8 @@ def test_answers_are_on_the_disk_before_they_take_their_place(tmp_path, monkeypa
     calls, real = [], os.replace
     monkeypatch.setattr(os, "fsync", lambda handle: calls.append("fsync"))
     monkeypatch.setattr(os, "replace", lambda *paths: (calls.append("replace"), real(*paths)))
-    write_answers(read_points(asked), pd.DataFrame({name: [0.0] for name in ANSWERS}), output)
+    answers = pd.DataFrame({name: [0.0] for name in ANSWERS})
+    write_answers(read_points(asked), answers, output, given=asked)
     assert calls == ["fsync", "replace", "fsync"]  # the last is that of the folder
     assert output.read_text().startswith("speed_mm_s,force_before_N")
     assert output.read_text().endswith("0.0,0.0\n")

@@ -6,7 +6,6 @@ import csv
 import io
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
@@ -23,17 +22,8 @@ ANSWERS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Points:
-    """Rows as text, and with numbers in numeric columns."""
-
-    path: Path
-    text: pd.DataFrame
-    values: pd.DataFrame
-
-
-def read_points(path: Path) -> Points:
-    """Return the rows of a CSV of points (comma, UTF-8, one line of names).
+def read_points(path: Path) -> pd.DataFrame:
+    """Return the rows of a CSV of points (comma, UTF-8, one line of names) as text.
 
     Raises
     ------
@@ -62,7 +52,7 @@ def read_points(path: Path) -> Points:
     text = pd.DataFrame(rows, columns=names, dtype=object)
     if text.empty:
         raise RequestError("has no rows.", file=path, fix="Give one row per point.")
-    return Points(path, text, text.apply(_numbers))
+    return text
 
 
 def _filled(lines, path: Path) -> Iterator[list[str]]:
@@ -100,7 +90,7 @@ def _refuse_names(names: list[str], **place: object) -> None:
 
 
 def points_of(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the points of a DataFrame as `predict` takes them: those that a CSV of them would give.
+    """Return points as `predict` takes them: numbers in numeric columns, as a CSV of them would give.
 
     Raises
     ------
@@ -149,17 +139,18 @@ def _no_formula(cell: str) -> str:
     return cell
 
 
-def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
-    """Write the given rows and their predictions to `output`, completely or not at all; return the counts.
+def write_answers(points: pd.DataFrame, answers: pd.DataFrame, output: Path, *, given: Path) -> dict:
+    """Write the rows of file `given` and their predictions to `output`, completely or not at all.
 
-    The cells of the points are written unchanged, except those that a spreadsheet would take as a formula.
+    Return the counts. The cells of the points are written unchanged, except those that a spreadsheet would
+    take as a formula.
 
     Raises
     ------
     RequestError
         If `output` cannot be written or is the table of points itself.
     """
-    if output.exists() and output.resolve() == points.path.resolve():
+    if output.exists() and output.resolve() == given.resolve():
         raise RequestError(f"--output {output} is the table of points.", fix="Give another name.")
     if not output.absolute().parent.is_dir():
         raise RequestError(f"there is no folder {output.parent} for --output.", fix="Make it first.")
@@ -172,7 +163,7 @@ def write_answers(points: Points, answers: pd.DataFrame, output: Path) -> dict:
             fix="Give a name that ends in .csv.",
         )
     # `answers` has the same rows in the same order.
-    table = pd.concat([points.text.map(_no_formula), answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
+    table = pd.concat([points.map(_no_formula), answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     table.columns = [_no_formula(name) for name in table.columns]
     try:
         _replace(output, table.to_csv(index=False, lineterminator="\n").encode("utf-8"))

@@ -1,6 +1,6 @@
 import pytest
 
-from sealfit.closure.prediction_csv import read_points
+from sealfit.closure.prediction_csv import points_of, read_points
 from sealfit.errors import RequestError
 
 POINTS = "aging_days,speed_mm_s\n1,5\n4,5\n"
@@ -24,4 +24,4 @@ def test_points_that_cannot_be_read_are_refused_with_their_line(tmp_path, text, 
 
 def test_blank_lines_before_and_between_points_are_nothing(tmp_path):
     (tmp_path / "points.csv").write_text("\n" + POINTS.replace("\n4", "\n\n4"))
-    assert read_points(tmp_path / "points.csv").values["aging_days"].tolist() == [1, 4]
+    assert points_of(read_points(tmp_path / "points.csv"))["aging_days"].tolist() == [1, 4]

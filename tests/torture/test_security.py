@@ -206,11 +206,11 @@ def test_the_lock_is_not_written_through_a_link(tmp_path):
 
 def test_answers_are_not_written_through_a_link(tmp_path):
     (tmp_path / "mine").write_text("years")
-    (tmp_path / "points.csv").write_text("oil\n1\n")
+    (asked := tmp_path / "points.csv").write_text("oil\n1\n")
     answers = pd.DataFrame({name: [None] for name in ANSWERS}, dtype=object)
     (tmp_path / ".q.csv.part").symlink_to(tmp_path / "mine")
     (tmp_path / "q.csv").symlink_to(tmp_path / "mine")
-    write_answers(read_points(tmp_path / "points.csv"), answers, tmp_path / "q.csv")
+    write_answers(read_points(asked), answers, tmp_path / "q.csv", given=asked)
     assert (tmp_path / "mine").read_text() == "years"
     assert (tmp_path / "q.csv").read_text().startswith("oil,")
 
