@@ -113,7 +113,7 @@ def close_loop(
     document = closure_document(selection, models, heldout.level, config, effects, outliers)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their original order
     tables = {
-        "effects": effect_table([e for e in document["effects"] if not e["candidate"]], selection.added),
+        "effects": effect_table(document["effects"], selection.added),
         "residuals_before": _residual_table(bins, before, models.held_before),
         "residuals_after": _residual_table(bins, after, models.held_after),
         **drawn,

@@ -40,6 +40,7 @@ from sealfit.effects.contract import Effect, fill_unit
 from sealfit.fit.joint import Fitted, effective_df, fit
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import Rows
+from sealfit.tables import EFFECTS
 from sealfit.units import Units
 
 OFFSET = "zero_offset"
@@ -292,17 +293,11 @@ def parameter_unit(unit: str, term: Term, units: Units) -> str:
 
 
 def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd.DataFrame:
-    """Return the `effects` table: a row per parameter."""
-    names = [
-        "round", "id", "label", "channels", "acts_on", "operation", "form", "named",
-        "parameter", "value", "lo95", "hi95", "unit", "p_value",
-    ]  # fmt: skip
+    """Return the `effects` table from closure.json's `effects`: a row per parameter of an added effect."""
     records = [
         {
+            **entry,
             "round": item.round,
-            **{
-                key: entry[key] for key in ("id", "label", "acts_on", "operation", "form", "named", "p_value")
-            },
             "channels": " ".join(entry["channels"]),
             "parameter": p["name"],
             "value": p["value"],
@@ -310,10 +305,10 @@ def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd
             "hi95": p["ci95"][1],
             "unit": p["unit"],
         }
-        for item, entry in zip(added, entries, strict=True)
+        for item, entry in zip(added, entries, strict=False)  # a candidate comes last
         for p in entry["parameters"]
     ]
-    return pd.DataFrame(records, columns=names)
+    return pd.DataFrame(records, columns=EFFECTS.names())
 
 
 def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> dict:
