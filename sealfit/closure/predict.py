@@ -94,7 +94,7 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
     """Return the points with every column that the model reads: given, derived, or the only tested value."""
     ranges = model["ranges"]
     table = _with_derived(_with_unaged(points, config).assign(file=""), model)
-    needed = [*config.condition, *([] if not config.rubber else config.rubber)]
+    needed = [*config.condition, *config.rubber]
     if any(form != "constant" for form in after.declared.stribeck.values()) or "speed_mm_s" in points:
         needed.append("speed_mm_s")
     if model["has_load"]:
@@ -104,12 +104,8 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
         if name in table:
             continue
         tested = ranges.get(name)
-        if (
-            tested is not None
-            and len(tested) == 2
-            and tested[0] == tested[1]
-            and name not in config.condition
-        ):
+        one_value = tested is not None and len(tested) == 2 and tested[0] == tested[1]
+        if one_value and name not in config.condition:
             table[name] = tested[0]
             continue
         unit = config.units.of(name)

@@ -141,17 +141,13 @@ def _shape_candidates(
         # it is seen only as a difference between directions
         if unsigned and FINER[channel.unit] > FINER["stroke"]:
             names = ("direction", channel.name)
-            unit = min(unit, _direction_unit(rows), key=FINER.get)
+            unit = min(unit, unit_of(np.sign(rows.speed), rows), key=FINER.get)
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
         for part in parts:
             test_result = tests([v[:, part] for v in left], between, level, (acts_on, operation))
             if test_result is not None:
                 yield Candidate(names, acts_on, operation, level, own[:, part], test_result)
-
-
-def _direction_unit(rows: Rows) -> str:
-    return unit_of(np.sign(rows.speed), rows)
 
 
 def _declared(fitted: Fitted, acts_on: str) -> bool:

@@ -72,13 +72,6 @@ class ContrastTest(NamedTuple):
     consistent: np.ndarray  # (m,) whether two to four specimens have the same slope
 
 
-class Prior(NamedTuple):
-    """Prior variance of contrasts of one kind, and its degrees of freedom."""
-
-    variance: float
-    df: float
-
-
 def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest | None:
     """Return the contrasts of projected columns, one by one, in units of a level; None with too few.
 
@@ -201,8 +194,7 @@ def moderated(tests: Sequence[ContrastTest]) -> list[tuple[np.ndarray, np.ndarra
     priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
     found = []
     for test in tests:
-        own = [priors[test.level, bool(a)] for a in test.along]
-        known, variance = (np.array(part) for part in zip(*[(p.df, p.variance) for p in own], strict=True))
+        variance, known = np.array([priors[test.level, bool(a)] for a in test.along]).T
         df = test.df + known
         found.append(((known * variance + test.df * test.variance) / df, df))
     return found
@@ -214,8 +206,11 @@ def log_p_of_t(t: np.ndarray, df: np.ndarray) -> np.ndarray:
     return np.log(2) + np.where(df >= MOST_DF, log_ndtr(-np.abs(t)), tail)
 
 
-def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> Prior:
-    """Return the prior for contrasts of one kind, by moments of their log variances (Smyth 2004, 6.2)."""
+def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> tuple[float, float]:
+    """Return the prior variance of contrasts of one kind, and its degrees of freedom.
+
+    They follow from the moments of their log variances (Smyth 2004, 6.2).
+    """
     chosen = [(t, t.along == along) for t in tests if t.level == level]
     variance = np.concatenate([t.variance[own] for t, own in chosen])
     df = np.concatenate([t.df[own] for t, own in chosen])
@@ -224,7 +219,7 @@ def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> Prior:
     known = _degrees_of_freedom(spread)
     half = known / 2
     typical = float(np.exp(mean + (psi(half) - np.log(half) if known < MOST_DF else 0.0)))
-    return Prior(typical, min(known, (_independent_directions(deviations) - 1) * float(np.median(df))))
+    return typical, min(known, (_independent_directions(deviations) - 1) * float(np.median(df)))
 
 
 def _log_moments(variance: np.ndarray, df: np.ndarray) -> tuple[float, float]:
