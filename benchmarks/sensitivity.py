@@ -214,7 +214,7 @@ def outcome(selection: Selection, entry: dict, effect: np.ndarray) -> str:
     true = project(selection.before, effect[:, None])[:, 0]
     for item in selection.added:
         alike = abs(true @ item.proposal.column) / np.linalg.norm(true) / np.linalg.norm(item.proposal.column)
-        if alike > ALIKE or any(name in r.term.channels for r in item.rivals):
+        if alike > ALIKE or any(name in r.term.channels for r, _ in item.rivals):
             return "same"
     return (
         "shown"

@@ -37,6 +37,7 @@ from sealfit.fit.joint import Fitted, fit, with_reml_smoothness
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
 from sealfit.fit.joint.rows import ALONG, LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
+from sealfit.progress import Silent
 from sealfit.tables import CALENDAR
 
 LEAST_SETTINGS, MOST_SETTINGS = 3, 15
@@ -239,15 +240,15 @@ def _within_strokes(rows: Rows, force: np.ndarray) -> np.ndarray:
 class AcceptedEffect:
     """An accepted effect: the proposal, its gain on held-out data and the rivals these data do not exclude.
 
-    `left_N` is the RMSE on the held-out data with it, and `rivals_rmse_N` with each rival instead; NaN if not
-    computed. If the effect varies within files, runs or specimens, it is the RMSE about their means.
+    `left_N` is the RMSE on the held-out data with it, and the number beside each rival is that with the rival
+    instead; NaN if not computed. If the effect varies within files, runs or specimens, it is the RMSE about
+    their means.
     """
 
     proposal: Proposal
     gain_N: float
     left_N: float
-    rivals: tuple[Proposal, ...]
-    rivals_rmse_N: tuple[float, ...]
+    rivals: tuple[tuple[Proposal, float], ...]
     round: int
 
     @property
@@ -275,17 +276,13 @@ class RefusedEffect:
         return self.reason in NEGLIGIBLE
 
 
-def silent(text: str) -> None:
-    """Write no progress message."""
-
-
 @dataclass(frozen=True)
 class Context:
     """Settings of every round of the loop."""
 
     config: Config
     effects: Mapping[str, Effect]  # the catalogue, the user's own effects included
-    say: Callable[[str], None] = silent  # called with a line on what is being done
+    say: Callable[[str], None] = Silent().say  # called with a line on what is being done
     compare: bool = True  # whether the held-out error of rivals is computed too
     workers: int = 1  # processes for the folds
 
@@ -313,14 +310,12 @@ def confirmed(
         label = describe(proposal.term, fitted.rows)
         context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
-            others = rivals(proposal, proposals)
-            rmse = (
-                [heldout_gain(fitted, o, *folds_of).left_N for o in others[:MOST_RIVALS]]
-                if context.compare
-                else []
+            most = MOST_RIVALS if context.compare else 0
+            others = tuple(
+                (rival, heldout_gain(fitted, rival, *folds_of).left_N if k < most else np.nan)
+                for k, rival in enumerate(rivals(proposal, proposals))
             )
-            rmse += [np.nan] * (len(others) - len(rmse))
-            return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, tuple(others), tuple(rmse), number)
+            return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, others, number)
         if proposal.p_value <= config.loop.family_error:
             failed.append(RefusedEffect(proposal.term, proposal.p_value, reason))
     refused += failed[:1]

@@ -15,7 +15,6 @@ from sealfit.closure.confirm import (
     AcceptedEffect,
     Context,
     RefusedEffect,
-    silent,
     turns_negative,
     varies_within,
 )
@@ -35,7 +34,7 @@ from sealfit.fit.joint import Fitted, fit, fit_declared, fit_with_effects
 from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
 from sealfit.ingest.stored_parts import StoredTraces
-from sealfit.progress import timed
+from sealfit.progress import Silent, timed
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def close_loop(
     `traces` may also be where that table is stored. The folds are searched in `workers` processes, and
     `on_progress` is called with a line on what is being done.
     """
-    say = on_progress or silent
+    say = on_progress or Silent().say
     effects = dict(EFFECTS)
     if config.loop.effects_folder is not None:
         from sealfit.effects.user import load_user_effects
@@ -158,7 +157,7 @@ class _HeldOut:
 
     def __init__(self, rows: Rows, part: Subsample, samples: pd.DataFrame, context: Context) -> None:
         self.rows, self.part, self.samples, self.workers = rows, part, samples, context.workers
-        self.context = replace(context, say=silent, compare=False, workers=1)  # of the search in a fold
+        self.context = replace(context, say=Silent().say, compare=False, workers=1)  # of the search in a fold
         self.level = heldout_level(rows)
         loop = context.config.loop
         self.masks = list(folds(rows, self.level, loop.folds, loop.seed))

@@ -134,7 +134,7 @@ def next_runs(
     """
     wanted = [_run_to_repeat(one, config) for one in outliers]
     for item in selection.added:
-        for rival in item.rivals[:1]:
+        for rival, _ in item.rivals[:1]:
             chosen, own = item.proposal, item.proposal.fitted
             channels = (*chosen.term.channels, *rival.term.channels)
             found = largest_difference(own.model, rival.fitted.model, own.rows, channels, config)

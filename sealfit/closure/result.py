@@ -240,7 +240,7 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
                 "acts_on": rival.term.acts_on,
                 "heldout_rmse_N": _number(rmse),
             }
-            for rival, rmse in zip(item.rivals, item.rivals_rmse_N, strict=True)
+            for rival, rmse in item.rivals
         ],
     }
 

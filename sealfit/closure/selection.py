@@ -280,11 +280,9 @@ class _Loop:
         unclaimable = [c for c in tested if c.p_value <= self.alpha and not c.claimable]
         if left is None and unclaimable:
             proposals = self.propose(self.fitted, unclaimable, [p for _, p in laws])
-            others = tuple(rivals(proposals[0], proposals))
+            others = tuple((rival, np.nan) for rival in rivals(proposals[0], proposals))
             left = unclaimable[0]
-            inconclusive = AcceptedEffect(
-                proposals[0], np.nan, np.nan, others, (np.nan,) * len(others), len(added) + 1
-            )
+            inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, len(added) + 1)
         return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
 
 

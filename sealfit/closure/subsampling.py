@@ -175,21 +175,20 @@ def reselect_on_all(
             if others_of is _on_other_quantities:
                 left = [p.term.target for p in found if p.bic - found[0].bic < RIVAL_BIC]
                 number = next(k for k, a in enumerate(added) if a is item)
-                added[number] = item = _with_rivals(
-                    item, [r for r in _rivals(item) if r[0].term.target in left]
-                )
+                rivals = (r for r in _rivals(item) if r[0].term.target in left)
+                added[number] = item = replace(item, rivals=tuple(rivals))
     return replace(selection, added=tuple(added), after=after), whole
 
 
 def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
     """Return the first rivals of an effect."""
-    return [rival for rival in item.rivals[:MOST_RIVALS] if not _periodic(rival)]
+    return [rival for rival, _ in item.rivals[:MOST_RIVALS] if not _periodic(rival)]
 
 
 def _on_other_quantities(item: AcceptedEffect) -> list[Proposal]:
     """Return an effect on the targets of its rivals, with its own values as start."""
     term = item.proposal.term
-    targets = dict.fromkeys(rival.term.target for rival in item.rivals)
+    targets = dict.fromkeys(rival.term.target for rival, _ in item.rivals)
     return [
         replace(item.proposal, term=replace(term, acts_on=target[0], operation=target[1]))
         for target in targets
@@ -205,10 +204,10 @@ def _replaced(
     model = without.model.with_term(chosen.term, _values(chosen))
     chosen = replace(chosen, fitted=after.refitted(model))
     gain = heldout_gain(without, chosen, config.loop.folds, config.loop.seed, samples, {})
-    rest = [r for r in _rivals(item) if r[0].term is not chosen.term]
-    item = _with_rivals(item, [(item.proposal, item.left_N), *rest])
+    rest = (r for r in _rivals(item) if r[0].term is not chosen.term)
+    rivals = ((item.proposal, item.left_N), *rest)
     after = fit(chosen.fitted.model, after.rows, after.scatter, turns=2)
-    return replace(item, proposal=chosen, gain_N=gain.rmse_N, left_N=gain.left_N), after
+    return AcceptedEffect(chosen, gain.rmse_N, gain.left_N, rivals, item.round), after
 
 
 def _periodic(proposal: Proposal) -> bool:
@@ -217,12 +216,7 @@ def _periodic(proposal: Proposal) -> bool:
 
 def _rivals(item: AcceptedEffect) -> list[tuple[Proposal, float]]:
     """Return the rivals of an effect, without itself, and their RMSE."""
-    pairs = zip(item.rivals, item.rivals_rmse_N, strict=True)
-    return [(rival, rmse) for rival, rmse in pairs if rival.term.key() != item.proposal.term.key()]
-
-
-def _with_rivals(item: AcceptedEffect, rivals: list[tuple[Proposal, float]]) -> AcceptedEffect:
-    return replace(item, rivals=tuple(r for r, _ in rivals), rivals_rmse_N=tuple(rmse for _, rmse in rivals))
+    return [pair for pair in item.rivals if pair[0].term.key() != item.proposal.term.key()]
 
 
 def _on_full_campaign(proposal: Proposal, every: Rows) -> Proposal:

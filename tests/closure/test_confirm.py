@@ -206,15 +206,14 @@ def test_the_first_that_gains_is_accepted_with_its_rivals_and_what_they_leave(de
     gains = [Gain(-0.1, 1.1, 5.0), Gain(0.3, 0.7, 5.0), Gain(0.2, 0.8, 5.0)]
     found, refused, said = decide([first, second, third], gains, compare=True)
     assert (found.proposal, found.gain_N, found.left_N, found.round) == (second, 0.3, 0.7, 2)
-    assert found.rivals == (first, third)
-    assert found.rivals_rmse_N == (1.1, 0.8)
+    assert found.rivals == ((first, 1.1), (third, 0.8))
     assert refused == []
     assert said == [
         "  round 2: form 0, factor on mu: held-out gain -0.1 N",
         "  round 2: form 1, factor on mu: held-out gain 0.3 N",
     ]
     found, *_ = decide([first, second, third], gains)
-    assert np.isnan(found.rivals_rmse_N).all()  # not asked for
+    assert np.isnan([rmse for _, rmse in found.rivals]).all()  # not asked for
 
 
 def test_after_three_that_gain_nothing_none_is_tried_and_the_best_is_refused(decide):

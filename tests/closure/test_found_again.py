@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.confirm import AcceptedEffect, silent
+from sealfit.closure.confirm import AcceptedEffect
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.loop import _all_refused, _found_in_folds, _only_gains
 from sealfit.closure.selection import Selection
@@ -12,6 +12,7 @@ from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
+from sealfit.progress import Silent
 
 OIL = {"oil_ppm": lambda rng: rng.normal(50, 10), "humidity_pct": lambda rng: rng.normal(40, 5)}
 
@@ -31,7 +32,7 @@ def selection():
     after = fit(model, rows, before.scatter, turns=0)
     added = tuple(
         AcceptedEffect(
-            Proposal(t, v, "run", 72, 1e3, 1e-3, np.empty(0), (t.channels, "mu", "multiply")), 1, 1, (), (), 1
+            Proposal(t, v, "run", 72, 1e3, 1e-3, np.empty(0), (t.channels, "mu", "multiply")), 1, 1, (), 1
         )
         for t, v in zip(after.model.terms, after.model.values, strict=True)
     )
@@ -58,7 +59,7 @@ def test_evidence_that_is_not_weak_needs_no_fold_to_find_it_again(selection):
 
 
 def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selection):
-    own = _all_refused(selection, silent)
+    own = _all_refused(selection, Silent().say)
     assert own.added == ()
     assert own.after is selection.before
     assert [r.term.channels[0] for r in own.refused] == list(OIL)
@@ -80,6 +81,6 @@ def test_the_evidence_for_the_last_effect_says_what_is_asked_of_the_error(select
 
     added = list(selection.added)
     added[strong] = replace(added[strong], proposal=replace(added[strong].proposal, p_value=1e-9))
-    kept, models = _only_gains(replace(selection, added=tuple(added)), Models(), None, silent)
+    kept, models = _only_gains(replace(selection, added=tuple(added)), Models(), None, Silent().say)
     assert kept.added == tuple(added)
     assert models.weak == (strong == 0)

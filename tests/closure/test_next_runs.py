@@ -82,7 +82,7 @@ def test_repeats_are_asked_where_the_models_differ_most_at_a_tested_run(rival, b
     first = {name: fitted.rows.table[name].iloc[0] for name in ("temperature_C", "aging_days", "speed_mm_s")}
     most = {**first, "speed_mm_s": first["speed_mm_s"] * (1.0 if begins.startswith("more") else 1.3)}
     monkeypatch.setattr("sealfit.closure.next_runs.largest_difference", lambda *given: (most, 0.5))
-    item = SimpleNamespace(proposal=chosen, rivals=(other,))
+    item = SimpleNamespace(proposal=chosen, rivals=((other, 0.1),))
     selection = SimpleNamespace(added=[item], after=fitted, inconclusive=None)
     run, *_ = next_runs(selection, Config(), {})
     assert run["why"].startswith(begins)

@@ -98,7 +98,6 @@ def test_an_effect_is_not_given_up_for_one_that_fits_worse(monkeypatch):
             1.0,
             1.0,
             (),
-            (),
             1,
         )
         for t, v in zip(fitted.model.terms, fitted.model.values, strict=True)
@@ -132,7 +131,7 @@ def in_place_of(bins, *terms, gain_N=1.0, **options):
         source = (term.channels, term.acts_on, term.operation)
         units = rows.groups.starts["run"].size
         proposal = Proposal(term, values, "run", units, 1e3, 1e-9, np.empty(0), source, fitted=fitted)
-        return AcceptedEffect(proposal, gain_N, 1.0, (), (), 1)
+        return AcceptedEffect(proposal, gain_N, 1.0, (), 1)
 
     *earlier, new = (accepted(t, v, f) for (t, v), f in zip(terms, fits[1:], strict=True))
     channels = {c.name: c for c in find_channels(rows)}
@@ -236,7 +235,6 @@ def test_of_an_unconfirmed_effect_and_a_later_one_the_one_that_explains_least_go
             Proposal(t, v, "run", 72, 1e3, 1e-9, np.empty(0), (t.channels, "mu", "multiply")),
             1.0,
             1.0,
-            (),
             (),
             k,
         )

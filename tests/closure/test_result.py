@@ -58,14 +58,14 @@ def selection(fitted):
     return Selection(fitted, fitted, (), (), (), None, None, channels)
 
 
-def accepted(fitted, term=WARMING, values=(-0.05, 10.0), p_value=1e-8, rivals=(), rmse=()):
+def accepted(fitted, term=WARMING, values=(-0.05, 10.0), p_value=1e-8, rivals=()):
     numbers = dict(zip([p.name for p in term.effect.parameters], values, strict=True))
     after = fitted_at(fitted.model.with_term(term, numbers), fitted.rows, fitted.scatter)
     column = np.ones(fitted.force.size)
     proposal = Proposal(
         term, numbers, "run", 10, 50.0, p_value, column, (term.channels, "mu", "multiply"), fitted=after
     )
-    return AcceptedEffect(proposal, 0.2, 0.4, rivals, rmse, 1), after
+    return AcceptedEffect(proposal, 0.2, 0.4, rivals, 1), after
 
 
 def candidate(*channels, p_value=1e-3, log_p=-9.0, chi2=20.0, unit="run"):
@@ -151,8 +151,11 @@ def test_without_a_load_a_label_names_what_is_fitted(acts_on, operation, words, 
 
 
 def test_an_effect_is_written_with_its_intervals_and_rivals(selection, fitted):
-    rivals = tuple(accepted(fitted, replace(WARMING, acts_on=name))[0].proposal for name in ("force", "mu_c"))
-    item, after = accepted(fitted, rivals=rivals, rmse=(0.41, np.nan))
+    rivals = tuple(
+        (accepted(fitted, replace(WARMING, acts_on=name))[0].proposal, rmse)
+        for name, rmse in (("force", 0.41), ("mu_c", np.nan))
+    )
+    item, after = accepted(fitted, rivals=rivals)
     (entry,) = document(replace(selection, added=(item,)), after)["effects"]
     assert entry["label"] == "warming by sliding (distance), factor on mu"
     assert (entry["level"], entry["channels"], entry["named"], entry["candidate"]) == (

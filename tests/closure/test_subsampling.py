@@ -153,7 +153,7 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
 
     for first, second in ((other, acts_on), (acts_on, other)):
         chosen, rival = on(first), on(second)
-        item = replace(found, proposal=chosen, rivals=(rival,), rivals_rmse_N=(0.1,))
+        item = replace(found, proposal=chosen, rivals=((rival, 0.1),))
         off_target = replace(selection, after=chosen.fitted, added=(item,))
         told, whole = reselect_on_all(off_target, part.every, samples, Config(), lambda text: None)
         (effect,) = told.added
