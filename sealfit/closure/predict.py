@@ -62,7 +62,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     before, after, conditions, code = _conditions(before, after, conditions, table, notes, config)
     _check_values(table, after, model, notes)
     good = np.array([not note for note in notes]) & (code >= 0)
-    answer = pd.DataFrame({name: np.full(len(table), np.nan) for name in FORCES})
+    answer = np.full((len(table), len(FORCES)), np.nan)
     if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
         _note(notes, good, TESTED_ONLY)
     if model["df"] == 0:
@@ -81,11 +81,10 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, mean))
         spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
         forces = (evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half)
-        answer.loc[good, FORCES] = np.column_stack([*forces, mean - spread, mean + spread])
-    bad = answer["force_after_N"].isna().to_numpy()
+        answer[good] = np.column_stack([*forces, mean - spread, mean + spread])
     return points.reset_index(drop=True).assign(
-        **{name: answer[name] for name in FORCES},
-        extrapolated=np.where(bad, False, extrapolated),
+        **dict(zip(FORCES, answer.T, strict=True)),
+        extrapolated=extrapolated & ~np.isnan(answer[:, 1]),  # of `force_after_N`
         note=["; ".join(note) for note in notes],
     )
 
@@ -157,8 +156,7 @@ def _conditions(
     )
     known = {name: k for k, name in enumerate(conditions["condition"])}
     declared = after.declared
-    index = {q: list(v) for q, v in declared.index.items()}
-    added = []
+    added, like = [], []  # conditions that were not tested, and for each one that was, with the same law
     code = np.full(len(table), -1)
     for k in range(len(table)):
         name, series, rubber = keys["condition"].iloc[k], keys["series"].iloc[k], keys["rubber"].iloc[k]
@@ -166,9 +164,9 @@ def _conditions(
             notes[k].append("an empty condition cell: fill it in")
             continue
         if name not in known:
-            like = conditions.index[(conditions["series"] == series) & (conditions["rubber"] == rubber)]
-            lawful = [c for c in like if declared.index["a_c"][c] >= 0]
-            if not lawful or not 0 <= days.iloc[k] < OVERLOAD:
+            same = np.flatnonzero((conditions["series"] == series) & (conditions["rubber"] == rubber))
+            lawful = same[declared.index["a_c"][same] >= 0]
+            if not lawful.size or not 0 <= days.iloc[k] < OVERLOAD:
                 fix = f"give a tested condition, such as {conditions['condition'].iloc[0]}"
                 law = ""
                 if config.aging:
@@ -177,15 +175,14 @@ def _conditions(
                 notes[k].append(f"condition {name} was not tested{law}: {fix}")
                 continue
             known[name] = len(known)
-            added.append(
-                {"condition": name, "series": series, "rubber": rubber, "aging_days": float(days.iloc[k])}
-            )
-            for quantity in index:
-                index[quantity].append(int(declared.index[quantity][lawful[0]]))
+            keys_of = {"condition": name, "series": series, "rubber": rubber}
+            added.append({**keys_of, "aging_days": float(days.iloc[k])})
+            like.append(lawful[0])
         code[k] = known[name]
-    numbers = {q: np.array(v, dtype=int) for q, v in index.items()}
-    wider = replace(declared, index=numbers)
     full = pd.concat([conditions, pd.DataFrame(added)], ignore_index=True) if added else conditions
+    places = [*range(len(conditions)), *like]
+    numbers = {quantity: own[places] for quantity, own in declared.index.items()}
+    wider = replace(declared, index=numbers)
     return replace(before, declared=wider), replace(after, declared=wider), full, code
 
 
