@@ -58,10 +58,13 @@ def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str
 
 def at_reference(model: Model, config: Config) -> Model:
     """Return the model at the reference: only effects that are part of a condition are kept."""
-    kept = [k for k, term in enumerate(model.terms) if is_kept(term, config)]
-    return replace(
-        model, terms=tuple(model.terms[k] for k in kept), values=tuple(model.values[k] for k in kept)
-    )
+    return _with_terms(model, [k for k, term in enumerate(model.terms) if is_kept(term, config)])
+
+
+def _with_terms(model: Model, kept: Sequence[int]) -> Model:
+    """Return a model with some of its terms."""
+    terms, values = (tuple(own[k] for k in kept) for own in (model.terms, model.values))
+    return replace(model, terms=terms, values=values)
 
 
 def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.DataFrame:
@@ -282,14 +285,12 @@ class _Law:
     def _values(self, days: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the coefficient at days of aging, and its standard error, shape (n,) each."""
         after, config, rows = self.after, self.config, self.after.rows
-        model = at_reference(after.model, config)
-        for number in reversed(
-            [k for k, term in enumerate(model.terms) if term.acts_on in ("v_s", "sigma_2")]
-        ):
-            model = model.without_term(number)  # they change no coefficient
-        declared = model.declared
+        others = ("v_s", "sigma_2")  # effects on these change no coefficient
+        terms = list(enumerate(after.model.terms))
+        kept = [k for k, term in terms if is_kept(term, config) and term.acts_on not in others]
+        model = _with_terms(after.model, kept)
         condition = int(self.conditions[0])
-        index = {name: int(declared.index[name][condition]) for name in ("v_s", "sigma_2")}
+        index = {name: int(model.declared.index[name][condition]) for name in others}
         v_s = float(np.exp(model.theta[index["v_s"]])) if index["v_s"] >= 0 else 1.0
         theta = model.theta.copy()
         if index["sigma_2"] >= 0:
@@ -302,10 +303,9 @@ class _Law:
         )
         at = rows.points(table.drop(columns=[POWER], errors="ignore"), np.full(days.size, condition))
         force, tangent = evaluate(replace(model, theta=theta), replace(at, days=days))
-        own = (after.model.term_slice(after.model.terms.index(term)) for term in model.terms)
-        kept = [np.arange(after.model.size)[place] for place in own]
+        places = [np.arange(after.model.size)[after.model.term_slice(k)] for k in kept]
         slope = np.zeros((days.size, after.model.size))
-        slope[:, np.concatenate([np.arange(theta.size), *kept])] = tangent.toarray()
+        slope[:, np.concatenate([np.arange(theta.size), *places])] = tangent.toarray()
         slope[:, list(index.values())] = 0.0
         scale = load if rows.has_load else 1.0
         return force / scale, np.sqrt(np.einsum("ni,ij,nj->n", slope, after.covariance, slope)) / scale

@@ -253,10 +253,7 @@ def periodic_terms(
         fixed["shift"] = pass_shifts(samples, rows, length, peak.axis)
         fixed["held"] = {"lambda_": (length - reach, length + reach), "phi": (-np.pi, np.pi)}
         lengths, phases = (length,), (0.0,)
-    names = {
-        p.name: (lengths if p.name == "lambda_" or p.name.startswith("lambda") else phases)
-        for p in effect.nonlinear
-    }
+    names = {p.name: lengths if p.name == "lambda_" else phases for p in effect.nonlinear}
     units = rows.groups.starts["file"].size
     for target in targets:
         if target in effect.acts_on:
