@@ -62,7 +62,7 @@ def test_a_fold_is_searched_without_its_strokes(monkeypatch):
     bins = numbered(make_bins(repeats=1, bins=6))
     rows, coarse = make_rows(bins, has_aging=True), make_rows(thin(bins, len(bins) // 3), has_aging=True)
     samples = steady_samples(make_traces(bins), rows)
-    heldout = loop._HeldOut(rows, Subsample(rows, coarse, coarse), samples, Context(Config(), EFFECTS))
+    part, context = Subsample(rows, coarse, coarse), Context(Config(), EFFECTS)
     out = rows.codes("run") % 5 == 0
     used = {}
 
@@ -71,8 +71,8 @@ def test_a_fold_is_searched_without_its_strokes(monkeypatch):
         return SimpleNamespace(before=None, after=SimpleNamespace(model="model"), added=())
 
     monkeypatch.setattr(loop, "select_effects", search)
-    monkeypatch.setattr(heldout, "predicted", lambda fitted, out: (rows.force[out], rows.force[out] > 0))
-    assert heldout.searched(None, 2, out)[-1] == "model"
+    monkeypatch.setattr(loop, "_predicted", lambda fitted, part, test: (test.force, test.force > 0))
+    assert loop._searched(part, samples, context, None, 2, rows.subset(out))[-1] == "model"
     kept = set(rows.table["stroke_id"][~out])
     assert set(used["seen"]["stroke_id"]) == set(used["train"].table["stroke_id"]) == kept
     assert used["train"].force.size == 2 * len(kept)

@@ -187,7 +187,8 @@ class _HeldOut:
             return before, after, determined & also, None
         start = Start(selection.before.model, selection.before.scatter)
         rounds = max(a.round for a in selection.added)
-        parts = run_map(partial(self.searched, start, rounds), self.masks, workers=self.workers)
+        search = partial(_searched, self.part, self.samples, self.context, start, rounds)
+        parts = run_map(search, [self.rows.subset(out) for out in self.masks], workers=self.workers)
         before, after = np.full((2, self.rows.force.size), np.nan)
         determined, models = np.zeros(self.rows.force.size, dtype=bool), []
         for k, (out, part) in enumerate(zip(self.masks, parts, strict=True)):
@@ -196,46 +197,14 @@ class _HeldOut:
             models.append(model)
         return before, after, determined, models
 
-    def searched(
-        self, start: Start, rounds: int, out: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Model]:
-        """Return the forces before and after at the rows held out, where determined, and the model after.
-
-        The search is repeated without these rows.
-        """
-        fine = self.without(out, self.part.rows) if self.part.coarse is not self.part.rows else None
-        seen = self.samples[~self.samples["stroke_id"].isin(self.strokes(out))]
-        train = self.without(out, self.part.coarse)
-        found = select_effects(train, seen, self.context, fine=fine, start=start, rounds=rounds)
-        before, determined = self.predicted(found.before, out)
-        after, also = self.predicted(found.after, out) if found.added else (before, determined)
-        return before, after, determined & also, found.after.model
-
     def refitted(self, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
         """Return each row's force by a model refitted without its fold, and where it is determined, (n,)."""
         force, determined = np.full(self.rows.force.size, np.nan), np.zeros(self.rows.force.size, dtype=bool)
         for out in self.masks:
-            own = fit(fitted.model, self.without(out, self.part.coarse), fitted.scatter, turns=1)
-            force[out], determined[out] = self.predicted(own, out)
+            test = self.rows.subset(out)
+            own = fit(fitted.model, _without(self.part.coarse, test), fitted.scatter, turns=1)
+            force[out], determined[out] = _predicted(own, self.part, test)
         return force, determined
-
-    def predicted(self, fitted: Fitted, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the force at the rows held out, and where the other rows determine it.
-
-        A model of some runs is fitted to all others first.
-        """
-        if not self.part.whole:
-            fitted = fit(fitted.model, self.without(out, self.part.every), fitted.scatter, turns=0)
-        force, tangent = evaluate(fitted.model, self.rows.subset(out))
-        return force, mean_se(tangent, fitted.covariance) < DETERMINED * fitted.rmse_N
-
-    def without(self, out: np.ndarray, rows: Rows) -> Rows:
-        """Return rows of the campaign without the strokes held out."""
-        return rows.subset(~rows.table["stroke_id"].isin(self.strokes(out)).to_numpy())
-
-    def strokes(self, out: np.ndarray) -> np.ndarray:
-        """Return the `stroke_id` of each row held out."""
-        return self.rows.table["stroke_id"].to_numpy()[out]
 
     def covered(self, model: Model) -> np.ndarray:
         """Return which rows were held out and are covered by the others, shape (n,)."""
@@ -244,6 +213,38 @@ class _HeldOut:
         for out in self.masks:
             found |= covered(self.rows, out, channels)
         return found
+
+
+def _searched(
+    part: Subsample, samples: pd.DataFrame, context: Context, start: Start, rounds: int, test: Rows
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Model]:
+    """Return the forces before and after at the test rows, where both are determined, and the model after.
+
+    The search is repeated without the strokes of these rows.
+    """
+    fine = _without(part.rows, test) if part.coarse is not part.rows else None
+    seen = samples[~samples["stroke_id"].isin(test.table["stroke_id"])]
+    train = _without(part.coarse, test)
+    found = select_effects(train, seen, context, fine=fine, start=start, rounds=rounds)
+    before, determined = _predicted(found.before, part, test)
+    after, also = _predicted(found.after, part, test) if found.added else (before, determined)
+    return before, after, determined & also, found.after.model
+
+
+def _predicted(fitted: Fitted, part: Subsample, test: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Return the force at the test rows, and where the other rows determine it.
+
+    A model of some runs is fitted to all others first.
+    """
+    if not part.whole:
+        fitted = fit(fitted.model, _without(part.every, test), fitted.scatter, turns=0)
+    force, tangent = evaluate(fitted.model, test)
+    return force, mean_se(tangent, fitted.covariance) < DETERMINED * fitted.rmse_N
+
+
+def _without(rows: Rows, test: Rows) -> Rows:
+    """Return rows without the strokes of the test rows."""
+    return rows.subset(~rows.table["stroke_id"].isin(test.table["stroke_id"]).to_numpy())
 
 
 def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
