@@ -194,21 +194,17 @@ class _Law:
     """Eq. 15 of one quantity of one series in the after-model; `place` is None where it has none."""
 
     def __init__(self, after: Fitted, config: Config, series: str, conditions: np.ndarray, end: str) -> None:
-        self.after, self.config, self.series, self.end = after, config, series, end
-        table, declared = after.rows.conditions, after.model.declared
+        self.after, self.config, self.end = after, config, end
         self.conditions = conditions  # aged
+        table, declared = after.rows.conditions, after.model.declared
         self.rubber = str(table["rubber"].iloc[conditions[0]])
         days = table["aging_days"].to_numpy(float)
-        self.unaged = bool((days[(table["rubber"] == self.rubber).to_numpy()] == 0).any())
-        symbol = f"mu_{end}"
-        self.quantity = symbol if after.rows.has_load else FORCES[symbol]
-        self.unit = parameter_units(config.units, after.rows.has_load)["mu_s"]
-        names = (f"mu_0{end}", f"a_{end}", f"b_{end}")
-        number = [int(declared.index[name][self.conditions[0]]) for name in names]
+        unaged = bool((days[(table["rubber"] == self.rubber).to_numpy()] == 0).any())
+        quantity = f"mu_{end}" if after.rows.has_load else FORCES[f"mu_{end}"]
+        unit = parameter_units(config.units, after.rows.has_load)["mu_s"]
+        self.curve_of = Curve(series, quantity, 0, np.unique(days[conditions]), unaged, unit)
+        number = [int(declared.index[name][conditions[0]]) for name in (f"mu_0{end}", f"a_{end}", f"b_{end}")]
         self.place = number if min(number) >= 0 else None
-        self.curve_of = Curve(
-            series, self.quantity, 0, np.unique(days[self.conditions]), self.unaged, self.unit
-        )
         self.df = law_df(after)
 
     def rows(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
@@ -248,7 +244,8 @@ class _Law:
 
     def _statistics(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
         """Yield the errors of the law at single conditions, and the statistics behind its intervals."""
-        own = steady_fit[(steady_fit["quantity"] == "steady") & (steady_fit["parameter"] == self.quantity)]
+        curve, steady = self.curve_of, steady_fit["quantity"] == "steady"
+        own = steady_fit[steady & (steady_fit["parameter"] == curve.quantity)]
         own = own[own["identified"].astype(bool)].set_index("condition")["value"]
         names = self.after.rows.conditions["condition"].to_numpy()[self.conditions]
         days = self.after.rows.conditions["aging_days"].to_numpy(float)[self.conditions]
@@ -262,15 +259,15 @@ class _Law:
             ("specimen_sd_pct", 100 * np.sqrt(specimen), "%"),
             ("error_df", self.df, ""),
             ("max_error_pct", 100 * np.abs(share).max() if share.size else None, "%"),
-            ("rmse", np.sqrt(np.mean(gap**2)) if gap.size else None, self.unit),
-            ("n_days", self.curve_of.days.size + self.unaged, ""),
-            ("last_day", self.curve_of.days[-1], "d"),
+            ("rmse", np.sqrt(np.mean(gap**2)) if gap.size else None, curve.unit),
+            ("n_days", curve.days.size + curve.unaged, ""),
+            ("last_day", curve.days[-1], "d"),
         ):
-            parameter = f"{self.quantity}:{name}"
+            parameter = f"{curve.quantity}:{name}"
             row = table_row(
                 quantity="statistics", parameter=parameter, value=value, unit=unit, identified=True
             )
-            yield {**row, "series": self.series}
+            yield {**row, "series": curve.series}
 
     def curve(self) -> pd.DataFrame:
         """Return the law along aging time with its 95 % band, including effects of the condition."""
@@ -278,9 +275,8 @@ class _Law:
         value, error = self._values(days)
         half = t_quantile(self.df) * error
         columns = {"aging_days": days, "value": value, "lo95": value - half, "hi95": value + half}
-        return pd.DataFrame({"series": self.series, "quantity": self.quantity, **columns})[
-            AGING_CURVES.names()
-        ]
+        named = {"series": self.curve_of.series, "quantity": self.curve_of.quantity}
+        return pd.DataFrame({**named, **columns})[AGING_CURVES.names()]
 
     def _values(self, days: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the coefficient at days of aging, and its standard error, shape (n,) each."""

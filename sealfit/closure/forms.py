@@ -424,10 +424,12 @@ def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tupl
 def _best(before: Fitted, term: Term) -> Fitted | None:
     """Return the best joint fit of the law from several start values."""
     effect, rows = term.effect, before.rows
-    days = np.unique(rows.days[rows.days > 0])
+    days = np.unique(rows.days[rows.days > 0])[:-1]
+    if not days.size:
+        return None
     amplitude, number = effect.linear[0], effect.nonlinear[0].name
     found: list[Fitted] = []
-    for day in _spread(days[:-1]):
+    for day in days[np.unique(np.linspace(0, days.size - 1, STARTS).round().astype(int))].tolist():
         (shape,) = mean_derivatives(term, {**effect.start(), number: day}, rows, only_linear=True)
         left = project(before, (before.slope(*TARGET) * shape)[:, None])[:, 0]
         size = float(left @ left)
@@ -438,9 +440,4 @@ def _best(before: Fitted, term: Term) -> Fitted | None:
         }
         model = before.model.with_term(term, {p.name: start[p.name] for p in effect.parameters})
         found.append(reestimated(before.refitted(model)))
-    return min(found, key=lambda f: f.deviance, default=None)
-
-
-def _spread(days: Sequence[float]) -> list[float]:
-    places = np.unique(np.linspace(0, len(days) - 1, STARTS).round().astype(int)) if len(days) else ()
-    return [float(days[k]) for k in places]
+    return min(found, key=lambda f: f.deviance)

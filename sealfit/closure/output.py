@@ -229,7 +229,7 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
         term, values = after.model.terms[number], after.model.values[number]
         place = after.model.term_slice(number)
         covariance = robust_covariance(after, "file") if "held" in term.fixed else after.covariance
-        inputs, x, labels = _along(term, after, first)
+        inputs, x, labels = _along(term, values, after.rows, first)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
         tangent = np.column_stack(
             [np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)]
@@ -289,17 +289,18 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=SHAPE_POINTS.names())
 
 
-def _along(term: Term, after: Fitted, first: str) -> tuple[dict, np.ndarray, list | None]:
+def _along(
+    term: Term, parameters: Mapping[str, float], rows: Rows, first: str
+) -> tuple[dict, np.ndarray, list | None]:
     """Return inputs along one of a term's channels, others at their means, and its values or categories."""
-    rows = after.rows
     values = rows.values(first)
     if values.dtype.kind != "f":
         labels = [str(c) for c in np.unique(values)]
         return {term.effect.reads[0]: np.array(labels), **term.fixed}, np.full(len(labels), np.nan), labels
     values = np.abs(values) if first == "speed_mm_s" else values
     low, high = float(values.min()), float(values.max())
-    if "lambda_" in after.model.values[after.model.terms.index(term)]:
-        high = min(high, low + PERIODS * after.model.values[after.model.terms.index(term)]["lambda_"])
+    if "lambda_" in parameters:
+        high = min(high, low + PERIODS * parameters["lambda_"])
     x = np.unique(values)
     if x.size > 12:
         spaced = np.geomspace if first == "speed_mm_s" and low > 0 and high >= WIDE * low else np.linspace
