@@ -54,6 +54,7 @@ class OutlierFile(NamedTuple):
     deviation: float  # its mean force over that predicted, less 1
     p_value: float  # times the number of files
     conditions: dict  # the columns of its first row
+    instead: tuple[str, ...] = ()  # files that may be the wrong ones instead; it is not left out then
 
 
 def outlier_files(rows: Rows) -> list[OutlierFile]:
@@ -61,8 +62,9 @@ def outlier_files(rows: Rows) -> list[OutlierFile]:
 
     Model and scatter are fitted without the file, so that it does not hide itself. It is an outlier if the
     gain that would explain it is significant beside the scatter of the others. These are then judged without
-    it. If another file may as well be the wrong one, none is left out. In linear regression the test is that
-    of the deletion residual (Cook & Weisberg 1982, *Residuals and Influence in Regression*, section 2.2.2).
+    it. In linear regression the test is that of the deletion residual (Cook & Weisberg 1982, *Residuals and
+    Influence in Regression*, section 2.2.2). If another file may be the wrong one instead, none is left out,
+    and the search ends.
     """
     rows = rows.sparse(ROWS)
     fitted, found = fit_declared(rows), []
@@ -71,19 +73,22 @@ def outlier_files(rows: Rows) -> list[OutlierFile]:
         one, kept = min(tried, key=lambda pair: pair[0].p_value, default=(None, fitted))
         if one is None or one.p_value > OUTLIER_P or abs(one.deviation) < OUTLIER_SHARE:
             break
-        if _may_be_another(one, kept, [other for other, _ in tried]):
+        found.append(one._replace(instead=_wrong_instead(one, tried)))
+        if found[-1].instead:
             break
-        found.append(one)
         fitted = kept
     return sorted(found, key=lambda one: -abs(one.deviation))
 
 
-def _may_be_another(one: OutlierFile, kept: Fitted, tried: Sequence[OutlierFile]) -> bool:
-    """Whether another file may be the wrong one: significant with `one` in the data, and not without it."""
-    rows = kept.rows
-    names = rows.table["record"].to_numpy()[rows.groups.starts["file"]].tolist()
-    others = [other for other in tried if other is not one and other.p_value <= OUTLIER_P]
-    return any(_without(kept, names.index(other.file))[0].p_value > OUTLIER_P for other in others)
+def _wrong_instead(one: OutlierFile, tried: Sequence[tuple[OutlierFile, Fitted]]) -> tuple[str, ...]:
+    """Return the files without which `one` agrees with the rest: each may be the wrong one instead."""
+    found = []
+    for other, kept in tried:
+        names = kept.rows.table["record"].to_numpy()[kept.rows.groups.starts["file"]].tolist()
+        if other.file != one.file:
+            deviation = _without(kept, names.index(one.file))[0].deviation
+            found += [other.file] if abs(deviation) < OUTLIER_SHARE else []
+    return tuple(found)
 
 
 def _df(fitted: Fitted) -> int:
@@ -119,8 +124,8 @@ def _without(fitted: Fitted, number: int) -> tuple[OutlierFile, Fitted]:
     kept = fit(search_nonlinear(fitted.model, others, fitted.scatter), others, fitted.scatter, turns=2)
     at = fitted_at(kept.model, rows, kept.scatter)
     column = at.basis.project_out(at.whitening(np.where(own, at.friction, 0.0)[:, None])[:, 0])
-    size = max(float(np.linalg.norm(column)), 1e-9)  # 0 if only this file determines a parameter
-    deviation = float(column @ at.white_residual) / size**2
+    size = float(np.linalg.norm(column))  # 0, but for rounding, if only this file determines a parameter
+    deviation = float(column @ at.white_residual) / size**2 if size > 1e-9 else 0.0
     p_value = 2 * stdtr(_df(at), -abs(deviation) * size) * rows.groups.starts["file"].size
     if _like_others_of_its_speed(at, number):
         p_value = 1.0

@@ -71,9 +71,10 @@ def close_loop(
     del bins
     rows = make_rows(counted, has_aging=config.aging)
     outliers = outlier_files(rows)
-    if outliers:
-        say("left out, far off all others: " + ", ".join(one.file for one in outliers))
-        rows = rows.subset(~rows.table["record"].isin([one.file for one in outliers]).to_numpy())
+    left_out = [one.file for one in outliers if not one.instead]
+    if left_out:
+        say("left out, far off all others: " + ", ".join(left_out))
+        rows = rows.subset(~rows.table["record"].isin(left_out).to_numpy())
     del counted  # it takes much memory, and `rows` contains it
     start = None
     for part in subsamples(rows, config.loop.seed):

@@ -170,12 +170,15 @@ def _is_tested(conditions: Mapping[str, object], rows: Rows) -> bool:
 
 
 def _run_to_repeat(one: OutlierFile, config: Config) -> dict:
-    """Return the run of a file that was left out."""
+    """Return the run of a file that was left out, or would have been if no other could be the wrong one."""
     names = (*condition_columns(config), "speed_mm_s", "load_N")
     side = "above" if one.deviation > 0 else "below"
+    done = "was left out: look at it, and repeat its run"
+    if one.instead:
+        others = " or ".join(one.instead)
+        done = f"was kept, as {others} may be the wrong file instead: look at them, and repeat their runs"
     return {
-        "why": f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and was left "
-        "out: look at it, and repeat its run",
+        "why": f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and {done}",
         "conditions": _settings(one.conditions, names),
     }
 

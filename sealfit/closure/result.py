@@ -166,6 +166,7 @@ def closure_document(
         "outlier_files": [
             {"file": one.file, "deviation_pct": 100 * one.deviation, "p_value": one.p_value}
             for one in outliers
+            if not one.instead
         ],
         "next_runs": next_runs(selection, config, effects, outliers),
         "incomplete_channels": incomplete_channels(after.rows),

@@ -130,6 +130,11 @@ def test_the_run_of_an_outlying_file_comes_first():
     first, *_ = next_runs(selection, Config(), {}, [outlier])
     assert first["why"].startswith("file a.csv is 12% below what all others predict and was left out")
     assert first["conditions"] == known
+    kept = outlier._replace(instead=("b.csv",))
+    first, *_ = next_runs(selection, Config(), {}, [kept])
+    assert first["why"].endswith(
+        "was kept, as b.csv may be the wrong file instead: look at them, and repeat their runs"
+    )
 
 
 def test_longer_strokes_are_wanted_where_the_friction_is_not_steady_at_their_end():
