@@ -355,18 +355,18 @@ def test_refuses_an_empty_table_and_a_missing_column(campaign):
 
 # ---------------------------------------------------------------- Birge
 def test_birge_by_hand():
-    variance = unit_variance([8.0, 12.0], [5, 5], 40.0)  # pooled 20/10 = 2, F(10, 40) p = 0.06
+    variance = unit_variance([8.0, 12.0], [5, 5], True, 40.0)  # pooled 20/10 = 2, F(10, 40) p = 0.06
     npt.assert_allclose(variance.value, 2.0)
     npt.assert_allclose(variance.df, 10)
     npt.assert_allclose(variance.f, [1.6, 2.4])
-    calm = unit_variance([4.0, 6.0], [5, 5], 40.0)  # pooled 1: no set-up scatter
+    calm = unit_variance([4.0, 6.0], [5, 5], True, 40.0)  # pooled 1: no set-up scatter
     npt.assert_allclose(calm.value, 1.0)
     npt.assert_allclose(calm.df, 40)
     npt.assert_allclose(calm.rise(), 2.0211**2, rtol=1e-4)  # t table, 40 degrees of freedom
 
 
 def test_a_condition_worse_than_the_others_gets_its_own_ratio():
-    variance = unit_variance([5.0] * 9 + [100.0], [5] * 10, 100.0)
+    variance = unit_variance([5.0] * 9 + [100.0], [5] * 10, True, 100.0)
     assert list(variance.own) == [False] * 9 + [True]
     npt.assert_allclose(variance.value[-1], 20.0)
     assert variance.df[-1] == 5
@@ -407,6 +407,15 @@ def test_few_speeds_give_the_mean_over_them_and_intervals_that_cover(campaign, s
             widths.append((row.hi95 - row.lo95) / value)
     assert np.mean(hits) > 0.9
     assert np.median(widths) < 0.04
+
+
+def test_a_condition_with_too_few_speeds_leaves_the_others_their_curve(campaign):
+    """What its straight line leaves of the Stribeck curve is no scatter of their runs."""
+    table = campaign(speeds=(0.5, 2, 5, 15, 40), days=(0, 2, 8), ways=(1,), noise=0.002, repeats=3)
+    last = table["aging_days"] == 8
+    fits = fit_conditions(table[~last | ~table["speed_mm_s"].isin([2, 15])], Config())
+    found = fits[(fits["quantity"] == "steady") & (fits["parameter"] == "mu_s")]
+    assert found["identified"].tolist() == (found["aging_days"] != 8).tolist()
 
 
 @pytest.mark.filterwarnings("error")

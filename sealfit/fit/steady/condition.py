@@ -145,17 +145,19 @@ def make_condition(name: str, runs: pd.DataFrame) -> Condition:
     return Condition(str(name), kept.reset_index(drop=True), levels, has_load, len(runs) - len(kept), model)
 
 
-def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray]:
-    """Return chi-square of the run means of every condition and its degrees of freedom, each (conditions,).
+def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return chi-square of run means, its degrees of freedom, and whether it is scatter, (conditions,) each.
 
     Conditions with too few speeds for a Stribeck curve still show how the force changes from speed to speed,
     which is no scatter between runs. Where several have the same speeds, the model of each is multiplied by
-    one factor per speed and direction, which is common to all of them.
+    one factor per speed and direction, which is common to all of them. Where too few have, chi-square is no
+    scatter, unless no other condition shows any.
     """
     chi2, df = (np.array([getattr(c, name) for c in conditions], float) for name in ("chi2", "df"))
     few = [k for k, c in enumerate(conditions) if c.model == VISCOUS and c.few_speeds and c.values[0] > 0]
+    scatter = np.ones(len(conditions), dtype=bool)
     if not few:
-        return chi2, df
+        return chi2, df, scatter
     cells = {k: conditions[k].run_levels() for k in few}
     slowest = [part[0] for part in speed_clusters(np.unique(np.concatenate(list(cells.values()))[:, 1]))]
     groups: dict[frozenset, list[int]] = {}
@@ -167,6 +169,7 @@ def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray
         free = np.array([len(c.runs) - np.count_nonzero(c.values) for c in own], float)
         spare = free.sum() - (len(same) - 1)
         if spare <= 0:
+            scatter[group] = False
             continue
         model = np.concatenate([c.model_force() for c in own])
         force, weight = (np.concatenate([c.arrays[k] for c in own]) for k in (2, 3))
@@ -175,7 +178,7 @@ def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray
         left = weight * (force - factor[cell] * model) ** 2
         chi2[group] = np.bincount(np.repeat(np.arange(len(own)), [len(c.runs) for c in own]), left)
         df[group] = free * spare / free.sum()
-    return chi2, df
+    return chi2, df, scatter if df[scatter].any() else np.ones_like(scatter)
 
 
 def stacked(conditions: list[Condition]) -> tuple[np.ndarray, ...]:

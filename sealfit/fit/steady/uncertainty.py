@@ -150,19 +150,20 @@ class UnitVariance:
             return stdtrit(self.df, 0.975) ** 2 * self.value
 
 
-def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
+def unit_variance(chi2, df, scatter, pure_df: float) -> UnitVariance:
     """Return the factors on the variances stated by the weights, from chi-square of every condition.
 
-    With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions, is tested against pure
-    error. If its p-value is at most `POOLING_P`, the factor is the pooled ratio, at least 1, with the pooled
-    degrees of freedom. Else it is 1 with `pure_df`. A condition whose ratio exceeds that at level `WORSE_P`
-    gets its own ratio. Without repeats the weights are relative and the pooled ratio is the variance.
+    With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions in which it is scatter of
+    runs (mask `scatter`), is tested against pure error. If its p-value is at most `POOLING_P`, the factor is
+    the pooled ratio, at least 1, with the pooled degrees of freedom. Else it is 1 with `pure_df`. A condition
+    whose ratio exceeds that at level `WORSE_P` gets its own ratio. Without repeats the weights are relative
+    and the pooled ratio is the variance.
 
     Birge 1932, Phys. Rev. 40, 207; Bancroft 1944, Ann. Math. Statist. 15(2), 190-204,
     doi:10.1214/aoms/1177731284.
     """
     chi2, df = np.asarray(chi2, float), np.asarray(df, float)
-    total, total_df = float(chi2.sum()), float(df.sum())
+    total, total_df = float(np.sum(chi2 * scatter)), float(np.sum(df * scatter))
     ratio = np.divide(chi2, df, out=np.full(chi2.shape, np.nan), where=df > 0)
     pooled = total / total_df if total_df > 0 else np.nan
     repeated = pure_df > 0
@@ -173,7 +174,7 @@ def unit_variance(chi2, df, pure_df: float) -> UnitVariance:
     else:
         base, base_df = 1.0, pure_df
     with np.errstate(invalid="ignore", divide="ignore"):
-        worse = (ratio > base) & (fdtrc(df, base_df, ratio / base) < WORSE_P) & (df < total_df)
+        worse = (ratio > base) & (fdtrc(df, base_df, ratio / base) < WORSE_P) & (df < df.sum())
         p = fdtrc(df, pure_df, ratio) if repeated else np.full(chi2.shape, np.nan)
     return UnitVariance(
         value=np.where(worse, ratio, base),
