@@ -341,7 +341,8 @@ def effect_label(effect: Mapping, units: Units) -> str:
 
     Examples
     --------
-    >>> effect = {"label": "ripple along displacement_mm, added to force", "acts_on": "force"}
+    >>> label = "ripple along displacement_mm, added to force"
+    >>> effect = {"label": label, "channels": ["displacement_mm"], "acts_on": "force"}
     >>> effect_label(effect, Units())
     'ripple along displacement'
     """
