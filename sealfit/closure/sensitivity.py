@@ -78,12 +78,14 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     at several levels has an entry for each, for an effect at that level only. `smallest_N` is the RMS over
     all rows of the smallest effect that is found with a power of 80 %, `smallest_pct` the same in percent of
     the RMS force; None if the variable cannot be tested in this campaign. `files_needed` is the number of
-    files, made like these, that would show an effect of 1 % of the force.
+    files, made like these, that would show an effect of 1 % of the force. A variable that can show nothing
+    beside its effect in the model, such as the direction beside a zero offset, has no entry.
     """
     fitted = selection.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
     files, specimens = (rows.groups.starts[level].size for level in ("file", "specimen"))
     search = _Search(selection, alpha)
+    in_model = {name for added in selection.added for name in added.proposal.term.channels}
     entries = []
     for name, channel in selection.channels.items():
         target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
@@ -98,6 +100,8 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
                 stated = float(max(TO_BE_ADDED * times, SIZE_MARGIN * LEAST_SIZE))
                 smallest = force * stated if times < 1 else None
+            if smallest is None and name in in_model:
+                continue
             if smallest is None:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
                 if channel.unit == "sample" and specimens > 1:

@@ -14,7 +14,9 @@ from sealfit.closure.search import search
 from sealfit.closure.selection import Selection
 from sealfit.closure.sensitivity import _by_numbers, sensitivity, undetectable_variables
 from sealfit.config import Config
-from sealfit.fit.joint import fit_declared
+from sealfit.effects import EFFECTS
+from sealfit.fit.joint import fit, fit_declared
+from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 
 SMALL = {"temperatures": (60.0,), "days": (1.0, 4.0), "bins": 6, "noise_N": 0.1, "setup": 0.003}
@@ -49,6 +51,19 @@ def test_the_evidence_is_weak_for_half_the_stated_effect_and_strong_for_twice_as
     fresh = make_bins(4, repeats=repeats, run_channels=OIL, **{**SMALL, "noise_N": 0.1001})
     assert p_with(fresh, smallest / 2) > WEAK_P
     assert p_with(fresh, 2 * smallest) < WEAK_P
+
+
+def test_a_variable_that_can_show_nothing_beside_its_effect_has_no_entry():
+    bins = make_bins(4, directions=(1, -1), repeats=1, **SMALL)
+    bins["force_N"] += 2.0
+    selection = searched(bins)
+    assert entries(selection)["direction", "run"]["smallest_N"] > 0
+    term = Term(EFFECTS["zero_offset"], ("direction",), "force", "add")
+    after = fit(selection.after.model.with_term(term, {"A": 2.0}), selection.after.rows)
+    last = tuple(search(ScoreTests(after), list(selection.channels.values()), np.random.default_rng(0)))
+    added = (SimpleNamespace(proposal=SimpleNamespace(term=term)),)
+    closed = replace(selection, after=after, last=last, added=added)
+    assert ("direction", "run") not in entries(closed)
 
 
 def test_a_variable_has_an_entry_for_each_level_at_which_it_varies():
