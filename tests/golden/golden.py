@@ -234,12 +234,12 @@ def _close(old: float | None, new: float | None, by: float) -> bool:
     return abs(new - old) <= by + 1e-12
 
 
-def _rounded(value: object) -> object:
+def rounded(value: object) -> object:
     """Return a record with its numbers rounded to 8 digits."""
     if isinstance(value, dict):
-        return {key: _rounded(own) for key, own in value.items()}
+        return {key: rounded(own) for key, own in value.items()}
     if isinstance(value, list):
-        return [_rounded(own) for own in value]
+        return [rounded(own) for own in value]
     return float(f"{value:.8g}") if isinstance(value, float) else value
 
 
@@ -247,7 +247,7 @@ def main(names: list[str]) -> None:
     """Record the named campaigns, or all."""
     RECORDS.mkdir(exist_ok=True)
     for name in names or CAMPAIGNS:
-        text = json.dumps(_rounded(record(name)), indent=1, ensure_ascii=False)
+        text = json.dumps(rounded(record(name)), indent=1, ensure_ascii=False)
         text = re.sub(r"\n {3,}| {0,2}\n {2}(?=\])|\n {2}(?=\})", " ", text)  # a line for each entry
         (RECORDS / f"{name}.json").write_text(text + "\n", encoding="utf-8")
         print(name)
