@@ -61,7 +61,6 @@ TARGETS = (
     ("a", "multiply"),
     ("b", "multiply"),
 )
-MOST_NUMBERS = 1 << 22  # Numbers in the columns that are projected at once: 34 MB.
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 
@@ -118,23 +117,15 @@ def _shape_candidates(
     if channel.name in ("speed_mm_s", POWER) and "full" not in fitted.model.declared.stribeck.values():
         return  # with few speeds a dependence on speed may be the Stribeck curve
     both_ways, loads = rows.speed.min() < 0 < rows.speed.max(), POWER in rows.table
-    slopes, places = [], []
     for acts_on, operation in targets:
         if not (_allowed(channel, acts_on, operation, both_ways, loads) and _declared(fitted, acts_on)):
             continue
         slope = fitted.slope(acts_on, operation)
-        if np.abs(slope).max() > 0:
-            halved = channel.name == "direction" and acts_on != "force"
-            own = channel.values[:, None] / 2 if halved else shapes
-            slopes.append(own * slope[:, None])
-            places.append((acts_on, operation, own))
-    together = max(1, MOST_NUMBERS // shapes.size)
-    variants: tuple[np.ndarray, ...] = ()
-    for number, (acts_on, operation, own) in enumerate(places):
-        if number % together == 0:
-            variants = tests.variants(np.column_stack(slopes[number : number + together]), channel.unit)
-        first = number % together * own.shape[1]
-        left = [v[:, first : first + own.shape[1]] for v in variants]
+        if not np.abs(slope).max() > 0:
+            continue
+        halved = channel.name == "direction" and acts_on != "force"
+        own = channel.values[:, None] / 2 if halved else shapes
+        variants = tests.variants(own * slope[:, None], channel.unit)
         unit = channel.unit
         names = (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
@@ -145,7 +136,7 @@ def _shape_candidates(
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
         for part in parts:
-            test_result = tests([v[:, part] for v in left], between, level, (acts_on, operation))
+            test_result = tests([v[:, part] for v in variants], between, level, (acts_on, operation))
             if test_result is not None:
                 yield Candidate(names, acts_on, operation, level, own[:, part], test_result)
 
