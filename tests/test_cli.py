@@ -5,6 +5,7 @@ import re
 import stat
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import fake_parts
@@ -404,11 +405,12 @@ def test_faults_are_said_and_counted_and_strict_stops(sealfit, parts, campaign, 
         in ended.stderr
     )
     assert "faults      0 errors, 1 warning; left out: 1 row (table quality)" in ended.stdout
+    parts.faults = [fake_parts.FAULT, replace(fake_parts.FAULT, line=None)]
     parts.calls.clear()
-    for arguments in (["--strict"], ["--strict", "--force"]):
+    for arguments in (["--strict", "--force"], ["--strict"]):
         ended = sealfit("run", campaign, "--out", out, "--json", *arguments)
         assert ended.code == 1
-        assert ended.json["errors"][0]["line"] == 3
+        assert [error["line"] for error in ended.json["errors"]] == [3, None]
     assert parts.calls == ["ingest"]
     assert sealfit("ingest", campaign, "--out", out, "--strict").code == 1
 
