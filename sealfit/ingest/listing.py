@@ -319,7 +319,7 @@ def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: C
     if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
         there.update(glob_names(campaign, config.files))
     files = there - listed - {table}
-    reason, fix = f"is not in {table}.", "Add it to runs.csv if it is a trace."
+    reason, fix = f"is not in {table}.", f"Add it to {table} if it is a trace."
     return [
         Fault("not_listed", reason, file=f, fix=fix, **PASSED_OVER) if _is_utf8(f) else _odd_name(f, "info")
         for f in sorted(files, key=natural)

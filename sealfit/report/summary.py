@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 STATISTICS = "statistics"  # `quantity` of rows about the fit itself
 OF_INGEST = {  # columns that its summary counts
-    "inputs": ["status"],
+    "inputs": ["file", "status"],
     "runs": ["used", "run_id"],
-    "quality": ["action", "severity", "check", "column", "value", "reason"],
+    "quality": ["file", "action", "severity", "check", "column", "value", "reason"],
     "steady": ["condition"],
 }
 CLOSURE_KEYS = (
@@ -49,11 +49,13 @@ def of_steps(store: Store, steps: Iterable[str]) -> dict:
 
 def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
     """Return how many files, runs and conditions there are, and how many faults."""
-    quality, runs = tables["quality"], tables["runs"]
-    files = Counter(tables["inputs"]["status"])
+    quality, runs, inputs = tables["quality"], tables["runs"], tables["inputs"]
+    files = Counter(inputs["status"])
+    others = quality[quality["file"].isin(inputs.loc[inputs["status"] == "not matched", "file"])]
     actions, severities = Counter(quality["action"]), Counter(quality["severity"])
     return {
         "files": {status.replace(" ", "_"): files[status] for status in ("used", "left out", "not matched")},
+        "not_traces": {check: rows["file"].tolist() for check, rows in others.groupby("check", sort=False)},
         "rows_left_out": actions["row left out"],
         "strokes_left_out": actions["stroke left out"],
         "faults": {severity: severities[severity] for severity in ("error", "warning")},

@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from sealfit.errors import EXAMPLES
+
+NOT_TRACES = {  # why a file in the campaign's folder is none of its traces, by the check that says so
+    "not_listed": "not in the table of runs",
+    "not_matched": "not matched by the file-name pattern",
+    "excluded": "excluded by files.exclude",
+    "file_name": "with names that are not UTF-8",
+}
 # Level of the test for lack of fit.
 LACKING = 0.05
 
@@ -34,10 +42,10 @@ def lines(summary: Mapping) -> list[str]:
 def ingest_lines(part: Mapping) -> list[str]:
     """Return the lines of an ingest."""
     files, faults = part["files"], part["faults"]
-    text = f"{files['used']} used, {files['left_out']} left out"
-    if files["not_matched"]:
-        text += f", {files['not_matched']} not matched by the file-name pattern"
-    found = [line("files", text)]
+    found = [line("files", f"{files['used']} used, {files['left_out']} left out")]
+    for check, names in part["not_traces"].items():
+        more = ", ..." if len(names) > EXAMPLES else ""
+        found.append(line("", f"{len(names)} {NOT_TRACES[check]}: {', '.join(names[:EXAMPLES])}{more}"))
     numbers = {what: part[f"{what}s_left_out"] for what in ("stroke", "row")}
     left_out = [_count(number, what) for what, number in numbers.items() if number]
     if sum(faults.values()):

@@ -11,9 +11,11 @@ from sealfit.config import Bins, Config, Strokes, load_config
 from sealfit.errors import CampaignError
 from sealfit.fit.joint.rows import LEVELS, make_rows
 from sealfit.ingest.campaign import ingest_campaign
+from sealfit.report import summary, summary_lines
 from sealfit.tables import SCHEMAS
 
 TABLES = ["inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins"]
+PAIR = r"traces/(?P<run>\d)_(?P<repeat>\d)\.csv"
 MEASURED = os.environ.get("SEALFIT_MEASURED")
 
 
@@ -70,6 +72,25 @@ def campaign(tmp_path):
 def findings(ingested, file):
     quality = ingested.tables["quality"]
     return quality[quality["file"] == file]
+
+
+def test_the_summary_names_files_that_are_no_traces_and_says_why(campaign):
+    for name in ("more", "notes"):
+        (campaign / f"traces/{name}.csv").touch()
+    made = ingest_campaign(campaign, Config(files={"exclude": ["*/no*"], "glob": "traces/*"}))
+    assert made.faults == []
+    lines = summary_lines.ingest_lines(summary.of_ingest(made.tables))
+    assert [text.strip() for text in lines[:2]] == [
+        "files       6 used, 0 left out",
+        "1 not in the table of runs: traces/more.csv",
+    ]
+    (campaign / "runs.csv").unlink()
+    config = Config(condition=["run"], files={"exclude": ["*/no*"], "glob": "traces/*", "name_pattern": PAIR})
+    lines = summary_lines.ingest_lines(summary.of_ingest(ingest_campaign(campaign, config).tables))
+    assert sorted(text.strip() for text in lines[1:3]) == [
+        "1 excluded by files.exclude: traces/notes.csv",
+        "1 not matched by the file-name pattern: traces/more.csv",
+    ]
 
 
 def test_a_campaign_becomes_all_tables_with_their_schemas(campaign):
