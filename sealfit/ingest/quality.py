@@ -17,7 +17,7 @@ from scipy.special import bdtrc
 from sealfit.config import Config, Quality
 from sealfit.errors import KEPT, NOTED, STROKE_OUT, ConfigError, Fault
 from sealfit.ingest.strokes import Stroke
-from sealfit.ingest.trace_checks import resolution
+from sealfit.ingest.trace_checks import resolution, with_unit
 from sealfit.tables import CALENDAR, QUALITY, STEADY
 from sealfit.units import conversion
 
@@ -31,8 +31,10 @@ VARIES, STEADIER = 0.05, 0.2
 # above with its load in kg, which makes mu 9.81 times too large, and below with its load in g: 102 times too
 # small.
 MU_RANGE = (0.01, 5.0)
+# A load in kg makes the ratio 40 at most (of soft rubber), a force in mN 100 or more unless mu is below 0.1.
+IN_MN = 100.0
 _HEAVIER = (
-    'Is the load in kg or lb, or the force in mN? Give the unit in the rig config: load_N = {unit = "kgf"} '
+    'Is the load in kg or lb? Give the unit in the rig config: load_N = {unit = "kgf"} '
     "under [files.runs_columns] (kg is a mass; its weight is kgf, or 9.80665 times the kg in N)."
 )
 _LIGHTER = (
@@ -268,6 +270,8 @@ def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
     for wrong, fix in ((mu > MU_RANGE[1], _HEAVIER), (mu < MU_RANGE[0], _LIGHTER)):
         if wrong.any():
             middle = float(mu[wrong].median())
+            if middle > IN_MN:
+                fix = f"Is the force in mN? {with_unit('force_N', 'mN', config)}"
             where = f"in {wrong.sum()} of {len(mu)} conditions"
             reason = f"the friction force is {middle:.2g} times the load {where}; "
             reason += f"coefficients of friction are {MU_RANGE[0]:g} to {MU_RANGE[1]:g}."

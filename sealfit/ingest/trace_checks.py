@@ -236,7 +236,7 @@ def speed_fault(
         if name in config.trace.columns and config.trace.columns[name].unit
     ]
     first = f"Is the unit in the rig config right ({', '.join(declared)})? " if declared else ""
-    fix = first + _mix_up(ratio, time_s, displacement_mm, tolerance)
+    fix = first + _mix_up(ratio, time_s, displacement_mm, config)
     return Fault("speed_disagreement", reason, action="file left out", fix=fix, **place)
 
 
@@ -258,11 +258,20 @@ def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[f
     return _of_cuts(*means)
 
 
-def _mix_up(ratio: float, time_s: np.ndarray, displacement: np.ndarray, tolerance: float) -> str:
+def with_unit(column: str, unit: str, config: Config) -> str:
+    """Return the fix for a column of traces, ours by name, whose numbers are in another unit."""
+    if column in config.trace.compute:
+        return f"Correct compute.{column} in the rig config."
+    theirs = config.trace.their_columns.get(column, column)
+    name = "" if theirs == column else f"name = {theirs!r}, "
+    return f'Set {column} = {{{name}unit = "{unit}"}} under [trace.columns] in the rig config.'
+
+
+def _mix_up(ratio: float, time_s: np.ndarray, displacement: np.ndarray, config: Config) -> str:
     """Return the likely fix for a measured speed that is `ratio` times the commanded one."""
     step, travel = float(np.median(np.diff(time_s))), float(np.ptp(displacement))
-    time_in_ms = 'Is the time in ms? Set compute.time_s = "time_ms / 1000" in the rig config.'
-    metres = "Is the displacement in m? Compute displacement_mm from it, times 1000."
+    time_in_ms = f"Is the time in ms? {with_unit('time_s', 'ms', config)}"
+    metres = f"Is the displacement in m? {with_unit('displacement_mm', 'm', config)}"
     known = (
         # Both are a factor of 1000: rigs sample faster than once a second and travel farther than 1 mm.
         (1e-3, time_in_ms if step >= 0.5 or travel >= 1.0 else metres),
@@ -277,6 +286,6 @@ def _mix_up(ratio: float, time_s: np.ndarray, displacement: np.ndarray, toleranc
         (1000.0 / 60.0, "Is the commanded speed in m/min?"),
     )
     factor, fix = min(known, key=lambda row: abs(math.log(ratio / row[0])))
-    if abs(math.log(ratio / factor)) <= math.log1p(tolerance):
+    if abs(math.log(ratio / factor)) <= math.log1p(config.quality.speed_disagreement):
         return fix
     return "Check the commanded speed, the decimal mark, and the units of time and displacement."

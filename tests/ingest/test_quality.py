@@ -316,6 +316,7 @@ def steady_of(load, force=47.07, **more):
 @pytest.mark.parametrize(
     ("load", "said", "fix"),
     [
+        (49.03e-3, "9.6e+02 times the load in 2 of 2 conditions", "mN"),  # or the force in mN
         (5.0, "9.4 times the load in 2 of 2 conditions", "kgf"),  # 5 kg
         (5000.0, "0.0094 times the load in 2 of 2 conditions", "gf"),  # 5000 g
         ([49.03, 49.03, 5.0], "9.4 times the load in 1 of 2 conditions", "kgf"),

@@ -250,6 +250,18 @@ def test_units_mixed_up_are_named_by_speed_times_time(tmp_path, factor_t, factor
     assert words in fault.fix
 
 
+@pytest.mark.parametrize(("factor_t", "factor_x"), [(1000.0, 1.0), (1.0, 1e-3)])
+@pytest.mark.parametrize("names", ["time_s,displacement_mm,force_N", "t,x,force_N"])
+def test_the_unit_that_is_told_makes_the_file_readable(tmp_path, factor_t, factor_x, names):
+    content = csv_of([f"{0.1 * i * factor_t!r},{0.5 * i * factor_x!r},2.0" for i in range(100)], names)
+    columns = dict(zip(("time_s", "displacement_mm"), names.split(","), strict=False))
+    text = "[trace.columns]\n" + "".join(f"{ours} = '{theirs}'\n" for ours, theirs in columns.items())
+    fix = refused(tmp_path, content, text, speed_set_mm_s=5.0).fix
+    line = fix.partition("Set ")[2].partition(" under")[0]
+    kept = [old for old in text.splitlines() if old.split()[0] != line.split()[0]]
+    assert read(tmp_path, content, "\n".join([*kept, line]), speed_set_mm_s=5.0).faults == ()
+
+
 def test_speed_within_tolerance_or_resting_agrees_and_a_slip_warns(tmp_path):
     assert read(tmp_path, csv_of(ROWS), speed_set_mm_s=5.9).faults == ()
     (fault,) = read(tmp_path, csv_of(ROWS), speed_set_mm_s=6.5).faults
