@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import islice
@@ -19,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.errors import BadFile, CampaignError, ConfigError, Fault
+from sealfit.errors import BadFile, CampaignError, ConfigError, Fault, nearest
 from sealfit.ingest.columns import (
     RESERVED,
     Column,
@@ -57,6 +58,7 @@ from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt
 from sealfit.ingest.reader import read_header, read_trace
 from sealfit.ingest.trace_checks import measured_speed, speed_factor
+from sealfit.units import Conversion, conversion
 
 EXCEL_DAY_0 = datetime(1899, 12, 30)
 EXCEL_DAYS = (32874, 73415)  # 1990 to 2100: other numbers are hours, or seconds, or no times at all
@@ -418,6 +420,18 @@ def _missing(entries: list[Entry], columns: Columns, config: Config) -> list[Fau
         elif len(rows):
             reason = "there is no such column in runs.csv, file names, header lines or traces."
             fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
+            fix = (table and _in_other_unit(name, columns, config)) or fix
             place = {"file": table, "line": 1 if table else None, "column": name}
             faults.append(Fault("missing_column", reason, fix=fix.strip(), **place))
     return faults
+
+
+def _in_other_unit(name: str, columns: Columns, config: Config) -> str:
+    """Return the fix where the nearest column of the table of runs ends in another unit; "" if none does."""
+    close = nearest(name, columns)
+    unit, ours = close.rpartition("_")[2], config.units.of(name)
+    with suppress(ConfigError):
+        if ours and conversion(unit, ours) != Conversion():
+            meant = f'{name} = {{name = "{close}", unit = "{unit}"}} under [files.runs_columns]'
+            return f"Did you mean '{close}'? Set {meant} in the rig config."
+    return ""

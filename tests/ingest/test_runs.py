@@ -245,6 +245,14 @@ def test_a_missing_condition_column_is_one_fault_with_the_nearest_name(tmp_path)
     assert "Did you mean 'temprature_C'?" in fault.fix
 
 
+def test_a_condition_column_in_another_unit_is_named_with_that_unit(tmp_path):
+    folder = campaign(tmp_path, FULL.replace("aging_days", "aging_h").replace("80,4,", "80,96,"))
+    (fault,) = faults(folder)
+    line = 'aging_days = {name = "aging_h", unit = "h"}'
+    assert f"'aging_h'? Set {line} under [files.runs_columns] in the rig config." in fault.fix
+    assert channels(folder, f"[files.runs_columns]\n{line}")["a.csv"]["aging_days"] == 4.0
+
+
 def test_one_trace_file_whose_name_is_longer_than_a_file_system_takes_is_missing(tmp_path):
     table = FULL.replace("a.csv", 5000 * "a").replace("b.csv", "y.csv").replace("c.csv", "z.csv")
     (fault,) = faults(campaign(tmp_path, table))
