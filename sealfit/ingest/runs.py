@@ -53,7 +53,7 @@ from sealfit.ingest.derived_columns import (
     with_day_0,
 )
 from sealfit.ingest.file_names import Listing, TraceRef, channels_of, matched_part, name_parts, unmatched
-from sealfit.ingest.files import as_number, bad_file, cut_files
+from sealfit.ingest.files import as_number, bad_file, cut_files, read_bytes
 from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt
 from sealfit.ingest.reader import read_header, read_trace
@@ -235,15 +235,15 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     faults += found + _missing(entries, columns, config) + out_of_range(entries, columns)
     columns, found = add_order(entries, columns, config)
     faults += found
-    _stop_at_errors(faults)
+    files = [entry.file for entry in entries]
+    _stop_at_errors(faults, campaign, files)
     columns = as_set(columns)
     conditions = condition_keys(columns, len(entries), config)
     columns, found = add_runs(columns, conditions, measured, config.units.unit("speed"))
     faults += found
     columns = add_repeats(add_specimens(columns, conditions))
     faults += disagreements(entries, columns, conditions)
-    _stop_at_errors(faults)
-    files = [entry.file for entry in entries]
+    _stop_at_errors(faults, campaign, files)
     cut = cut_files(campaign, [file for file in files if kind_of(file, config.trace) == "csv"])
     return Listing(files, _set_speed(columns), conditions, cut), faults
 
@@ -261,10 +261,17 @@ def _set_speed(columns: Columns) -> Columns:
     return renamed
 
 
-def _stop_at_errors(faults: Sequence[Fault]) -> None:
+def _stop_at_errors(faults: Sequence[Fault], campaign: Path | None = None, files: Sequence[str] = ()) -> None:
+    """Raise `CampaignError` if there are errors of the campaign, with those of opening its files."""
     errors = [fault for fault in faults if fault.severity == "error" and fault.action == "stopped"]
-    if errors:
-        raise CampaignError(errors)
+    if not errors:
+        return
+    for file in dict.fromkeys(files):
+        try:
+            read_bytes(campaign, file, head=True)
+        except BadFile as error:
+            errors += error.faults
+    raise CampaignError(errors)
 
 
 def _config_faults(config: Config) -> list[Fault]:

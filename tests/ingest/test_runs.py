@@ -238,6 +238,13 @@ def test_every_fault_is_told_at_once(tmp_path):
     }
 
 
+def test_files_that_cannot_be_opened_are_told_with_the_faults_of_the_table(tmp_path):
+    folder = campaign(tmp_path, FULL.replace("8,49.03", "8,-1"), files=("a.csv", "c.csv"))
+    (folder / "a.csv").write_text("")
+    found = [(fault.file, fault.check) for fault in faults(folder)]
+    assert found == [("runs.csv", "out_of_range"), ("a.csv", "empty_file"), ("b.csv", "missing_file")]
+
+
 def test_a_missing_condition_column_is_one_fault_with_the_nearest_name(tmp_path):
     table = FULL.replace("temperature_C", "temprature_C")
     (fault,) = faults(campaign(tmp_path, table))
