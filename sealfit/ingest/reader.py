@@ -114,7 +114,7 @@ def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Cells,
     try:
         ours = locate(layout, len(layout.names) or width, settings, file)
     except BadFile as error:
-        raise _names_below(error, layout, body, settings) from None
+        raise _names_elsewhere(error, layout, body, settings) from None
     cells = read_cells(body, layout, settings, _numeric(ours, settings), file)
     return replace(cells, faults=(*cut, *cells.faults)), ours, layout
 
@@ -137,14 +137,19 @@ def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat, file: str)
         raise bad_file(file, "too_few_cells", reason, fix, line=layout.first_line)
 
 
-def _names_below(error: BadFile, layout: Layout, body: bytes, settings: TraceFormat) -> BadFile:
-    """Return the error, with the line in which the names of the columns stand if it is a later one."""
+def _names_elsewhere(error: BadFile, layout: Layout, body: bytes, settings: TraceFormat) -> BadFile:
+    """Return the error, or another one if the names of the columns stand in another line, which it names."""
     wanted = {name for name in settings.their_columns.values() if isinstance(name, str)}
-    lines = body[:HEAD_BYTES].decode("utf-8", "replace").split("\n") if wanted else []
-    for number, line in enumerate(lines, start=layout.first_line):
+    if layout.names_line is None or wanted <= set(layout.names):
+        return error
+    lines = [*layout.header, *body[:HEAD_BYTES].decode("utf-8", "replace").split("\n")]
+    for number, line in enumerate(lines, start=1):
         if wanted <= {cell.strip() for cell in split_line(line, settings.delimiter)}:
-            fix = f"The names stand in line {number}: set header_lines = {number} under [trace]."
-            return BadFile(*(replace(fault, fix=fix) for fault in error.faults))
+            instead = " in place of header_ends_at" if settings.header_ends_at is not None else ""
+            count = number + len(layout.header) - layout.names_line
+            fix = f"They stand in line {number}: set header_lines = {count}{instead} under [trace]."
+            reason = "the names of the columns do not stand in this line."
+            return BadFile(replace(error.fault, reason=reason, column=None, fix=fix))
     return error
 
 

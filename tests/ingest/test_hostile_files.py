@@ -8,7 +8,7 @@ import pytest
 from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, read, refused, trace
 
 from sealfit.config import load_config
-from sealfit.errors import CampaignError, ConfigError, Fault, grouped, told
+from sealfit.errors import BadFile, CampaignError, ConfigError, Fault, grouped, told
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
@@ -30,13 +30,28 @@ c.csv,2,5
         (b"\xff\xfe", "is empty", "Export it again"),
         (b"<!DOCTYPE html><p>no</p>", "is a web page, not a table", "as CSV"),
         (b'{"time_s": [0, 1]}', "is a JSON file, not a table", "as CSV"),
-        (f"Rig 7, oil 3\n{csv_of(ROWS)}", "no such column", "in line 2: set header_lines = 2"),
+        (f"Rig 7, oil 3\n{csv_of(ROWS)}", "names of the columns", "in line 2: set header_lines = 2 under"),
         (csv_of(ROWS).replace("time_s", "'time_s'"), "no such column", "Did you mean \"'time_s'\"?"),
     ],
 )
 def test_what_is_not_a_table_is_called_what_it_is(tmp_path, content, reason, fix):
     fault = refused(tmp_path, content)
     assert reason in fault.reason
+    assert fix in fault.fix
+
+
+@pytest.mark.parametrize(
+    ("header", "fix"),
+    [
+        ("header_lines = 5", "line 1: set header_lines = 1 under"),
+        ("header_lines = 5\nunits_row = true", "line 1: set header_lines = 2 under"),
+        ("header_ends_at = '^0.3'", "line 1: set header_lines = 1 in place of header_ends_at under"),
+    ],
+)
+def test_a_header_that_is_said_to_be_too_long_is_one_fault(tmp_path, header, fix):
+    with pytest.raises(BadFile) as caught:
+        read(tmp_path, csv_of(ROWS), f"[trace]\n{header}\n")
+    (fault,) = caught.value.faults
     assert fix in fault.fix
 
 
