@@ -250,8 +250,9 @@ RUBBERS = {
     "ptfe",
 }  # fmt: skip
 DIRECTIONS = {
-    **dict.fromkeys(("fwd", "forward", "vor", "hin", "pos", "up", "push", "cw"), 1),
-    **dict.fromkeys(("bwd", "rev", "back", "backward", "rueck", "her", "neg", "down", "pull", "ccw"), -1),
+    **dict.fromkeys(("fwd", "forward", "vor", "vorwaerts", "vorwärts", "hin", "pos", "up", "push", "cw"), 1),
+    **dict.fromkeys(("bwd", "rev", "back", "backward", "her", "neg", "down", "pull", "ccw"), -1),
+    **dict.fromkeys(("zurueck", "zurück", "rueck", "rück", "rueckwaerts", "rückwärts"), -1),
 }
 
 

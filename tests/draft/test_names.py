@@ -75,8 +75,9 @@ def test_units_and_signs_in_names(files, expected):
     assert told(files) == pytest.approx(expected)
 
 
-def test_a_word_for_the_other_direction_makes_the_speed_negative():
-    files = made("d{d}_v{v}_{w}.csv", d=(1, 2), v=(5, 10), w=("fwd", "rev"))
+@pytest.mark.parametrize("words", [("fwd", "rev"), ("vor", "zurueck"), ("Hin", "Rück")])
+def test_a_word_for_the_other_direction_makes_the_speed_negative(words):
+    files = made("d{d}_v{v}_{w}.csv", d=(1, 2), v=(5, 10), w=words)
     assert told(files, 1)["speed_mm_s"] == -5.0
 
 
