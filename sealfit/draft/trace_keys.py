@@ -308,7 +308,7 @@ def _other_columns(found: Found, roles: Roles, clock: str, notes: Notes) -> None
     texts = [name for name in words if name and name != clock]
     if roles.speed is not None and roles.displacement is not None:
         ignored.append(roles.speed)
-    if ignored or texts or one.width > len(one.numbers):
+    if ignored or texts or one.width > len(one.numbers) + bool(clock):
         same = {c.position: f", the same signal as column {c.copy_of}" for c in ignored if c.copy_of}
         shown = [c.place + same.get(c.position, "") for c in ignored]
         shown += [f"'{name}' (text)" for name in texts]

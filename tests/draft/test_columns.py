@@ -1,5 +1,7 @@
 """Which column is what, by name, unit and behaviour; how files are written."""
 
+from datetime import timedelta
+
 import exports
 import numpy as np
 import pytest
@@ -272,6 +274,17 @@ def test_the_line_for_spreadsheets_is_header(tmp_path):
     made = campaign(tmp_path, exports.slots, "sep=;\nZeit s;Weg mm;Kraft N\n", delimiter=";")
     assert slots(made) == {"time_s": "Zeit s", "displacement_mm": "Weg mm", "force_N": "Kraft N"}
     assert parse_config(made.text, "rig.toml").trace.header_lines == 2
+
+
+def test_a_column_of_times_of_day_is_not_empty(tmp_path):
+    for one in exports.records(days=(4,), speeds=SPEEDS, repeats=(1,)):
+        rows = zip(*exports.slots(one), strict=True)
+        lines = [
+            f"{one.started + timedelta(seconds=float(t)):%H:%M:%S.%f};{x:.4f};{f:.4f}" for t, x, f in rows
+        ]
+        exports.write(tmp_path, f"d4_v{one.speed:g}.csv", "\n".join(["Uhrzeit;Weg [mm];Kraft [N]", *lines]))
+    trace = parse_config(draft(tmp_path).text, "rig.toml").trace
+    assert (trace.columns["time_s"].name, trace.other_columns) == ("Uhrzeit", "channels")
 
 
 def test_a_set_point_is_left_for_what_was_measured(tmp_path):
