@@ -14,7 +14,7 @@ from sealfit.config import AGING_CONDITION, Files
 from sealfit.draft.columns import Roles
 from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import CLOCK, Dialect
-from sealfit.draft.file_names import HEIGHT_FROM, Names, Part, signed_speed
+from sealfit.draft.file_names import FEW, HEIGHT_FROM, Names, Part, signed_speed
 from sealfit.draft.files_found import Found, RunsTable
 from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import channels_of, name_parts
@@ -138,7 +138,10 @@ def _renamed(names: Names, part: Part, ours: str, group: str, why: str) -> Names
 
 
 def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
-    """Return the names without a repeat that does not tell files of the same settings apart."""
+    """Return the names without a repeat that does not tell files of the same settings apart.
+
+    Where settings, repeat and unknown words do so, each word has runs of its own.
+    """
     repeat = next((part for part in names.parts if part.ours == "repeat"), None)
     if repeat is None:
         return names
@@ -146,14 +149,24 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
     of_run = names.given - {"started_at"}
     if aging := names.given & set(AGING_CONDITION):
         of_run = {*aging, "rubber", "specimen_id", "speed_mm_s", "speed_rpm", "load_N", "repeat"}
-    keys = Counter(tuple((name, one.get(name)) for name in sorted(of_run)) for one in said.values() if one)
+    keys = _keys(said, of_run)
     if not keys or max(keys.values()) == 1:
         return names
+    words = {part.ours for part in names.parts if part.ours.startswith("label_") and len(part.texts) <= FEW}
+    if "speed_mm_s" in of_run & names.given and max(_keys(said, of_run | words).values()) == 1:
+        of_run = (of_run | words | {"direction"}) - {"repeat"}
+        template = " ".join(f"{{{part.group}}}" for part in names.parts if part.ours in of_run)
+        return replace(names, columns={**names.columns, "run_id": template})
     count = sum(number for number in keys.values() if number > 1)
-    reason = f"the repeat in names does not tell {count} files apart that are named alike otherwise."
+    reason = f"the repeat in names does not tell {count} files apart that have the same settings."
     fix = "It is not used; repeats are numbered in the order of the files."
     notes.doubt("files.name_pattern", reason, fix)
     return _without(names, repeat)
+
+
+def _keys(said: Mapping[str, dict], columns: Collection[str]) -> Counter:
+    """Return how many files the names give the same values of these columns."""
+    return Counter(tuple((name, one.get(name)) for name in sorted(columns)) for one in said.values() if one)
 
 
 def _unaged_apart(names: Names, found: Found) -> Names:
@@ -161,7 +174,7 @@ def _unaged_apart(names: Names, found: Found) -> Names:
     series = [part for part in names.parts if part.ours in AGING_CONDITION and part.group]
     if "specimen_id" in names.given or "aging_days" not in names.given or len(series) < 2:
         return names
-    alike = names.given - {*AGING_CONDITION, "started_at"}
+    alike = names.given - {*AGING_CONDITION, "started_at", "run_id"}
     unaged = [one for one in values_by_file(names, found.traces).values() if one.get("aging_days") == 0]
     keys = Counter(tuple(one.get(name) for name in sorted(alike)) for one in unaged)
     if not keys or max(keys.values()) == 1:

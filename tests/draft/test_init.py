@@ -351,6 +351,18 @@ def test_a_repeat_that_does_not_tell_files_apart_is_not_used(tmp_path):
     assert sorted(ref.channels["repeat"] for ref in listing) == [1, 1, 2, 2, 3, 4]
 
 
+def test_files_that_an_unknown_word_tells_apart_keep_their_repeats(tmp_path):
+    for one in exports.records(days=(1, 4), speeds=(1.0, 5.0)):
+        for word in ("links", "rechts"):
+            exports.write(tmp_path, f"d{one.days}_v{one.speed:g}_{word}_r{one.repeat}.csv", plain(one))
+    made = draft(tmp_path)
+    assert not any("does not tell" in doubt.reason for doubt in made.doubts)
+    listing, _ = list_traces(tmp_path, parse_config(made.text, "rig.toml"))
+    assert [(ref.channels["run_id"], ref.channels["repeat"]) for ref in list(listing)[:4]] == [
+        ("1 1 links", 1), ("1 1 links", 2), ("1 1 rechts", 1), ("1 1 rechts", 2),
+    ]  # fmt: skip
+
+
 def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_known_is_said(tmp_path):
     rows = ["File,Ofen,Tage,Datum,Uhrzeit,Gewicht [kg],v [mm/min]"]
     for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
