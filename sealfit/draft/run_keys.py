@@ -174,10 +174,10 @@ def _unaged_apart(names: Names, found: Found) -> Names:
     series = [part for part in names.parts if part.ours in AGING_CONDITION and part.group]
     if "specimen_id" in names.given or "aging_days" not in names.given or len(series) < 2:
         return names
-    alike = names.given - {*AGING_CONDITION, "started_at", "run_id"}
+    alike = sorted(names.given - {*AGING_CONDITION, "started_at", "run_id"})
     unaged = [one for one in values_by_file(names, found.traces).values() if one.get("aging_days") == 0]
-    keys = Counter(tuple(one.get(name) for name in sorted(alike)) for one in unaged)
-    if not keys or max(keys.values()) == 1:
+    both = {tuple(tuple(map(one.get, own)) for own in (alike, AGING_CONDITION)) for one in unaged}
+    if len(both) == len({otherwise for otherwise, _ in both}):
         return names
     template = " ".join(f"{{{part.group}}}" for part in series)
     return replace(names, columns={**names.columns, "specimen_id": template})

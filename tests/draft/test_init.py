@@ -290,6 +290,12 @@ def test_unaged_rubber_of_several_series_is_a_piece_in_each(tmp_path):
     assert sorted(runs.loc[runs["aging_days"] == 0, "specimen_id"].unique()) == ["60 0", "80 0"]
 
 
+def test_unaged_rubber_of_one_series_is_one_piece(tmp_path):
+    for one in exports.records(days=(0, 4), speeds=(5.0,), repeats=(1, 2)):
+        exports.write(tmp_path, f"{one.number}_T{one.temperature}_d{one.days}_v5_r1.csv", plain(one))
+    assert "specimen_id" not in parse_config(draft(tmp_path).text, "rig.toml").files.columns
+
+
 def test_a_table_of_runs_in_other_units_is_converted_and_its_doubts_are_said(tmp_path):
     for number in (1, 2):
         (one,) = exports.records(days=(number,), speeds=(5.0,), repeats=(1,))
