@@ -7,7 +7,8 @@ units are converted by `conversion`, once, when they are read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cache
@@ -169,25 +170,27 @@ def conversion(unit: str, to: str) -> Conversion:
 def _registry():
     import pint  # here, as it takes half a second to load and few configs name a unit
 
-    return pint.UnitRegistry()
+    registry = pint.UnitRegistry(on_redefinition="ignore")
+    for length in ("", "c", "m"):  # pint's own Nm is one of textiles, metres per gram
+        registry.define(f"newton_{length}m = newton * {length}m = N{length}m")
+    return registry
 
 
 @cache
-def _dimension(unit: str) -> str | None:
-    """Return what dimension a unit is of, as text; None if there is no such unit."""
-    registry = _registry()
+def _dimension(unit: str) -> Hashable | None:
+    """Return what dimension a unit is of; None if there is no such unit."""
     try:
-        return str(dict(sorted(registry.Unit(unit).dimensionality.items())))
+        return _registry().Unit(unit).dimensionality
     except Exception:  # pint raises whatever the parser of Python does: a dozen kinds of errors
         return None
 
 
-def _name(dimension: str) -> str:
+def _name(dimension: Hashable) -> str:
     known = (name for name, units in _COMMON.items() if _dimension(units[0]) == dimension)
-    return next(known, f"dimension {dimension}")
+    return next(known, re.sub(r"[\[\]]", "", str(dimension)))
 
 
-def _nearest(unit: str, dimension: str) -> str:
+def _nearest(unit: str, dimension: Hashable) -> str:
     """Return a fix: the unit of that dimension that is written most like `unit`."""
     own = [one for units in _COMMON.values() for one in units if _dimension(one) == dimension]
     close = get_close_matches(unit, own, n=1, cutoff=0.3)

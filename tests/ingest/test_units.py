@@ -17,6 +17,9 @@ BY_HAND = [  # (unit, ours, number, the number in our unit)
     ("K", "°C", 333.15, 60.0),
     ("h", "d", 96.0, 4.0),
     ("N*m", "mN m", 0.5, 500.0),
+    ("N*mm", "Nm", 500.0, 0.5),
+    ("kNm", "Ncm", 0.5, 50000.0),
+    ("mNm", "Nmm", 0.5, 0.5),
     ("1", "%", 0.8, 80.0),
 ]
 
@@ -127,6 +130,7 @@ def test_parts_of_file_names(tmp_path, rest):
         ("oven_C", "F", r"temperature \(°C\) is expected. Did you mean 'degF'\?"),
         ("force_N", "kgff", r"'kgff' is no known unit; force \(N\) is expected. Did you mean 'kgf'\?"),
         ("force_N", "N-", r"'N-' is no known unit"),
+        ("force_N", "mm/kg", r"the unit 'mm/kg' is one of length / mass; force \(N\) is expected."),
         ("displacement_mm", "MM", r"'MM' is .* length \(mm\) is expected. Did you mean 'mm'\?"),
     ],
 )
