@@ -61,7 +61,8 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     notes = [[] for _ in range(len(table))]
     before, after, conditions, code = _conditions(before, after, conditions, table, notes, config)
     _check_values(table, after, model, notes)
-    good = np.array([not note for note in notes]) & (code >= 0)
+    code = np.where([bool(note) for note in notes], -1, code)
+    good = code >= 0
     answer = np.full((len(table), len(FORCES)), np.nan)
     if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
         _note(notes, good, TESTED_ONLY)
@@ -212,7 +213,7 @@ def _note(notes: list[list[str]], points: np.ndarray, text: str) -> None:
 def _outside(
     table: pd.DataFrame, conditions: pd.DataFrame, code: np.ndarray, model: dict, notes: list, after: Model
 ) -> np.ndarray:
-    """Return which points are extrapolated; some get a note. They are predicted all the same."""
+    """Return which points are extrapolated, with a note each. They are predicted all the same."""
     ranges = model["ranges"]
     outside = np.zeros(len(table), dtype=bool)
     tested_count = len(model["conditions"]["condition"])
@@ -221,7 +222,9 @@ def _outside(
     if model["has_aging"]:
         for k in np.flatnonzero(code >= tested_count):
             own = days[:tested_count][series[:tested_count] == series[code[k]]]
-            outside[k] |= bool(days[code[k]] > own.max())
+            if days[code[k]] > own.max():
+                outside[k] = True
+                notes[k].append(f"aging_days is outside the tests: up to {own.max():g}")
     speed = np.abs(pd.to_numeric(table["speed_mm_s"], errors="coerce").to_numpy(dtype=float))
     for k in np.flatnonzero(code >= 0):
         tested = np.array(model["speeds_mm_s"][series[code[k]]])
@@ -230,17 +233,18 @@ def _outside(
             notes[k].append(
                 f"too few speeds for the friction between them; tested: {', '.join(f'{v:g}' for v in tested)}"
             )
-    read = {"speed_mm_s"} | {name for term in after.terms for name in term.channels}
-    if model["has_load"]:
-        read.add("load_N")
-    for name in read:
+    read = ["speed_mm_s", *(["load_N"] if model["has_load"] else [])]
+    read += [name for term in after.terms for name in term.channels]
+    for name in dict.fromkeys(read):
         tested = ranges.get(name)
         if not _is_range(tested) or name == "direction":
             continue
         values = pd.to_numeric(table[name], errors="coerce").to_numpy(dtype=float)
         values = np.abs(values) if name == "speed_mm_s" else values
         slack = BEYOND * max(abs(tested[0]), abs(tested[1]), 1e-12)
-        outside |= (values < tested[0] - slack) | (values > tested[1] + slack)
+        beyond = (code >= 0) & ((values < tested[0] - slack) | (values > tested[1] + slack))
+        _note(notes, beyond, f"{name} is outside the tests: {tested[0]:g} to {tested[1]:g}")
+        outside |= beyond
     return outside
 
 

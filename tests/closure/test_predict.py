@@ -46,3 +46,14 @@ def test_unaged_rubber_may_be_named_as_in_a_runs_table():
         other = predict(model, points.assign(aging_days=word, temperature_C="RT", compression_ratio_pct=None))
         assert other["force_after_N"].tolist() == answer["force_after_N"].tolist()
         assert (other["aging_days"] == word).all()
+
+
+def test_a_point_outside_the_tests_says_which_of_its_numbers_is(of_three_speeds):
+    bins, model = of_three_speeds
+    point = bins[bins["aging_days"] > 0].head(1)
+    answer = predict(model, point.assign(speed_mm_s=-100.0, load_N=1e4, aging_days=1e3))
+    assert answer["extrapolated"].all()
+    (note,) = answer["note"]
+    beyond = [text.partition(" is outside the tests: ")[0] for text in note.split("; ") if "outside" in text]
+    assert beyond == ["aging_days", "speed_mm_s", "load_N"]
+    assert "speed_mm_s is outside the tests: 1 to 64" in note
