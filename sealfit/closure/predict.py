@@ -136,8 +136,9 @@ def _with_derived(table: pd.DataFrame, model: dict) -> pd.DataFrame:
         first = pd.Timestamp(model["first_started_at"])
         started = pd.to_datetime(table["started_at"], errors="coerce", utc=first.tzinfo is not None)
         table["elapsed_h"] = (started - first).dt.total_seconds() / 3600
-    if "direction" not in table and "speed_mm_s" in table:
-        table["direction"] = np.sign(table["speed_mm_s"])
+    if "speed_mm_s" in table:  # a direction that is not given is that of the speed
+        sign = np.sign(table["speed_mm_s"])
+        table["direction"] = pd.to_numeric(table.get("direction", sign).fillna(sign), errors="coerce")
     if POWER not in table and {"load_N", "speed_mm_s"} <= set(table):
         table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
     return table
@@ -197,7 +198,10 @@ def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -
         _note(notes, ~((load > 0) & (load < OVERLOAD)), "load_N must be a positive number")
     for name in dict.fromkeys(n for term in after.terms for n in term.channels):
         tested = model["ranges"].get(name)
-        if _is_range(tested):
+        if name == "direction":
+            agrees = table[name].to_numpy() == np.sign(speed)
+            _note(notes, slides & ~agrees, "direction must be 1 or -1, the sign of speed_mm_s")
+        elif _is_range(tested):
             table[name] = pd.to_numeric(table[name], errors="coerce").astype(float)
             _note(notes, ~(np.abs(table[name].to_numpy()) < OVERLOAD), f"{name} must be a number")
         elif isinstance(tested, list):

@@ -57,3 +57,17 @@ def test_a_point_outside_the_tests_says_which_of_its_numbers_is(of_three_speeds)
     beyond = [text.partition(" is outside the tests: ")[0] for text in note.split("; ") if "outside" in text]
     assert beyond == ["aging_days", "speed_mm_s", "load_N"]
     assert "speed_mm_s is outside the tests: 1 to 64" in note
+
+
+def test_the_direction_of_a_point_is_that_of_its_speed():
+    bins = make_bins(directions=(1, -1), bins=6, repeats=2, effect=lambda table, force: force + 1.5)
+    model = close_loop(bins, make_traces(bins), TWO_FOLDS).model
+    points = bins.groupby("direction").head(1).drop(columns="direction")
+    own = np.sign(points["speed_mm_s"])
+    answer = predict(model, points)["force_after_N"].tolist()
+    assert predict(model, points.assign(direction=own))["force_after_N"].tolist() == answer
+    assert predict(model, points.assign(direction=np.nan))["force_after_N"].tolist() == answer
+    for wrong in (2 * own, -own, "up"):
+        refused = predict(model, points.assign(direction=wrong))
+        assert refused["force_after_N"].isna().all()
+        assert (refused["note"] == "direction must be 1 or -1, the sign of speed_mm_s").all()
