@@ -252,7 +252,7 @@ def swapped_faults(force_N: np.ndarray, load_N: np.ndarray, config: Config) -> l
 
 
 def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
-    """Return that friction force over load is no coefficient of friction, in some conditions or in all.
+    """Return that friction force over load is no coefficient of friction, in some files or in all.
 
     Rows of `steady` with `used` false, and those without a load, are left out. Where force and load are not
     of one dimension (a torque over a load), nothing is said.
@@ -265,14 +265,17 @@ def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
         return []
     rows = steady[steady["used"].to_numpy(bool) & (np.abs(steady["load_N"].to_numpy(float)) > 0)]
     ratio = in_load_units(rows["force_N"].abs()) / rows["load_N"].abs()
-    mu = ratio.groupby(rows["condition"].to_numpy()).mean()
+    mu = ratio.groupby(rows["file"].to_numpy(), sort=False).mean()
     faults = []
     for wrong, fix in ((mu > MU_RANGE[1], _HEAVIER), (mu < MU_RANGE[0], _LIGHTER)):
         if wrong.any():
             middle = float(mu[wrong].median())
             if middle > IN_MN:
                 fix = f"Is the force in mN? {with_unit('force_N', 'mN', config)}"
-            where = f"in {wrong.sum()} of {len(mu)} conditions"
+            where = f"in {wrong.sum()} of {len(mu)} files"
+            if wrong.sum() < len(mu) / 2:  # exceptions, not a unit of the campaign
+                where += f", such as {wrong.idxmax()}"
+                fix = "Look at what differs in these files: the range of the sensor, or the load in runs.csv."
             reason = f"the friction force is {middle:.2g} times the load {where}; "
             reason += f"coefficients of friction are {MU_RANGE[0]:g} to {MU_RANGE[1]:g}."
             faults.append(Fault("improbable_load", reason, column="load_N", value=middle, fix=fix, **KEPT))

@@ -309,17 +309,22 @@ def test_the_quality_table_has_a_row_per_finding_and_one_for_every_sound_file():
 
 
 def steady_of(load, force=47.07, **more):
-    rows = {"condition": ["a", "a", "b"], "force_N": [force, -force, force], "load_N": load, "used": True}
+    rows = {
+        "file": ["a.csv", "a.csv", "b.csv"],
+        "force_N": [force, -force, force],
+        "load_N": load,
+        "used": True,
+    }
     return pd.DataFrame(rows | more)
 
 
 @pytest.mark.parametrize(
     ("load", "said", "fix"),
     [
-        (49.03e-3, "9.6e+02 times the load in 2 of 2 conditions", "mN"),  # or the force in mN
-        (5.0, "9.4 times the load in 2 of 2 conditions", "kgf"),  # 5 kg
-        (5000.0, "0.0094 times the load in 2 of 2 conditions", "gf"),  # 5000 g
-        ([49.03, 49.03, 5.0], "9.4 times the load in 1 of 2 conditions", "kgf"),
+        (49.03e-3, "9.6e+02 times the load in 2 of 2 files", "mN"),  # or the force in mN
+        (5.0, "9.4 times the load in 2 of 2 files", "kgf"),  # 5 kg
+        (5000.0, "0.0094 times the load in 2 of 2 files", "gf"),  # 5000 g
+        ([49.03, 49.03, 5.0], "9.4 times the load in 1 of 2 files", "kgf"),
     ],
 )
 def test_a_load_in_kg_or_g_is_a_warning(load, said, fix):
@@ -332,6 +337,15 @@ def test_a_load_in_kg_or_g_is_a_warning(load, said, fix):
     )
     assert said in fault.reason
     assert f'unit = "{fix}"' in fault.fix
+
+
+def test_of_a_few_improbable_files_the_worst_is_named():
+    steady = pd.DataFrame(
+        {"file": ["a.csv", "b.csv", "c.csv"], "force_N": [30.0, 3100.0, 31.0], "load_N": 49.03, "used": True}
+    )
+    (fault,) = improbable_loads(steady, Config())
+    assert "63 times the load in 1 of 3 files, such as b.csv" in fault.reason
+    assert "unit =" not in fault.fix
 
 
 def test_true_loads_are_not_blamed_nor_what_is_not_used_nor_a_torque():
