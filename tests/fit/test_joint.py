@@ -168,9 +168,21 @@ def test_a_curve_that_one_series_shows_is_that_of_all_with_three_speeds():
     assert declare(rows.subset(rows.values("temperature_C") == 80.0)).stribeck[noisy] == "viscous"
 
 
-def test_a_straight_line_through_three_speeds_is_left_one_in_half_of_the_series():
-    rows, forms = rows_of(speeds=(1.0, 8.0, 64.0), repeats=2, bins=4), []
-    for seed in range(10):
+def test_two_speeds_have_the_curve_of_another_series_of_their_rubber():
+    """Between a slow and a fast speed friction may fall, which no viscous force explains."""
+    rows = rows_of(speeds=(1.0, 8.0, 100.0), temperatures=(60.0, 80.0), days=(4.0,), repeats=2, bins=4)
+    rows = rows.subset((rows.values("aging_days") > 0) | (np.abs(rows.speed) != 8.0))
+    fitted = fit_declared(rows)
+    assert fitted.model.declared.stribeck["unaged"] == "interpolated"
+    fresh = rows.values("aging_days") == 0
+    assert np.abs(fitted.residual[fresh]).max() < 0.1 * np.abs(rows.force[fresh]).max()
+    two = rows.subset(fresh)
+    assert declare(two).stribeck["unaged"] == "viscous"
+
+
+def test_a_straight_line_through_three_speeds_is_left_one_in_half_of_the_campaigns():
+    rows, forms = rows_of(speeds=(1.0, 8.0, 64.0), temperatures=(60.0,), repeats=2, bins=4), []
+    for seed in range(30):
         files = np.random.default_rng(seed).normal(1, 0.01, rows.groups.starts["file"].size)[
             rows.codes("file")
         ]

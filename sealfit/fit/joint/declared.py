@@ -33,8 +33,6 @@ DROP_SHARE = 0.5
 # campaigns drawn at random with at most 27 files, 0.5 in place of 0.15 lowered the error against the truth in
 # three, 2 to 35 times, and raised it in one, by 8 %.
 REJECTED = 0.5
-# The same, times the number of series, for a curve in all series with three speeds.
-REJECTED_ELSEWHERE = 0.01
 # A residual sum of squares below this share of the total is rounding.
 ROUNDING = 1e-24
 
@@ -67,10 +65,10 @@ def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     """Return the declared model that these conditions and speeds determine.
 
     A series needs four speeds in one direction for Eq. 14, or three at which friction is not a straight line
-    ("interpolated"), and two for the viscous term. Eq. 15 needs three days, the unaged day included.
-    Parameters that are not determined are left out. Speeds are counted within one direction: an offset
-    between directions could be taken for a Stribeck curve. The result is cached. A part of a campaign with
-    the same conditions takes the model of the campaign, `as_in`.
+    ("interpolated"), and two for the viscous term. Two will do if another series of its rubber has a curve.
+    Eq. 15 needs three days, the unaged day included. Parameters that are not determined are left out. Speeds
+    are counted within one direction: an offset between directions could be taken for a Stribeck curve. The
+    result is cached. A part of a campaign with the same conditions takes the model of the campaign, `as_in`.
     """
     return rows.cache.once(("declared",), lambda: _declare(rows) if as_in is None else declare(as_in))
 
@@ -145,7 +143,8 @@ def series_of_curve(conditions, aging: bool) -> np.ndarray:
 def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
     """Return the form of the speed dependence that the speeds of each series determine.
 
-    With three speeds it is a line, unless a line is rejected in this series or, more surely, in another.
+    With three speeds it is a line, unless a line is rejected. It is a curve, too, if another series of the
+    rubber has one: an effect such as warming may hide the curve in one series.
     """
     number, names = pd.factorize(series_of)
     key = 2 * number[rows.condition] + (rows.speed > 0)
@@ -155,16 +154,19 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
     most = np.reshape(levels, (names.size, 2)).max(axis=1)  # of the two directions
     three = [k for k, m in enumerate(most) if SPEEDS_FOR_STRIBECK <= m < SPEEDS_BETWEEN]
     p_values = {k: _p_of_lines(rows, np.flatnonzero(number[rows.condition] == k)) for k in three}
-    elsewhere = len(three) * min(p_values.values(), default=1.0) < REJECTED_ELSEWHERE
     forms = {}
     for k, (name, m) in enumerate(zip(names, most, strict=True)):
         if m >= SPEEDS_BETWEEN:
             forms[name] = "full"
-        elif k in p_values and (elsewhere or p_values[k] < REJECTED):
+        elif k in p_values and p_values[k] < REJECTED:
             forms[name] = "interpolated"
         else:
             forms[name] = "viscous" if m >= SPEEDS_FOR_VISCOUS else "constant"
-    return forms
+    owners = list(zip(series_of, rows.conditions["rubber"], strict=True))
+    curved = {rubber for name, rubber in owners if forms[name] in CURVED}
+    return forms | {
+        name: "interpolated" for name, rubber in owners if forms[name] == "viscous" and rubber in curved
+    }
 
 
 def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
