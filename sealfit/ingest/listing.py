@@ -315,12 +315,16 @@ def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: C
     if not entries or entries[0].line is None:
         return []
     table, listed = entries[0].table, {entry.file for entry in entries}
-    there = files_beside(campaign, listed - outside)
+    there, vain = files_beside(campaign, listed - outside), []
     if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
-        there.update(glob_names(campaign, config.files))
+        there.update(found := glob_names(campaign, config.files))
+        if not found:
+            reason = f"no file matches files.glob = {config.files.glob!r}."
+            place = {"file": f"config '{config.name}'", "fix": "Correct it, or take it out."}
+            vain = [Fault("config", reason, **place, **KEPT)]
     files = there - listed - {table}
     reason, fix = f"is not in {table}.", f"Add it to {table} if it is a trace."
-    return [
+    return vain + [
         Fault("not_listed", reason, file=f, fix=fix, **PASSED_OVER) if _is_utf8(f) else _odd_name(f, "info")
         for f in sorted(files, key=natural)
         if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)

@@ -296,6 +296,13 @@ def test_one_missing_trace_is_left_to_reading_and_unlisted_ones_are_told(tmp_pat
     ]
 
 
+def test_a_glob_beside_runs_csv_that_matches_nothing_is_warned_of(tmp_path):
+    folder = campaign(tmp_path, FULL)
+    assert list_traces(folder, config("files.glob = '*.csv'"))[1] == []
+    (fault,) = list_traces(folder, config("files.glob = '*.txt'"))[1]
+    assert (fault.severity, fault.reason) == ("warning", "no file matches files.glob = '*.txt'.")
+
+
 def test_misspelt_channels_and_slips_in_them_are_warned_of(tmp_path):
     table = FULL.replace("speed_mm_s", "speed_mms")
     _, found = list_traces(campaign(tmp_path, table), config())
