@@ -224,6 +224,23 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
     return [fault for _, fault in sorted(found, key=lambda one: one[0])]
 
 
+def swapped_columns(entries: list[Entry], columns: Columns) -> list[Fault]:
+    """Return that unaged rubber has 100 degrees and a compression other than 100, as if these were swapped.
+
+    Day 0 may have temperature and compression of an aged condition: nobody reads them there.
+    """
+    none = [None] * len(entries)
+    days, *others = (columns.get(name, none) for name in ("aging_days", *_AGED_ONLY))
+    pairs = list(zip(*others, strict=True))
+    aged = {pair for pair, day in zip(pairs, days, strict=True) if day != 0}
+    for entry, pair, day in zip(entries, pairs, days, strict=True):
+        if day == 0 and pair[0] == 100 and pair[1] not in (100, None) and pair not in aged:
+            reason = f"unaged rubber is at 100 °C with a compression ratio of {_text(pair[1])} %."
+            fix = "Are compression_ratio_pct and temperature_C swapped? Not compressed is 100 %."
+            return [entry.fault("swapped_columns", reason, _AGED_ONLY[0], value=pair[0], fix=fix, **KEPT)]
+    return []
+
+
 # ---------------------------------------------------------------- derive
 # Everything here works on what is already known of each file, and reads none.
 

@@ -48,6 +48,7 @@ from sealfit.ingest.derived_columns import (
     in_our_units,
     of_its_kind,
     out_of_range,
+    swapped_columns,
     to_values,
     with_computed,
     with_day_0,
@@ -233,6 +234,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     entries, columns = _kept(kept, entries, columns)
     columns, measured = in_order(columns), [measured[i] for i in kept]
     faults += found + _missing(entries, columns, config) + out_of_range(entries, columns)
+    faults += swapped_columns(entries, columns)
     columns, found = add_order(entries, columns, config)
     faults += found
     files = [entry.file for entry in entries]

@@ -303,6 +303,21 @@ def test_a_glob_beside_runs_csv_that_matches_nothing_is_warned_of(tmp_path):
     assert (fault.severity, fault.reason) == ("warning", "no file matches files.glob = '*.txt'.")
 
 
+@pytest.mark.parametrize(
+    ("unaged", "aged", "checks"),
+    [
+        ("100,23", "80,60", ["swapped_columns"]),
+        ("23,100", "60,80", []),
+        ("100,25", "100,25", []),  # as planned, and not read
+        ("100,", "60,80", []),
+    ],
+)
+def test_swapped_temperature_and_compression_are_warned_of_by_unaged_rubber(tmp_path, unaged, aged, checks):
+    table = FULL.replace("60,80,8", f"{unaged},0").replace("60,80,4", f"{aged},4")
+    _, found = list_traces(campaign(tmp_path, table), config())
+    assert [fault.check for fault in found if fault.severity == "warning"] == checks
+
+
 def test_misspelt_channels_and_slips_in_them_are_warned_of(tmp_path):
     table = FULL.replace("speed_mm_s", "speed_mms")
     _, found = list_traces(campaign(tmp_path, table), config())
