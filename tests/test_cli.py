@@ -514,10 +514,15 @@ def test_wrong_places_come_with_the_likeliest_right_one(sealfit, parts, campaign
     sealfit("run", campaign, "--out", out)
     assert f"Did you mean {out}?" in fault("fit-steady", tmp_path / "oot")
     assert "sealfit run CAMPAIGN --out" in fault("fit-steady", tmp_path)
-    assert "there is no table of points" in fault("predict", out, "--points", "no.csv", "--output", "q.csv")
+    assert "no.csv: there is no such table of points. Fix" in fault(
+        "predict", out, "--points", "no.csv", "--output", "q.csv"
+    )
     (tmp_path / "points.csv").write_text("a\n1\n")
     arguments = ("--points", tmp_path / "point.csv", "--output", tmp_path / "q.csv")
     assert f"Did you mean {tmp_path / 'points.csv'}?" in fault("predict", out, *arguments)
+    for asked in (("check", "gone"), ("predict", out, "--points", "gone", "--output", "q.csv")):
+        (told,) = sealfit(*asked, "--json").json["errors"]
+        assert (told["file"], told["fix"]) == ("gone", "Fix the path.")
 
 
 def test_effects_are_never_read_from_a_campaign(sealfit, parts, campaign, out):
@@ -624,4 +629,4 @@ def test_simulate_names_campaign_and_truth_and_replaces_only_when_told(sealfit, 
     assert (made / "a.csv").read_text() == "one\n"
     assert sealfit("simulate", spec, "--out", made, "--force").code == 0
     assert (made / "a.csv").read_text() == "two\n"
-    assert "there is no spec" in sealfit("simulate", tmp_path / "none.toml", "--out", made).stderr
+    assert "there is no such spec" in sealfit("simulate", tmp_path / "none.toml", "--out", made).stderr

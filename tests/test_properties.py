@@ -135,7 +135,7 @@ def test_json_and_the_summary_say_the_same(table, tmp_path):
     said = CliRunner().invoke(app, asked).stdout
     assert "standard deviation of replicates 0.491, of batches 0.609" in said
     missing = CliRunner().invoke(app, ["fit-aging", "--values", "hardnes.csv", "--out", "out"])
-    assert "there is no table of values" in str(missing.exception)
+    assert "there is no such table of values" in str(missing.exception)
 
 
 def test_the_page_says_at_its_top_that_a_law_does_not_fit(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from sealfit.store.manifest import STATE, ConfigCopy, fingerprint
 # The folders and files named on the command line; a missing one is refused with the closest existing name.
 
 RUNS = "runs.csv"
+FIX_PATH = "Fix the path."
 
 
 def possible_tables(config: Config) -> tuple[str, ...]:
@@ -36,9 +37,12 @@ def campaign_folder(path: Path, config: Config) -> Path:
         fix = f"Give the folder that holds {RUNS}."
         if path.name in RUNS_TABLES:
             fix = f"Give its folder: {quoted(path.parent)}"
-        raise CampaignError([Fault("campaign_folder", f"{path} is a file, not a campaign folder.", fix=fix)])
+        raise CampaignError(
+            [Fault("campaign_folder", "is a file, not a campaign folder.", str(path), fix=fix)]
+        )
     if not path.is_dir():
-        raise CampaignError([Fault("campaign_folder", f"there is no folder {path}.", fix=did_you_mean(path))])
+        fix = did_you_mean(path) or FIX_PATH
+        raise CampaignError([Fault("campaign_folder", "there is no such folder.", str(path), fix=fix)])
     if config.files.glob is None and config.files.runs_table is None and not runs_tables(path, config):
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
         names = sorted(child.name + ("/" if child.is_dir() else "") for child in path.iterdir())
@@ -60,7 +64,7 @@ def existing_out(out: Path) -> Path:
         return out
     fix = did_you_mean(out, lambda folder: (folder / STATE).is_file())
     fix = fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}"
-    raise RequestError(f"there is no folder {out}.", fix=fix)
+    raise RequestError("there is no such folder.", file=out, fix=fix)
 
 
 def existing_file(path: Path, what: str) -> Path:
@@ -68,8 +72,10 @@ def existing_file(path: Path, what: str) -> Path:
     if path.is_file():
         return path
     if path.is_dir():
-        raise RequestError(f"{path} is a folder, not a {what}.", fix="Give the file itself.")
-    raise RequestError(f"there is no {what} {path}.", fix=did_you_mean(path, Path.is_file))
+        raise RequestError(f"is a folder, not a {what}.", file=path, fix="Give the file itself.")
+    raise RequestError(
+        f"there is no such {what}.", file=path, fix=did_you_mean(path, Path.is_file) or FIX_PATH
+    )
 
 
 # ---------------------------------------------------------------- own effects
@@ -105,7 +111,7 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
         fix = f"Name the folder by {OPTION}, or move the config."
         raise ConfigError(reason, file=config.path, fix=fix)
     if not folder.is_dir():
-        fix = did_you_mean(folder) or "Fix the path."
+        fix = did_you_mean(folder) or FIX_PATH
         raise ConfigError(f"{said}: there is no folder {folder}.", fix=fix)
     for path in (folder, *sorted(folder.glob("*.py"))):
         if place := _place_of(path, data):

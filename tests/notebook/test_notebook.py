@@ -366,7 +366,7 @@ def test_missing_results_name_the_command_and_leave_what_is_there(out, tmp_path)
         _ = results.errors
     assert len(results.table("steady_fit"))
     shutil.rmtree(copy)
-    with pytest.raises(RequestError, match="there is no folder"):
+    with pytest.raises(RequestError, match="there is no such folder"):
         _ = results.runs
 
 
