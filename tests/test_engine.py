@@ -1,3 +1,4 @@
+import _thread
 import multiprocessing
 import os
 import pickle
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sealfit.engine.run_map import START, cores, run_map
+from sealfit.engine.run_map import START, _apply, cores, in_processes, run_map
 from sealfit.errors import CampaignError, Fault, RequestError, WorkerError
 
 HERE = Path(__file__).resolve().parent
@@ -202,6 +203,20 @@ def test_a_server_that_is_still_loading_does_not_see_ctrl_c(tmp_path):
         os.killpg(run.pid, signal.SIGINT)
         _, stderr = run.communicate(timeout=20)
     assert (run.returncode, stderr) == (130, "interrupted\n")
+
+
+def test_ctrl_c_waits_until_the_processes_have_started():
+    chunks = []
+
+    def interrupted():
+        for number in range(2):
+            _thread.interrupt_main()  # as a signal that another thread takes, whatever this one blocks
+            chunks.append(number)
+            yield pickle.dumps((square, [number]))
+
+    with pytest.raises(KeyboardInterrupt):
+        list(in_processes(_apply, interrupted(), 2, load=__name__))
+    assert chunks == [0, 1]
 
 
 def test_a_map_that_is_given_up_ends_its_processes():

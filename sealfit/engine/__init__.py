@@ -1,9 +1,13 @@
-"""Number of threads of linear algebra. It imports little, because every command imports it first."""
+"""Threads of linear algebra, memory and Ctrl-C. It imports little, because every command imports it first."""
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
+import signal
+import threading
+from collections.abc import Iterator
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -40,3 +44,20 @@ def claim_memory() -> None:
     csv.read_csv(BufferReader(b"x\n1\n"), csv.ReadOptions(use_threads=False))
     one = np.eye(64)
     solve_triangular(one @ one, one)
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Delay Ctrl-C until the block has ended, which moves files to OUT or starts processes."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield  # signals reach the main thread only
+        return
+    waiting: list[object] = []
+    signal.signal(signal.SIGINT, lambda *caught: waiting.append(caught))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if waiting:
+            signal.raise_signal(signal.SIGINT)

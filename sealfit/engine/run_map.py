@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, TypeVar
 
 from sealfit import __version__
-from sealfit.engine import claim_memory, one_thread
+from sealfit.engine import claim_memory, one_thread, undisturbed
 from sealfit.errors import RequestError, WorkerError
 
 if TYPE_CHECKING:
@@ -156,7 +156,8 @@ def in_processes(
     sent: deque[Future[list]] = deque()
 
     def send(count: int) -> None:
-        with _no_interrupt_for_children(), _main_out_of_sight():
+        # Undisturbed, because a process that has not started yet would not be ended below.
+        with undisturbed(), _no_interrupt_for_children(), _main_out_of_sight():
             sent.extend(executor.submit(apply, chunk) for chunk in islice(chunks, count))
 
     finished = False
@@ -184,8 +185,8 @@ def in_processes(
 def _no_interrupt_for_children() -> Iterator[None]:
     """Start processes that ignore Ctrl-C; the parent stops them, so that they print no traceback.
 
-    A process inherits the blocked signals of the thread that starts it. A Ctrl-C in between waits, and is not
-    lost.
+    A process inherits the blocked signals of the thread that starts it. Other threads do not block it, and
+    the main thread would handle it all the same.
     """
     resource_tracker.ensure_running()  # started here, because it unblocks Ctrl-C when it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 
 from sealfit import __version__
 from sealfit.config import Config, Files
+from sealfit.engine import undisturbed
 from sealfit.errors import ConfigError, OutError, RequestError, StaleError, quoted
 from sealfit.store import manifest, staged_writes
 from sealfit.store.manifest import STATE, ConfigCopy, Fingerprint, Properties, State, fingerprint, to_json
 from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
-from sealfit.store.staged_writes import PARQUET, PROVENANCE, Staged, disk, file_size, held, undisturbed
+from sealfit.store.staged_writes import PARQUET, PROVENANCE, Staged, disk, file_size, held
 
 if TYPE_CHECKING:
     import pandas as pd

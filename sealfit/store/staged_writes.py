@@ -8,14 +8,13 @@ import fcntl
 import json
 import os
 import shutil
-import signal
 import socket
 import stat
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sealfit.engine import undisturbed
 from sealfit.errors import OutError
 from sealfit.store.manifest import STAGING, STATE, Fingerprints, State, fingerprint, to_json
 from sealfit.tables import SCHEMAS
@@ -171,27 +170,6 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-# ---------------------------------------------------------------- interrupts
-# Ctrl-C is delayed while files are moved, because an incomplete move leaves OUT stale.
-
-
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Delay Ctrl-C until the block has ended."""
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield  # signals reach the main thread only
-        return
-    waiting: list[object] = []
-    signal.signal(signal.SIGINT, lambda *caught: waiting.append(caught))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if waiting:
-            signal.raise_signal(signal.SIGINT)
 
 
 # ---------------------------------------------------------------- lock
