@@ -530,15 +530,22 @@ def parse_config(text: str, name: str) -> Config:
     try:
         return Config.model_validate(tomllib.loads(text))
     except ValidationError as error:
-        raise ConfigError(explain(error, Config), file=name, line=line_of(error, text), fix=fix) from error
+        raise ConfigError(
+            explain(error, Config, text), file=name, line=line_of(error, text), fix=fix
+        ) from error
     except (ValueError, RecursionError) as error:  # a number of thousands of digits, or lists in lists
         raise ConfigError(f"is not TOML: {error}.", file=name, fix=fix) from error
 
 
-def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Return a sentence per fault of a config or SPEC; one of `model`'s keys is named for an unknown key."""
+def explain(error: ValidationError, model: type[BaseModel] | None = None, source: str = "") -> str:
+    """Return a sentence per fault of a config or SPEC; one of `model`'s keys is named for an unknown key.
+
+    Each of several faults begins with its line in the text `source`.
+    """
     lines = []
     for fault in error.errors():
+        if error.error_count() > 1 and (line := _line(fault, source)):
+            lines.append(f"line {line}:")
         key, text = ".".join(str(part) for part in fault["loc"]), fault["msg"].removeprefix("Value error, ")
         if fault["type"] == "extra_forbidden":
             meant = _nearest_key(fault["loc"], model) if model is not None else ""
@@ -558,13 +565,16 @@ def _given(fault: Mapping) -> str:
 
 
 def line_of(error: ValidationError, text: str) -> int | None:
-    """Return the line of the last key of the one fault that a config has; None of several keys or lines."""
-    if error.error_count() > 1:
-        return None
-    (fault,) = error.errors()
+    """Return the line of the one fault that a config has; None of several."""
+    return _line(error.errors()[0], text) if error.error_count() == 1 else None
+
+
+def _line(fault: Mapping, text: str) -> int | None:
+    """Return the line of the last key of a fault; None if it is none, or stands in several lines."""
     said = fault["msg"].removeprefix("Value error, ").partition(":")[0]  # of a fault of the whole config
-    for part in reversed(fault["loc"] or said.split(".")):
-        key = re.compile(rf"(?<![\w-]){re.escape(str(part))}['\"]?\s*[]=.]")
+    keys = [part for part in fault["loc"] if isinstance(part, str)]
+    for part in reversed(keys or said.split(".")):
+        key = re.compile(rf"(?<![\w-]){re.escape(part)}['\"]?\s*[]=.]")
         lines = [number for number, line in enumerate(text.split("\n"), start=1) if key.search(line)]
         if lines:
             return lines[0] if len(lines) == 1 else None

@@ -187,6 +187,11 @@ def test_a_fault_of_a_config_has_the_line_of_its_key(text, line):
     assert caught.value.line == line
 
 
+def test_each_of_several_faults_of_a_config_has_its_line():
+    with pytest.raises(ConfigError, match=r"line 2: unknown key 'trace\.yyy'\. line 4: key 'files\.glob'"):
+        config("[trace]\nyyy = 1\n[files]\nglob = 1")
+
+
 def test_a_mistyped_config_is_answered_with_the_nearest_file_beside_it(tmp_path):
     (tmp_path / "rig.toml").write_text("")
     with pytest.raises(ConfigError, match=r"Did you mean .*rig\.toml\?"):

@@ -105,6 +105,10 @@ def test_an_effect_that_gives_no_number_is_said_and_nothing_written(tmp_path):
     [
         ("sed = 1", "unknown key 'sed'"),
         ("[design]\nspeed = 3", r"toml:2: unknown key 'design\.speed'"),
+        (
+            "seed = 1.5\n[design]\ndirections = [1, 2]",
+            r"line 1: key 'seed': .* line 3: key 'design\.directions\.1'",
+        ),
         ("[design\n", "is not TOML"),
         ("seed = -1", "toml:1: key 'seed': -1: Input should be greater than or equal to 0"),
         ("[design]\nstroke_mm = 2.0", "too short for stiffness_mm"),
@@ -123,7 +127,8 @@ def test_an_effect_that_gives_no_number_is_said_and_nothing_written(tmp_path):
             '[[effects]]\nid = "levels"\nchannels = ["batch"]\nparameters = {C = 0.1}',
             "'C' is no label of batch",
         ),
-        ('[[effects]]\nid = "no_such_effect"', "there is no such effect"),
+        ('[[effects]]\nid = "no_such_effect"', "there is no such effect. Known: "),
+        ('[[effects]]\nid = "zero_ofset"', "there is no such effect. Did you mean 'zero_offset'"),
         ('[[channels]]\nkind = "constant"\nname = "load_N"\nvalue = 1', "'load_N' is taken"),
         ('[[channels]]\nkind = "category"\nname = "batch"', "give labels"),
         (

@@ -12,7 +12,7 @@ from sealfit.config import Strict
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect, Operation, Target
 from sealfit.effects.free import LEVELS, SMOOTH, smooth_effect
-from sealfit.errors import ConfigError, ParameterError
+from sealfit.errors import ConfigError, ParameterError, nearest
 from sealfit.ingest.expression import evaluate, parse
 
 # ---------------------------------------------------------------- physics
@@ -199,8 +199,10 @@ def _catalogued(entry: EffectEntry, place: str) -> Effect:
         except ParameterError as error:
             raise ConfigError(f"{place}: {error}", fix="Give knots = [...].") from error
     if entry.id not in EFFECTS:
-        known = ", ".join(sorted({*EFFECTS, SMOOTH, LEVELS, EXPRESSION}))
-        raise ConfigError(f"{place}: there is no such effect.", fix=f"Known: {known}.")
+        known = sorted({*EFFECTS, SMOOTH, LEVELS, EXPRESSION})
+        meant = nearest(entry.id, known)
+        fix = f"Did you mean '{meant}'?" if meant else f"Known: {', '.join(known)}."
+        raise ConfigError(f"{place}: there is no such effect.", fix=fix)
     return EFFECTS[entry.id]
 
 

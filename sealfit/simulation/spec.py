@@ -297,7 +297,9 @@ def load_spec(path: Path) -> Spec:
         ) from error
     except ValidationError as error:
         fix = "sample_data/README.md lists every key."
-        raise ConfigError(explain(error, Spec), file=path, line=line_of(error, text), fix=fix) from error
+        raise ConfigError(
+            explain(error, Spec, text), file=path, line=line_of(error, text), fix=fix
+        ) from error
     except ConfigError as error:
         raise ConfigError(error.message, file=path, fix=error.fix) from error
     return spec
