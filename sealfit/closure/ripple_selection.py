@@ -42,8 +42,9 @@ class Ripples:
             return fitted
         own = fitted if fine is None else fit(fitted.model, fine, fitted.scatter, turns=1)
         while self.found is not None and len(self.added) < self.context.config.loop.max_rounds:
-            proposals = propose_ripples(own, self.found, self.samples, self.context.effects)
             number = len(self.added) + 1
+            self.context.say(f"round {number}: a significant ripple in the samples, before all other effects")
+            proposals = propose_ripples(own, self.found, self.samples, self.context.effects)
             accepted = confirmed(own, proposals, self.samples, self.context, number, self.refused)
             if accepted is None:
                 self.found = None

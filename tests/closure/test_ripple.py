@@ -1,9 +1,14 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
 
+from sealfit.closure import ripple_selection
+from sealfit.closure.confirm import Context
 from sealfit.closure.ripple_selection import turns_joined
 from sealfit.closure.ripples import Peak, _with_shared_phase, find_ripple
+from sealfit.config import Config
 
 
 def make_samples(
@@ -250,3 +255,12 @@ def test_turns_are_joined_only_where_nothing_lies_between_them():
     risen = cut[(cut["unit"] != 1) | (cut["stroke"] != 3) | (cut["displacement_mm"] > 40.0)]
     assert list(turns_joined(gone, 360.0)["stroke_id"].unique()) == [0, 2, 4]
     assert list(turns_joined(risen, 360.0)["stroke_id"].unique()) == [0, 4, 6]
+
+
+def test_a_round_that_tries_a_ripple_says_so_first(monkeypatch):
+    said, peak = [], SimpleNamespace(p_value=1e-9)
+    monkeypatch.setattr(ripple_selection, "find_ripple", lambda *samples, **known: peak)
+    monkeypatch.setattr(ripple_selection, "propose_ripples", lambda *tried: said.append("tried") or [])
+    ripples = ripple_selection.Ripples(pd.DataFrame({"force_N": [1.0]}), Context(Config(), {}, said.append))
+    ripples.added_to(SimpleNamespace(), None)
+    assert said == ["round 1: a significant ripple in the samples, before all other effects", "tried"]
