@@ -274,7 +274,7 @@ LEVELS = table(
     "levels",
     Column("stage", "before | after", TEXT),
     Column("level", "sample | stroke | file | run | specimen", TEXT),
-    Column("channel", "null for the whole level; else the channel tested at it", TEXT),
+    Column("channel", "null for the whole level; else a channel that varies at it", TEXT),
     Column(
         "sd_N",
         "standard deviation of the residual at this level, or of the part that the channel explains",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.polynomial import Legendre
 from scipy.special import fdtrc, stdtrit
 
+from sealfit.closure.channels import FINER, Channel
 from sealfit.closure.criteria import FEW_UNITS, LARGEST_LEVERAGE, LEAST_SPARE_RUNS
 from sealfit.closure.score_test import Candidate
 from sealfit.closure.small_sample_test import satterthwaite_df
@@ -190,8 +191,13 @@ def _residual_of_model(
     return basis.project_out(own.project_out(size)), basis.shape[1] + own.count
 
 
-def level_table(stage: str, fitted: Fitted, candidates: Sequence[Candidate]) -> pd.DataFrame:
-    """Return the residual's variance by level and, within the levels, by channel (table `levels`)."""
+def level_table(
+    stage: str, fitted: Fitted, candidates: Sequence[Candidate], channels: Mapping[str, Channel]
+) -> pd.DataFrame:
+    """Return the residual's variance by level and, within the levels, by channel (table `levels`).
+
+    The level of a candidate is the finest at which one of its `channels` varies, as that of an effect.
+    """
     rows, force = fitted.rows, fitted.force
     noise = float(rows.weight @ fitted.scatter.noise_sd(force) ** 2)
     free = float(force.size - rows.groups.starts["stroke"].size)
@@ -210,7 +216,8 @@ def level_table(stage: str, fitted: Fitted, candidates: Sequence[Candidate]) -> 
     for name, candidate in best.items():
         share = candidate.chi2 / max(white, 1e-300)
         found = (sd * np.sqrt(share), share, float(candidate.test_result.df), candidate.p_value)
-        records.append((stage, candidate.unit, name, *found))
+        units = [channels[own].unit for own in candidate.channels if own in channels] or [candidate.unit]
+        records.append((stage, min(units, key=FINER.get), name, *found))
     return pd.DataFrame(records, columns=TABLE_OF_LEVELS.names())
 
 

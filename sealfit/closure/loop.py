@@ -125,7 +125,8 @@ def _drawn_tables(
     selection: Selection, before: Fitted, after: Fitted, config: Config
 ) -> dict[str, pd.DataFrame]:
     """Return the tables that do not depend on the folds."""
-    levels = [level_table("before", before, selection.first), level_table("after", after, selection.last)]
+    searched = (("before", before, selection.first), ("after", after, selection.last))
+    levels = [level_table(*one, selection.channels) for one in searched]
     shapes = shape_table(after, config)
     drawn = {"shapes": shapes, "shape_points": shape_points(after, shapes)}
     if selection.inconclusive is not None:  # the last effect of a fit of its own

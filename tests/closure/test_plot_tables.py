@@ -1,9 +1,12 @@
+from types import SimpleNamespace
+
 import bins_helpers
 import numpy as np
 import numpy.testing as npt
 import pytest
 
 from sealfit.closure.channels import Channel, find_channels
+from sealfit.closure.errors_and_intervals import level_table
 from sealfit.closure.forms import free_term, surface_term
 from sealfit.closure.output import GROUPS, POINTS, channel_table, curve_table, shape_points, shape_table
 from sealfit.closure.selection import Selection
@@ -110,3 +113,16 @@ def test_beside_a_free_shape_of_its_channel_an_effect_has_no_free_shape():
     both = shape_table(fit(model.with_term(free, dict.fromkeys(free.effect.linear, 0.0)), rows), Config())
     assert alone["free"].notna().all()
     assert both["free"].isna().all()
+
+
+def test_a_variable_has_the_level_at_which_it_varies():
+    """Not that of the units between which it is tested: the report says the same of effects."""
+    rows = make_rows(bins_helpers.make_bins(repeats=2, bins=4, temperatures=(60.0,)), has_aging=True)
+    fitted = fit(start_model(rows), rows, turns=1)
+    channels = {one.name: one for one in find_channels(rows)}
+    found = {"unit": "run", "chi2": 1.0, "p_value": 1.0, "test_result": SimpleNamespace(log_p=0.0, df=1)}
+    candidates = [SimpleNamespace(channels=(name,), **found) for name in ("displacement_mm", "speed_mm_s")]
+    levels = level_table("after", fitted, candidates, channels).dropna(subset="channel")
+    assert dict(zip(levels["channel"], levels["level"], strict=True)) == {
+        "displacement_mm": "sample", "speed_mm_s": "run",
+    }  # fmt: skip
