@@ -41,6 +41,16 @@ KEYS = {
     "steady": ["file", "stroke"],
     "bins": ["file", "stroke", "bin"],
 }
+UNDRAWN = f"""
+import sys
+
+sys.path.append({str(ROOT / "tests")!r})
+from drawing_helpers import undrawn
+
+import sealfit.report.page
+
+sealfit.report.page.draw = undrawn
+"""  # no test looks at the drawings of the report: those of the notebook are its own
 FORCES = [name for name in ANSWERS if name.endswith("_N")]
 POINTS = pd.DataFrame(
     {
@@ -65,6 +75,7 @@ def tutorial(tmp_path_factory):
     (folder / "docs").mkdir()
     shutil.copytree(ROOT / "sample_data" / "simulated", folder / "sample_data" / "simulated")
     document = nbformat.read(TUTORIAL, as_version=4)
+    document.cells.insert(0, nbformat.v4.new_code_cell(UNDRAWN))
     client = NotebookClient(document, timeout=None, resources={"metadata": {"path": str(folder / "docs")}})
     return client.execute(), folder
 
