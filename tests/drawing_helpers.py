@@ -8,10 +8,10 @@ from sealfit.report import drawing
 from sealfit.report.drawing import Drawn
 from sealfit.report.style import Plot
 
-PANELS_ONLY = """
+UNDRAWN = """
 import drawing_helpers
-from sealfit.report import drawing
-drawing._saved = drawing_helpers.only_svg
+from sealfit.report import page
+page.draw = drawing_helpers.undrawn
 from sealfit.__main__ import main
 main()
 """
@@ -29,8 +29,8 @@ def only_svg(figure, form, metadata, **options) -> bytes:
 
 
 def command(*words: str) -> list[str]:
-    """Return what runs a command line in a process of its own; of a report no files for print are drawn."""
-    program = ["-c", PANELS_ONLY] if words[0] in ("run", "report") else ["-m", "sealfit"]
+    """Return what runs a command line in a process of its own; of a report nothing is drawn."""
+    program = ["-c", UNDRAWN] if words[0] in ("run", "report") else ["-m", "sealfit"]
     return [sys.executable, *program, *words]
 
 

@@ -22,10 +22,10 @@ name = "my campaign"
 seed = 3
 [design]
 days = [2, 8]
-speeds_mm_s = [0.5, 2, 5, 20, 50]
+speeds_mm_s = [0.5, 2, 10, 50]
 directions = [1, -1]
 repeats = 1
-max_rows = 150
+max_rows = 80
 [[effects]]
 id = "zero_offset"
 acts_on = "force"
@@ -75,7 +75,7 @@ def as_in_a_clone(folder):
 def run(command, folder, codes=(0,)):
     """Run a command of a page with this Python's sealfit, and return what it prints on stdout.
 
-    Of a report the panels on the page are drawn, and not the files for print.
+    Of a report nothing is drawn.
     """
     words = shlex.split(command)
     if words[0] == "sealfit":
