@@ -60,6 +60,7 @@ def test_of_very_many_strokes_a_few_files_all_over_the_campaign_keep_several_bin
 
 
 MANY_SPEEDS = (1.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 60.0)
+THREE_FOLDS = Config(loop={"folds": 3})  # each is a search of its own
 
 
 @pytest.fixture
@@ -112,7 +113,7 @@ def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch
     found, said = [], []
     for strokes in (120, 10_000):
         monkeypatch.setattr("sealfit.closure.subsampling.STROKES", strokes)
-        found.append(close_loop(bins, make_traces(bins), Config(), on_progress=said.append))
+        found.append(close_loop(bins, make_traces(bins), THREE_FOLDS, on_progress=said.append))
     assert not any("show more" in text for text in said)
     part, whole = (closed.document for closed in found)
     (one,), (other,) = part["effects"], whole["effects"]
@@ -169,12 +170,12 @@ def test_what_only_all_strokes_show_has_all_of_them_searched(monkeypatch):
     monkeypatch.setattr("sealfit.closure.subsampling.STROKES", 60)
     monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)
     rng = np.random.default_rng(5)
-    bins = make_bins(3, setup=0.003, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, noise_N=0.1)
+    bins = make_bins(3, setup=0.003, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=2, noise_N=0.1)
     humidity = bins["run_id"].map({run: rng.normal() for run in bins["run_id"].unique()})
     bins["humidity_pct"] = 50 + 5 * humidity
     bins["force_N"] *= 1 + 0.004 * humidity
     said = []
-    closed = close_loop(bins, make_traces(bins), Config(), on_progress=said.append)
+    closed = close_loop(bins, make_traces(bins), THREE_FOLDS, on_progress=said.append)
     assert f"all {bins['file'].nunique()} strokes show more than those searched: humidity_pct" in said
     (effect,) = closed.document["effects"]
     assert effect["channels"] == ["humidity_pct"]
