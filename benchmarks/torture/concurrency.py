@@ -186,7 +186,9 @@ def state_of(said: object, known: Sequence[object]) -> str:
     return next((name for name, one in zip(("old", "new"), known, strict=True) if said == one), "wrong")
 
 
-def readers(scene: Scene, folder: Path, rounds: int, count: int, seed: int) -> tuple[Counter, list[str]]:
+def readers(
+    scene: Scene, folder: Path, rounds: int, count: int, seed: int, read_s: float
+) -> tuple[Counter, list[str]]:
     """Let readers read while a writer makes the new state of the old, and return counts and faults."""
     counts, wrong, work = Counter(), [], folder / "work"
     trace = changed_trace(scene.here)
@@ -203,13 +205,13 @@ def readers(scene: Scene, folder: Path, rounds: int, count: int, seed: int) -> t
         for number in range(count):
             place, own = folder / f"reader-{number}", seed + 100 * turn + number
             begun.append(started(partial(reader, scene, number, work / "out", place, stop, own), place))
-        time.sleep(READ_S)
+        time.sleep(read_s)
         trace.write_bytes(after)
         while (
             writer := ended(started(partial(under_fault, scene, work, 0, ""), folder / "writer"))
         ).code == 1:
             time.sleep(0.05)  # a report is being written
-        time.sleep(READ_S)
+        time.sleep(read_s)
         stop.touch()
         ends = [ended(process) for process in begun]
         wrong += [end.fault() for end in (writer, *ends) if end.fault()]
@@ -274,6 +276,7 @@ def main() -> int:
     parser.add_argument("--writers", type=int, default=30, help="pairs of writers")
     parser.add_argument("--rounds", type=int, default=4, help="writes under twenty readers")
     parser.add_argument("--readers", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=READ_S, help="of reading before and after a write")
     parser.add_argument("--losses", type=int, default=4, help="workers lost, and schedulers")
     parser.add_argument("--work", type=Path, help="folder to work in; else one for temporary files")
     given = parser.parse_args()
@@ -291,7 +294,9 @@ def main() -> int:
         ]
         wrong += [f"two writers: {fault}" for fault in found if fault]
         print(f"{given.writers} pairs of writers: {sum(map(bool, found))} wrong", flush=True)
-        counts, faults = readers(scene, folder / "readers", given.rounds, given.readers, given.seed)
+        counts, faults = readers(
+            scene, folder / "readers", given.rounds, given.readers, given.seed, given.seconds
+        )
         wrong += [f"readers: {fault}" for fault in faults]
         print(
             f"{given.rounds} writes under {given.readers} readers: {dict(counts)}, {len(faults)} wrong",

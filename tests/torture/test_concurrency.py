@@ -26,9 +26,12 @@ def test_an_answer_is_that_of_one_state_or_a_refusal(said, state):
 
 @pytest.mark.skipif(not hasattr(concurrency.os, "fork"), reason="needs fork")
 def test_the_short_form(tmp_path):
-    words = ["--writers", "1", "--rounds", "1", "--readers", "5", "--losses", "0", "--work", str(tmp_path)]
+    words = ["--writers", "1", "--rounds", "1", "--readers", "5", "--seconds", "0.2", "--losses", "0"]
     run = subprocess.run(
-        [sys.executable, concurrency.__file__, *words], capture_output=True, text=True, check=False
+        [sys.executable, concurrency.__file__, *words, "--work", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert run.returncode == 0, run.stdout + run.stderr
     assert "1 pairs of writers: 0 wrong" in run.stdout
