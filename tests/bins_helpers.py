@@ -118,7 +118,9 @@ def _along_strokes(files: pd.DataFrame, bins: int) -> pd.DataFrame:
     return table[[*names[:9], "bin", *names[9:12], "displacement_mm", "distance_mm", "time_s", *names[12:]]]
 
 
-TWO_FOLDS = Config(loop={"folds": 2})  # for tests of what is found: each fold is a search of its own
+# For tests of what is found: each fold is a search of its own. The search of one of two has half of the runs,
+# and some effects need more.
+TWO_FOLDS, THREE_FOLDS = (Config(loop={"folds": count}) for count in (2, 3))
 
 
 def warm(table: pd.DataFrame, force: np.ndarray) -> np.ndarray:

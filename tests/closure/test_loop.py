@@ -6,7 +6,7 @@ import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
-from bins_helpers import LOAD_N, TRUE, TWO_FOLDS, make_bins, make_traces, warm
+from bins_helpers import LOAD_N, THREE_FOLDS, TRUE, TWO_FOLDS, make_bins, make_traces, warm
 
 from sealfit.closure.confirm import TOO_SMALL
 from sealfit.closure.loop import close_loop
@@ -38,7 +38,7 @@ def null():
 @pytest.fixture(scope="module")
 def warming():
     bins = make_bins(3, temperatures=(60.0,), bins=8, effect=warm, **SCATTER)
-    return bins, close(bins, Config())
+    return bins, close(bins, THREE_FOLDS)
 
 
 def test_nothing_is_claimed_where_nothing_is_missing(null):

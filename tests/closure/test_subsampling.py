@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.testing as npt
 import pytest
-from bins_helpers import TRUE, make_bins, make_traces, warm
+from bins_helpers import THREE_FOLDS, TRUE, make_bins, make_traces, warm
 
 from sealfit.closure.confirm import Context
 from sealfit.closure.loop import close_loop
@@ -60,7 +60,6 @@ def test_of_very_many_strokes_a_few_files_all_over_the_campaign_keep_several_bin
 
 
 MANY_SPEEDS = (1.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 60.0)
-THREE_FOLDS = Config(loop={"folds": 3})  # each is a search of its own
 
 
 @pytest.fixture
