@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from bins_helpers import make_bins, make_traces
+from bins_helpers import THREE_FOLDS, make_bins, make_traces
 
 from sealfit.closure import search as search_module
 from sealfit.closure.channels import Channel, find_channels
@@ -21,16 +21,16 @@ COLUMNS = {
 }
 
 
-def close(effect):
+def close(effect, config):
     bins = make_bins(5, setup=0.003, effect=effect, run_channels=COLUMNS, bins=8)
-    return bins, close_loop(bins, make_traces(bins), Config())
+    return bins, close_loop(bins, make_traces(bins), config)
 
 
 def test_product_of_two_columns_is_found_and_predicted():
     def product(table, force):
         return force * (1 + 0.004 * (table["oil_ppm"] - 50) * (table["dust_mg"] - 5)).to_numpy()
 
-    bins, closure = close(product)
+    bins, closure = close(product, THREE_FOLDS)
     (effect,) = closure.document["effects"]
     assert (effect["id"], set(effect["channels"])) == ("product", {"oil_ppm", "dust_mg"})
     assert (effect["acts_on"], effect["operation"], effect["level"]) == ("mu", "multiply", "run")
@@ -48,7 +48,7 @@ def test_slope_in_one_batch_only_is_found():
             force * (1 + 0.006 * (table["oil_ppm"] - 50) * np.where(table["batch"] == "B", 1, -1)).to_numpy()
         )
 
-    effects = close(in_b)[1].document["effects"]
+    effects = close(in_b, Config())[1].document["effects"]
     assert [(e["id"], set(e["channels"])) for e in effects] == [("slopes", {"oil_ppm", "batch"})]
     low, high = sorted(p["value"] for p in effects[0]["parameters"])
     assert (low, high) == (pytest.approx(-0.006, rel=0.2), pytest.approx(0.006, rel=0.2))
