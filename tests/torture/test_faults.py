@@ -125,7 +125,7 @@ def test_a_store_that_does_not_sync_is_found(tmp_path):
 
 def test_the_short_form():
     scenes = ["--scenes", "fit-aging --values", "predict", "fit-steady"]
-    words = ["--points", "20", "--limits", "0", "--kills", "0", "--jobs", "1", "--seed", "5"]
+    words = ["--points", "12", "--limits", "0", "--kills", "0", "--jobs", "1", "--seed", "5"]
     run = subprocess.run(
         [sys.executable, str(SCRIPT), *scenes, *words],  # not in tmp_path, which other users cannot enter
         capture_output=True,
@@ -133,7 +133,7 @@ def test_the_short_form():
         check=False,
     )
     assert run.returncode == 0, run.stdout + run.stderr
-    assert "20 points in" in run.stdout
+    assert "12 points in" in run.stdout
     assert "no locks: 6, 0 wrong" in run.stdout
     assert "read-only folder: 3, 0 wrong" in run.stdout
 
