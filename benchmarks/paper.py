@@ -94,13 +94,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=2020)
     parser.add_argument("--work", type=Path, default=Path("out/paper"), help="where campaign and results go")
     parser.add_argument("--docs", type=Path, default=Path("docs/paper"), help="where the page goes")
-    parser.add_argument("--short", action="store_true", help="one repeat, files of 150 rows, no report")
+    parser.add_argument("--short", action="store_true", help="one repeat, files of 60 rows, no report")
     given = parser.parse_args(arguments)
     one_thread()
     growth = Growth(**GROWTH)
     physics = Physics(mu_s=PUBLISHED_LAWS["mu_s"], mu_c=PUBLISHED_LAWS["mu_c"], growth=growth)
     spec = paper_campaign(seed=given.seed)
-    short = {"repeats": 1, "max_rows": 150} if given.short else {}
+    short = {"repeats": 1, "max_rows": 60} if given.short else {}
     spec = spec.model_copy(update={"physics": physics, "design": spec.design.model_copy(update=short)})
     campaign, out = given.work / "campaign", given.work / "out"
     simulate(spec, campaign)
