@@ -85,7 +85,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
     files, specimens = (rows.groups.starts[level].size for level in ("file", "specimen"))
     search = _Search(selection, alpha)
-    in_model = {name for added in selection.added for name in added.proposal.term.channels}
+    in_model = _channels_in_model(selection)
     entries = []
     for name, channel in selection.channels.items():
         target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
@@ -128,6 +128,11 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
         unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
         entries.append({**unknown, "smallest_pct": None, "files_needed": needed})
     return entries
+
+
+def _channels_in_model(selection: Selection) -> set[str]:
+    """Return the channels of all effects that were added."""
+    return {name for added in selection.added for name in added.proposal.term.channels}
 
 
 def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
@@ -387,7 +392,7 @@ def undetectable_variables(
     variable of an effect that was added is not among them.
     """
     starts = selection.after.rows.groups.starts
-    found = {name for added in selection.added for name in added.proposal.term.channels}
+    in_model = _channels_in_model(selection)
     undetectable = []
     for entry in entries:
         if entry["variable"] == SPECIMEN:
@@ -396,7 +401,7 @@ def undetectable_variables(
         channel: Channel = selection.channels[entry["variable"]]
         if (
             channel.grouping
-            or channel.name in found
+            or channel.name in in_model
             or channel.name in ASIDE
             or entry["level"] != LEVEL_NAMES[channel.unit]
         ):
