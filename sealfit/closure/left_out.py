@@ -84,10 +84,11 @@ def _wrong_instead(one: OutlierFile, tried: Sequence[tuple[OutlierFile, Fitted]]
     """Return the files without which `one` agrees with the rest: each may be the wrong one instead."""
     found = []
     for other, kept in tried:
+        if other.file == one.file:
+            continue
         names = kept.rows.table["record"].to_numpy()[kept.rows.groups.starts["file"]].tolist()
-        if other.file != one.file:
-            deviation = _without(kept, names.index(one.file))[0].deviation
-            found += [other.file] if abs(deviation) < OUTLIER_SHARE else []
+        if abs(_without(kept, names.index(one.file))[0].deviation) < OUTLIER_SHARE:
+            found.append(other.file)
     return tuple(found)
 
 

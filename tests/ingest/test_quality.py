@@ -339,7 +339,7 @@ def test_a_load_in_kg_or_g_is_a_warning(load, said, fix):
     assert f'unit = "{fix}"' in fault.fix
 
 
-def test_of_a_few_improbable_files_the_worst_is_named():
+def test_of_a_few_improbable_files_the_first_is_named():
     steady = pd.DataFrame(
         {"file": ["a.csv", "b.csv", "c.csv"], "force_N": [30.0, 3100.0, 31.0], "load_N": 49.03, "used": True}
     )
