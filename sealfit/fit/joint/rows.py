@@ -113,6 +113,9 @@ ALONG = ("displacement_mm", "distance_mm", "time_s")
 # Derived channel if loads differ: load times |speed|, the power of friction over its coefficient.
 POWER = "power"
 
+# Measured speeds of a run are one setting if the largest exceeds the smallest by less than this share.
+SAME_SETTING = 0.05
+
 # Ratio of the largest to the smallest load up to which it is one setting.
 SAME_LOAD = 1.05
 NOT_CHANNELS = {
@@ -263,14 +266,16 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
         condition = pd.Index(conditions["condition"]).get_indexer(names)[condition]
     files = groups.codes["file"]
     per_file = np.bincount(files)[files]
-    pace = table["speed_bin_mm_s"] if "speed_bin_mm_s" in table else table["speed_mm_s"]
+    measured = table["speed_mm_s"].to_numpy(dtype=float)
+    speed = set_speeds(measured, groups.codes["run"])
+    pace = table["speed_bin_mm_s"].to_numpy(dtype=float) if "speed_bin_mm_s" in table else measured
     return Rows(
         table=table,
         order=order,
         groups=groups,
         force=table["force_N"].to_numpy(dtype=float),
-        speed=table["speed_mm_s"].to_numpy(dtype=float),
-        pace=pace.to_numpy(dtype=float),
+        speed=speed,
+        pace=pace * speed / measured,
         load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table)),
         days=days,
         condition=condition,
@@ -280,6 +285,24 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
         weight=1.0 / per_file / (files.max() + 1),
         filled=fill_missing(table, groups),
     )
+
+
+def set_speeds(speed: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Return signed speeds of rows, shape (n,), with all strokes of one setting of a run at their mean.
+
+    `run`, shape (n,), is the number of each row's run. Measured speeds of one setting differ by the noise of
+    the position, and the force does not follow it. If the forces of these strokes are more alike than the
+    runs, the slope of the Stribeck curve would be fitted to that noise and be too small (regression dilution:
+    Fuller 1987, *Measurement Error Models*, section 1.1, doi:10.1002/9780470316665).
+    """
+    size = np.abs(speed)
+    order = np.lexsort((size, run))
+    first = np.r_[True, (np.diff(run[order]) != 0) | (np.diff(size[order]) > SAME_SETTING * size[order][:-1])]
+    setting = np.empty(speed.size, dtype=int)
+    setting[order] = np.cumsum(first[: speed.size])
+    own = pd.Series(size).groupby(setting)
+    same = own.transform("max") <= (1 + SAME_SETTING) * own.transform("min")
+    return np.sign(speed) * np.where(same, own.transform("mean"), size)
 
 
 def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
