@@ -265,6 +265,11 @@ class RefusedEffect:
     p_value: float
     reason: str
 
+    @classmethod
+    def of(cls, proposal: Proposal, reason: str) -> RefusedEffect:
+        """Return a proposal as refused."""
+        return cls(proposal.term, proposal.p_value, reason)
+
     @property
     def weak(self) -> bool:
         """Whether its evidence is too weak for the verdict `unexplained`."""
@@ -293,14 +298,14 @@ def confirmed(
     samples: pd.DataFrame,
     context: Context,
     number: int,
-    refused: list[RefusedEffect],
+    refused: list[tuple[Proposal, str]],
 ) -> AcceptedEffect | None:
     """Return the first of a round's best proposals that has a gain on held-out data; None if none has.
 
-    If none is confirmed, the best proposal and the reason are appended to `refused`.
+    If none is confirmed, the significant ones are appended to `refused`, best first, each with the reason.
     """
     config = context.config
-    failed: list[RefusedEffect] = []
+    failed: list[tuple[Proposal, str]] = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
     for proposal in proposals[:MOST_PROPOSALS]:
         gain = heldout_gain(fitted, proposal, *folds_of)
@@ -317,8 +322,8 @@ def confirmed(
             )
             return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, others, number)
         if proposal.p_value <= config.loop.family_error:
-            failed.append(RefusedEffect(proposal.term, proposal.p_value, reason))
-    refused += failed[:1]
+            failed.append((proposal, reason))
+    refused += failed
     return None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import Channel, channels_of, searched
-from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
+from sealfit.closure.confirm import NEGLIGIBLE, AcceptedEffect, Context, RefusedEffect, confirmed
 from sealfit.closure.criteria import EQUAL_BIC, HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
 from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
@@ -131,9 +131,9 @@ class _Loop:
         return propose(base, candidates, self.channels, self.context.effects, also)
 
     def confirm(
-        self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[RefusedEffect]
+        self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[tuple[Proposal, str]]
     ) -> AcceptedEffect | None:
-        """Return the first proposal that held-out data confirm; a refused one is appended to `failed`."""
+        """Return the first proposal that held-out data confirm; if none, `failed` has the reasons."""
         return confirmed(base, proposals, self.samples, self.context, number, failed)
 
     def run_round(self, number: int) -> bool:
@@ -156,12 +156,15 @@ class _Loop:
         claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
         open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
         proposals = self.propose(self.fitted, open_, laws)
-        failed: list[RefusedEffect] = []
+        failed: list[tuple[Proposal, str]] = []
         accepted = self.confirm(self.fitted, proposals, number, failed)
-        self.unconfirmed += failed
+        self.unconfirmed += [RefusedEffect.of(*one) for one in failed[:1]]
         if accepted is None:
             keys = {p.source for p in proposals[:MOST_PROPOSALS]} or {c.key for c in open_}
-            if failed and failed[0].negligible:
+            for proposal, reason in failed:
+                if reason in NEGLIGIBLE:
+                    self.negligible |= _no_stronger(open_, proposal) | {proposal.source}
+            if failed and failed[0][1] in NEGLIGIBLE:
                 keys |= _no_stronger(open_, proposals[0])
                 self.negligible |= keys
             self.refused |= keys

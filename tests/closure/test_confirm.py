@@ -10,6 +10,7 @@ from sealfit.closure.confirm import (
     NEGATIVE,
     Context,
     Gain,
+    RefusedEffect,
     about_means,
     confirmed,
     gain_between_settings,
@@ -159,9 +160,10 @@ def decide(monkeypatch):
         monkeypatch.setattr(
             "sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen]
         )
-        refused, said = [], []
+        failed, said = [], []
         context = Context(Config(), EFFECTS, **{"compare": False, "say": said.append} | more)
-        return confirmed(FORCE, proposals, samples, context, 2, refused), refused, said
+        found = confirmed(FORCE, proposals, samples, context, 2, failed)
+        return found, [RefusedEffect.of(*one) for one in failed], said
 
     return decided
 
@@ -216,10 +218,10 @@ def test_the_first_that_gains_is_accepted_with_its_rivals_and_what_they_leave(de
     assert np.isnan([rmse for _, rmse in found.rivals]).all()  # not asked for
 
 
-def test_after_three_that_gain_nothing_none_is_tried_and_the_best_is_refused(decide):
+def test_after_three_that_gain_nothing_none_is_tried_and_these_are_refused(decide):
     found, refused, said = decide([proposal(f"form {k}") for k in range(4)], [Gain(-1, 2, -1)] * 3 + [GOOD])
     assert found is None
-    assert [item.term.effect.id for item in refused] == ["form 0"]
+    assert [item.term.effect.id for item in refused] == ["form 0", "form 1", "form 2"]
     assert len(said) == 3
 
 

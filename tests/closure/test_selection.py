@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from sealfit.closure import selection
+from sealfit.closure.confirm import NO_GAIN
 from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.closure.search import MaskedPair
 from sealfit.config import Config
@@ -47,22 +48,49 @@ def test_a_ripple_is_not_dropped(monkeypatch):
     assert left(monkeypatch, [effect("a", periodic=True), effect("b"), effect("c")]) == "ac"
 
 
-def test_effects_that_take_the_place_of_others_in_turn_end_the_loop(monkeypatch):
-    """A new effect that is merged with an earlier one, and explains no more, is not asked again."""
+def a_loop(monkeypatch, candidates, proposals):
     loop = object.__new__(selection._Loop)
-    candidate = SimpleNamespace(key="c", channels=("x",), chi2=5.0)
-    proposal = SimpleNamespace(source="c", term=SimpleNamespace(channels=("x",)), chi2=9.0)
     loop.fitted, loop.added, loop.refused = SimpleNamespace(deviance=10.0), ["earlier"], set()
     loop.tests, loop.found = SimpleNamespace(fitted=loop.fitted), SimpleNamespace(claimable=[], laws=[])
     loop.context = SimpleNamespace(config=SimpleNamespace(loop=SimpleNamespace(max_rounds=9)), effects={})
-    loop.channels, loop.unconfirmed = {}, []
-    monkeypatch.setattr(loop.__class__, "open_candidates", lambda own: [candidate])
+    loop.channels, loop.unconfirmed, loop.negligible = {}, [], set()
+    monkeypatch.setattr(loop.__class__, "open_candidates", lambda own: list(candidates))
+    monkeypatch.setattr(selection, "propose", lambda *given: proposals)
+    monkeypatch.setattr(selection, "_related_candidates", lambda *given: [])
+    return loop
+
+
+def named(key, channel, chi2):
+    """Return a candidate of a channel and its proposal."""
+    term = SimpleNamespace(channels=(channel,))
+    proposal = SimpleNamespace(source=key, term=term, chi2=chi2, p_value=1e-9)
+    return SimpleNamespace(key=key, channels=(channel,), chi2=chi2), proposal
+
+
+def test_effects_that_take_the_place_of_others_in_turn_end_the_loop(monkeypatch):
+    """A new effect that is merged with an earlier one, and explains no more, is not asked again."""
+    candidate, proposal = named("c", "x", 5.0)
+    loop = a_loop(monkeypatch, [candidate], [proposal])
     monkeypatch.setattr(loop.__class__, "confirm", lambda own, *given: SimpleNamespace(proposal=proposal))
     monkeypatch.setattr(loop.__class__, "add", lambda own, accepted: setattr(own, "added", ["merged"]))
-    monkeypatch.setattr(selection, "propose", lambda *given: [proposal])
-    monkeypatch.setattr(selection, "_related_candidates", lambda *given: [])
     assert not loop.run_round(2)
     assert loop.refused == {"c"}
+
+
+def test_an_effect_too_small_to_matter_is_known_behind_another_that_is_refused(monkeypatch):
+    """The second form of a round is negligible, and so is a weaker one of its channel, but not the first."""
+    (pair, of_pair), (time, of_time), (weaker, _) = (
+        named(*one) for one in (("pair", "speed", 90.0), ("time", "time", 50.0), ("weaker", "time", 40.0))
+    )
+    loop = a_loop(monkeypatch, [pair, time, weaker], [of_pair, of_time])
+    reasons = [(of_pair, "it does not lower the error"), (of_time, NO_GAIN)]
+    monkeypatch.setattr(
+        loop.__class__, "confirm", lambda own, base, found, number, failed: failed.extend(reasons)
+    )
+    assert not loop.run_round(2)
+    assert loop.refused == {"pair", "time"}
+    assert loop.negligible == {"time", "weaker"}
+    assert [item.reason for item in loop.unconfirmed] == ["it does not lower the error"]
 
 
 def test_effects_that_mask_each_other_come_before_a_weaker_single_one():
