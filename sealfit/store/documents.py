@@ -8,8 +8,8 @@ ignored.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, make_dataclass
 from datetime import datetime
 from typing import Annotated, Literal
 
@@ -34,10 +34,14 @@ Matrix = list[list[Number]]
 Operation = Literal["add", "multiply"]
 
 
-def _require(*agree: bool) -> None:
-    """Raise ValueError, as a wrong type does, unless all of these hold."""
-    if not all(agree):
-        raise ValueError("sizes or names do not agree")
+def record(agrees: Callable | None = None, **fields: object) -> type:
+    """Return the type of an object with these keys; ValueError, as for a wrong type, unless it `agrees`."""
+
+    def require(own) -> None:
+        if agrees is not None and not agrees(own):
+            raise ValueError("sizes or names do not agree")
+
+    return make_dataclass("Record", fields.items(), namespace={"__post_init__": require})
 
 
 def _is_square(matrix: Matrix, size: int) -> bool:
@@ -50,327 +54,175 @@ def _are_below(places: Iterable[int], count: int, least: int = 0) -> bool:
 
 # ---------------------------------------------------------------- closure.json
 
-
-@dataclass(frozen=True, slots=True)
-class FitQuality:
-    """How the error compares with the scatter of repeats."""
-
-    state: Literal["within_scatter", "above_scatter", "unknown"]
-    ratio: Maybe
-    p_value: Maybe
-
-    def __post_init__(self) -> None:
-        _require(self.state == "unknown" or None not in (self.ratio, self.p_value))
-
-
-@dataclass(frozen=True, slots=True)
-class Detectable:
-    """The smallest effect of a variable that would have been found."""
-
-    variable: Text
-    level: Text
-    smallest_N: Maybe
-    smallest_pct: Maybe
-    files_needed: StrictInt | None
-    cannot_tell: StrictBool
-
-    def __post_init__(self) -> None:
-        _require((self.smallest_N is None) == (self.smallest_pct is None))
-
-
-@dataclass(frozen=True, slots=True)
-class Refused:
-    """A significant effect that was not accepted."""
-
-    id: Text
-    channels: Names
-    acts_on: Text
-    label: Text
-    p_value: Number
-    reason: Text
-    weak: StrictBool
-
-
-@dataclass(frozen=True, slots=True)
-class SlotUnits:
-    """The unit of every slot."""
-
-    force_N: Text
-    displacement_mm: Text
-    speed_mm_s: Text
-    load_N: Text
-    time_s: Text
-
-
-@dataclass(frozen=True, slots=True)
-class Errors:
-    """The errors of one model."""
-
-    rmse_N: Maybe
-    rmse_runs_N: Maybe
-    heldout_rmse_N: Maybe
-    heldout_extrapolated_rmse_N: Maybe
-    max_abs_N: Maybe
-    mean_abs_pct: Maybe
-    lack_of_fit_p: Maybe
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterOfEffect:
-    """One parameter of an effect with its interval."""
-
-    name: Text
-    value: Maybe
-    ci95: tuple[Maybe, Maybe]
-    unit: Text | None
-
-
-@dataclass(frozen=True, slots=True)
-class Alternative:
-    """A rival of an effect."""
-
-    id: Text
-    channels: Names
-    acts_on: Text
-    heldout_rmse_N: Maybe
-
-
-@dataclass(frozen=True, slots=True)
-class EffectFound:
-    """An effect of the model after, or a candidate."""
-
-    id: Text
-    label: Text
-    level: Text
-    channels: Names
-    acts_on: Text
-    operation: Operation
-    reference: Text
-    form: Text
-    named: StrictBool
-    candidate: StrictBool
-    parameters: list[ParameterOfEffect]
-    p_value: Number
-    heldout_gain_N: Maybe
-    heldout_rmse_N: Maybe
-    alternatives: list[Alternative]
-
-
-@dataclass(frozen=True, slots=True)
-class ScatterOfLevel:
-    """The scatter of one level."""
-
-    level: Text
-    sd_rel: Maybe
-    sd_N: Maybe
-    df: Maybe
-
-
-@dataclass(frozen=True, slots=True)
-class Left:
-    """What is left of the residual."""
-
-    rmse_N: Maybe
-    level: Text | None
-    channel: Text | None
-    p_value: Maybe
-    significant: StrictBool
-
-    def __post_init__(self) -> None:
-        _require(self.channel is None or self.p_value is not None)
-
-
-@dataclass(frozen=True, slots=True)
-class OutlierFile:
-    """A file that the loop left out."""
-
-    file: Text
-    deviation_pct: Number
-    p_value: Number
-
-
-@dataclass(frozen=True, slots=True)
-class NextRun:
-    """A run to make next."""
-
-    why: Text
-    conditions: dict[Text, StrictBool | Number | Text]
-
-
-@dataclass(frozen=True, slots=True)
-class IncompleteChannel:
-    """A channel that some files lack."""
-
-    channel: Text
-    files_without: StrictInt
-    files: StrictInt
-    searched: StrictBool
-
-
-@dataclass(frozen=True, slots=True)
-class Closure:
-    """What the loop found."""
-
-    schema: Literal[1]
-    verdict: Literal["closed", "nothing_missing", "unexplained", "cannot_tell"]
-    fit_quality: FitQuality
-    sensitivity: list[Detectable]
-    refused: list[Refused]
-    units: SlotUnits
-    noise_floor_N: Maybe
-    before: Errors
-    after: Errors
-    heldout_unit: Text
-    effects: list[EffectFound]
-    scatter: list[ScatterOfLevel]
-    left: Left
-    outlier_files: list[OutlierFile]
-    next_runs: list[NextRun]
-    incomplete_channels: list[IncompleteChannel]
+ERRORS = record(
+    rmse_N=Maybe,
+    rmse_runs_N=Maybe,
+    heldout_rmse_N=Maybe,
+    heldout_extrapolated_rmse_N=Maybe,
+    max_abs_N=Maybe,
+    mean_abs_pct=Maybe,
+    lack_of_fit_p=Maybe,
+)
+EFFECT = record(
+    id=Text,
+    label=Text,
+    level=Text,
+    channels=Names,
+    acts_on=Text,
+    operation=Operation,
+    reference=Text,
+    form=Text,
+    named=StrictBool,
+    candidate=StrictBool,
+    parameters=list[record(name=Text, value=Maybe, ci95=tuple[Maybe, Maybe], unit=Text | None)],
+    p_value=Number,
+    heldout_gain_N=Maybe,
+    heldout_rmse_N=Maybe,
+    alternatives=list[record(id=Text, channels=Names, acts_on=Text, heldout_rmse_N=Maybe)],
+)
+FIT_QUALITY = record(
+    lambda own: own.state == "unknown" or None not in (own.ratio, own.p_value),
+    state=Literal["within_scatter", "above_scatter", "unknown"],
+    ratio=Maybe,
+    p_value=Maybe,
+)
+DETECTABLE = record(
+    lambda own: (own.smallest_N is None) == (own.smallest_pct is None),
+    variable=Text,
+    level=Text,
+    smallest_N=Maybe,
+    smallest_pct=Maybe,
+    files_needed=StrictInt | None,
+    cannot_tell=StrictBool,
+)
+LEFT = record(
+    lambda own: own.channel is None or own.p_value is not None,
+    rmse_N=Maybe,
+    level=Text | None,
+    channel=Text | None,
+    p_value=Maybe,
+    significant=StrictBool,
+)
+CLOSURE = record(
+    schema=Literal[1],
+    verdict=Literal["closed", "nothing_missing", "unexplained", "cannot_tell"],
+    fit_quality=FIT_QUALITY,
+    sensitivity=list[DETECTABLE],
+    refused=list[
+        record(
+            id=Text, channels=Names, acts_on=Text, label=Text, p_value=Number, reason=Text, weak=StrictBool
+        )
+    ],
+    units=record(force_N=Text, displacement_mm=Text, speed_mm_s=Text, load_N=Text, time_s=Text),
+    noise_floor_N=Maybe,
+    before=ERRORS,
+    after=ERRORS,
+    heldout_unit=Text,
+    effects=list[EFFECT],
+    scatter=list[record(level=Text, sd_rel=Maybe, sd_N=Maybe, df=Maybe)],
+    left=LEFT,
+    outlier_files=list[record(file=Text, deviation_pct=Number, p_value=Number)],
+    next_runs=list[record(why=Text, conditions=dict[Text, StrictBool | Number | Text])],
+    incomplete_channels=list[
+        record(channel=Text, files_without=StrictInt, files=StrictInt, searched=StrictBool)
+    ],
+)
 
 
 # ---------------------------------------------------------------- model.json
 
 
-@dataclass(frozen=True, slots=True)
-class Conditions:
-    """The conditions of the campaign, each list one column."""
-
-    condition: Names
-    series: Names
-    rubber: Names
-    aging_days: list[Annotated[Number, Field(ge=0)]]
-
-    def __post_init__(self) -> None:
-        columns = (self.condition, self.series, self.rubber, self.aging_days)
-        _require(len(self.condition) > 0, len({len(column) for column in columns}) == 1)
-
-
-@dataclass(frozen=True, slots=True)
-class Numbers:
-    """The number of the fitted parameter that each condition uses, for each quantity; -1 for none."""
-
-    mu_0s: list[Place]
-    a_s: list[Place]
-    b_s: list[Place]
-    mu_0c: list[Place]
-    a_c: list[Place]
-    b_c: list[Place]
-    v_s: list[Place]
-    sigma_2: list[Place]
+def _fixed_agree(term) -> bool:
+    """Return whether what is fixed in an effect is of the kind that its name says."""
+    for name, value in term.fixed.items():
+        kind = str if name == "categories" else float | int
+        if name in ("categories", "means") or name.endswith("knots"):
+            good = isinstance(value, list) and all(isinstance(own, kind) for own in value)
+        elif name.endswith("_ref"):
+            good = isinstance(value, kind)
+        else:  # `shift` is written without the origins of passes
+            good = isinstance(value, dict) and (name != "shift" or value == {})
+        if not good:
+            return False
+    return True
 
 
-@dataclass(frozen=True, slots=True)
-class DeclaredModel:
-    """Parameters of the declared model, and which of them every condition uses."""
-
-    parameters: list[tuple[Text, Text]]  # quantity and owner
-    index: Numbers
-    stribeck: dict[Text, Literal["full", "interpolated", "viscous", "constant"]]  # by series
-    law: dict[Text, StrictBool]  # by series
-
-
-Fixed = Number | Text | list[Number] | Names | dict[Text, tuple[Number, Number]] | None
-
-
-@dataclass(frozen=True, slots=True)
-class TermOfModel:
-    """An effect in a model, with its fitted values."""
-
-    id: Text
-    channels: Annotated[Names, Field(min_length=1)]
-    acts_on: Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"]
-    operation: Operation
-    fixed: dict[Text, Fixed]
-    values: dict[Text, Number]
-    smoothness: Maybe
-
-    def __post_init__(self) -> None:
-        for name, value in self.fixed.items():
-            kind = str if name == "categories" else float | int
-            if name in ("categories", "means") or name.endswith("knots"):
-                _require(isinstance(value, list) and all(isinstance(own, kind) for own in value))
-            elif name.endswith("_ref"):
-                _require(isinstance(value, kind))
-            else:  # `shift` is written without the origins of passes
-                _require(isinstance(value, dict), name != "shift" or value == {})
+def _sizes_agree(model) -> bool:
+    """Return whether the parts of a model have the sizes that its parameters and conditions need."""
+    if model.first_started_at is not None:
+        datetime.fromisoformat(model.first_started_at)
+    declared, conditions = len(model.declared.parameters), len(model.conditions.condition)
+    index = asdict(model.declared.index).values()
+    fitted = declared + sum(len(term.values) for term in model.after.terms)
+    covariances = [model.covariance, *(own.covariance for own in model.sandwiches)]
+    blocks = [block for own in model.sandwiches for block in own.information]
+    return (
+        model.has_aging == model.config.aging
+        and len(model.before.theta) == len(model.after.theta) == declared
+        and all(len(own) == conditions and _are_below(own, declared, -1) for own in index)
+        and set(model.conditions.series) <= model.speeds_mm_s.keys()
+        and all(_is_square(own, fitted) for own in covariances)
+        and all(_are_below(own, fitted) and _is_square(block, len(own)) for own, block in blocks)
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class FittedModel:
-    """The fitted numbers of the declared model, and the effects."""
-
-    theta: list[Number]
-    terms: list[TermOfModel]
-
-
-@dataclass(frozen=True, slots=True)
-class GroupCovariance:
-    """A covariance from whole groups: for each, the numbers of its parameters and their information."""
-
-    covariance: Matrix
-    information: list[tuple[list[Annotated[int, Field(strict=True, ge=0)]], Matrix]]
-
-
-@dataclass(frozen=True, slots=True)
-class ComponentOfScatter:
-    """The variance of one level."""
-
-    __pydantic_config__ = ConfigDict(extra="forbid")
-    level: Literal["stroke", "file", "run", "specimen"]
-    kind: Literal["offset", "gain"]
-    variance: Annotated[Number, Field(ge=0)]
-
-
-@dataclass(frozen=True, slots=True)
-class ScatterOfModel:
-    """The noise of a row, and the variance of every level."""
-
-    s0: Number
-    g: Number
-    components: list[ComponentOfScatter]
-
-
-@dataclass(frozen=True, slots=True)
-class Model:
-    """The models before and after, with all that a prediction needs."""
-
-    schema: Literal[1]
-    config: Config
-    conditions: Conditions
-    has_load: StrictBool
-    has_aging: StrictBool
-    declared: DeclaredModel
-    before: FittedModel
-    after: FittedModel
-    covariance: Matrix
-    sandwiches: list[GroupCovariance]
-    df: Annotated[Number, Field(ge=0)]
-    scatter: ScatterOfModel
-    ranges: dict[Text, Names | tuple[Number, Number]]
-    speeds_mm_s: dict[Text, list[Annotated[Number, Field(gt=0)]]]
-    first_started_at: Text | None
-
-    def __post_init__(self) -> None:
-        declared, conditions = len(self.declared.parameters), len(self.conditions.condition)
-        index = asdict(self.declared.index).values()
-        fitted = declared + sum(len(term.values) for term in self.after.terms)
-        blocks = [block for own in self.sandwiches for block in own.information]
-        _require(
-            self.has_aging == self.config.aging,
-            len(self.before.theta) == len(self.after.theta) == declared,
-            all(len(own) == conditions and _are_below(own, declared, -1) for own in index),
-            set(self.conditions.series) <= self.speeds_mm_s.keys(),
-            all(
-                _is_square(own, fitted) for own in (self.covariance, *(s.covariance for s in self.sandwiches))
-            ),
-            all(_are_below(own, fitted) and _is_square(block, len(own)) for own, block in blocks),
-        )
-        if self.first_started_at is not None:
-            datetime.fromisoformat(self.first_started_at)
+CONDITIONS = record(
+    lambda own: len(own.condition) > 0 and len({len(column) for column in asdict(own).values()}) == 1,
+    condition=Names,
+    series=Names,
+    rubber=Names,
+    aging_days=list[Annotated[Number, Field(ge=0)]],
+)
+QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
+DECLARED = record(
+    parameters=list[tuple[Text, Text]],  # quantity and owner
+    # The number of the fitted parameter that each condition uses, for each quantity.
+    index=record(**dict.fromkeys(QUANTITIES, list[Place])),
+    stribeck=dict[Text, Literal["full", "interpolated", "viscous", "constant"]],  # by series
+    law=dict[Text, StrictBool],  # by series
+)
+TERM = record(
+    _fixed_agree,
+    id=Text,
+    channels=Annotated[Names, Field(min_length=1)],
+    acts_on=Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"],
+    operation=Operation,
+    fixed=dict[Text, Number | Text | list[Number] | Names | dict[Text, tuple[Number, Number]] | None],
+    values=dict[Text, Number],
+    smoothness=Maybe,
+)
+FITTED = record(theta=list[Number], terms=list[TERM])
+GROUPED = record(  # a covariance from whole groups: for each, the numbers of its parameters
+    covariance=Matrix,
+    information=list[tuple[list[Annotated[int, Field(strict=True, ge=0)]], Matrix]],
+)
+COMPONENT = record(
+    level=Literal["stroke", "file", "run", "specimen"],
+    kind=Literal["offset", "gain"],
+    variance=Annotated[Number, Field(ge=0)],
+)
+COMPONENT.__pydantic_config__ = ConfigDict(extra="forbid")
+MODEL = record(
+    _sizes_agree,
+    schema=Literal[1],
+    config=Config,
+    conditions=CONDITIONS,
+    has_load=StrictBool,
+    has_aging=StrictBool,
+    declared=DECLARED,
+    before=FITTED,
+    after=FITTED,
+    covariance=Matrix,
+    sandwiches=list[GROUPED],
+    df=Annotated[Number, Field(ge=0)],
+    scatter=record(s0=Number, g=Number, components=list[COMPONENT]),
+    ranges=dict[Text, Names | tuple[Number, Number]],
+    speeds_mm_s=dict[Text, list[Annotated[Number, Field(gt=0)]]],
+    first_started_at=Text | None,
+)
 
 
-_DOCUMENTS = {"closure": TypeAdapter(Closure), "model": TypeAdapter(Model)}
+_DOCUMENTS = {"closure": TypeAdapter(CLOSURE), "model": TypeAdapter(MODEL)}
 
 
 def read_document(name: str, text: str) -> dict:
