@@ -21,12 +21,6 @@ from sealfit.ingest.scatter import Layout, ScatterFit, fit_scatter, repeat_means
 
 # Share of the repeats that the search takes out at most. Beyond it the bulk is not known.
 MAX_OUTLIERS = 0.1
-# Repeats taken out at once at most, as a share of the degrees of freedom: one at a time up to 1,000.
-TOGETHER = 0.002
-# Share of the sum of squares taken out at once at most. The scatter then changes by a percent a round.
-SQUARES = 0.02
-# Factor on the level within which a p-value is found again one by one before it decides.
-NEAR = 10.0
 # Share of its variance below which a residual is that of a run's only repeat.
 ALONE = 1e-9
 
@@ -35,7 +29,6 @@ class _Judged(NamedTuple):
     rows: np.ndarray  # one repeat, or the two of a run
     t: float
     p: float  # adjusted over the campaign
-    tests: int
     mean_N: float  # of the run without it; of the run, if both are out
 
 
@@ -63,123 +56,49 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
     scatter and pattern are estimated without it, and so on; the outliers are those up to the last one that
     exceeds its limit. So neither does an outlier widen the scale it is judged by, nor do two hide each other.
     The limit is Sidak's for the repeats left, on Student's t with the pooled degrees of freedom.
-
-    In large campaigns the most extreme repeats of several runs are taken out at once, so that the work grows
-    with the number of repeats and not with its square; each is then judged by a scatter between those with
-    and without them, and where that leaves the last outlier in doubt, by the scatter that one by one would
-    have given.
     """
     layout = Layout.of(means)
     force = means["force_N"].to_numpy(float)
     tiny = 1e-6 * float(np.max(np.abs(force), initial=0.0)) + 1e-300  # repeats that agree to the last digit
-    found: list[_Judged] = []
-    left, over = max(1, int(MAX_OUTLIERS * len(means))), False
     kept = np.ones(len(means), bool)
+    found: list[_Judged] = []
     fit = fit_scatter(layout, force, kept)
-    while left > 0 and not over:
+    while len(found) < max(1, int(MAX_OUTLIERS * len(means))):
         tests = int((kept & (fit.share > ALONE)).sum())
         if fit.scatter.df < 4 or not tests:
             break
-        most = min(left, int(TOGETHER * fit.scatter.df))
-        taken, kept, apart = _take_out(layout, force, fit, kept, _furthest(layout, fit, kept, most))
-        for judged in _judge(fit, apart, taken, tests, tiny):
-            found.append(judged)
-            over = judged.p >= level and abs(judged.t) < 3.0  # nothing further out remains
-            if over:
-                break
-        left, fit = left - len(taken), apart
-    outliers = _outliers(layout, force, found, level, tiny)
+        rows = _furthest(layout, fit, kept)
+        kept[rows] = False
+        apart = fit_scatter(layout, force, kept)
+        found.append(_judged(fit, apart, rows, tests, tiny))
+        if found[-1].p >= level and abs(found[-1].t) < 3.0:  # nothing further out remains
+            break
+        fit = apart
+    last = max((number for number, one in enumerate(found, start=1) if one.p < level), default=0)
     none = means.iloc[:0].assign(run_mean_N=0.0, t=0.0, p=0.0, alone=False)
     each = [
         means.iloc[one.rows].assign(run_mean_N=one.mean_N, t=one.t, p=one.p, alone=len(one.rows) == 2)
-        for one in outliers
+        for one in found[:last]
     ]
     return pd.concat([none, *each])
 
 
-def _furthest(layout: Layout, fit: ScatterFit, kept: np.ndarray, most: int) -> list[np.ndarray]:
-    """Return the rows to take out next, the most extreme first, one per run: alone or with its only peer."""
-    size = np.where(kept & (fit.share > ALONE), np.abs(fit.t), -1.0)
-    order = np.argsort(-size, kind="stable")[: int((size >= 0.0).sum())]
-    first = np.flatnonzero(~pd.Index(layout.run[order]).duplicated())
-    few = int(np.searchsorted(np.cumsum(size[order[first]] ** 2), SQUARES * fit.scatter.df))
-    first = first[: max(1, min(most, few))]
-    count = np.bincount(layout.run[kept], minlength=layout.runs)
-    return [
-        np.flatnonzero(kept & (layout.run == layout.run[row]))
-        if count[layout.run[row]] == 2
-        else np.array([row])
-        for row in order[first]
-    ]
+def _furthest(layout: Layout, fit: ScatterFit, kept: np.ndarray) -> np.ndarray:
+    """Return the rows to take out next: the most extreme repeat, alone or with its only peer."""
+    row = int(np.argmax(np.where(kept & (fit.share > ALONE), np.abs(fit.t), -1.0)))
+    of_run = np.flatnonzero(kept & (layout.run == layout.run[row]))
+    return of_run if len(of_run) == 2 else np.array([row])
 
 
-def _take_out(
-    layout: Layout, force_N: np.ndarray, fit: ScatterFit, kept: np.ndarray, furthest: list[np.ndarray]
-) -> tuple[list[np.ndarray], np.ndarray, ScatterFit]:
-    """Return what is taken out, which rows are kept then, and the fit to these.
-
-    Without the furthest of its run another repeat may lie further out than some of the rest: these then wait,
-    so that the most extreme goes first.
-    """
-    without = _less(kept, furthest)
-    apart = fit_scatter(layout, force_N, without)
-    touched = without & (apart.share > ALONE) & np.isin(layout.run, layout.run[np.concatenate(furthest)])
-    sd = fit.scatter.sd_N(apart.mean[touched]) * np.sqrt(apart.share[touched])
-    next_out = np.max(np.abs(apart.residual[touched]) / np.maximum(sd, 1e-300), initial=0.0)
-    taken = [rows for rows in furthest if np.abs(fit.t[rows]).max() >= next_out] or furthest[:1]
-    if len(taken) < len(furthest):
-        without = _less(kept, taken)
-        apart = fit_scatter(layout, force_N, without)
-    return taken, without, apart
-
-
-def _less(kept: np.ndarray, taken: list[np.ndarray]) -> np.ndarray:
-    without = kept.copy()
-    for rows in taken:
-        without[rows] = False
-    return without
-
-
-def _judge(
-    fit: ScatterFit, apart: ScatterFit, taken: list[np.ndarray], tests: int, tiny: float
-) -> list[_Judged]:
-    """Return t and p of each that was taken out, by the scatter without it and without those before it.
-
-    Between the scatters with and without all of them, variances go by the share of the squares that is out,
-    degrees of freedom by the number.
-    """
-    worst = np.array([rows[np.argmax(np.abs(fit.t[rows]))] for rows in taken])
-    square = np.nan_to_num(fit.t[worst] ** 2, posinf=1.0)
-    number = np.arange(1, len(taken) + 1) / len(taken)
-    gone = np.cumsum(square) / square.sum() if square.any() else number
-    force = fit.mean[worst]
-    sd = np.sqrt((1.0 - gone) * fit.scatter.sd_N(force) ** 2 + gone * apart.scatter.sd_N(force) ** 2)
-    t = fit.residual[worst] / (np.maximum(sd, tiny) * np.sqrt(fit.share[worst]))
-    each = zip(number.tolist(), force.tolist(), strict=True)
-    df = [(1.0 - n) * fit.df_at(f) + n * apart.df_at(f) for n, f in each]
-    p_one = 2.0 * stdtr(df, -np.abs(t))
-    judged = []
-    for k, rows in enumerate(taken):
-        p = -np.expm1((tests - (len(rows) - 1)) * np.log1p(-min(p_one[k], 1.0 - 1e-16)))
-        mean = apart.mean[worst[k]] if len(rows) == 1 else force[k]
-        judged.append(_Judged(rows, float(t[k]), float(p), tests, float(mean)))
-        tests -= len(rows)
-    return judged
-
-
-def _outliers(
-    layout: Layout, force_N: np.ndarray, found: list[_Judged], level: float, tiny: float
-) -> list[_Judged]:
-    """Return those up to the last one that exceeds its limit."""
-    for last in range(len(found), 0, -1):
-        one = found[last - 1]
-        if level / NEAR < one.p < level * NEAR:
-            kept = _less(np.ones(len(force_N), bool), [other.rows for other in found[: last - 1]])
-            fits = [fit_scatter(layout, force_N, rows) for rows in (kept, _less(kept, [one.rows]))]
-            one = _judge(*fits, [one.rows], one.tests, tiny)[0]
-        if one.p < level:
-            return [*found[: last - 1], one]
-    return []
+def _judged(fit: ScatterFit, apart: ScatterFit, rows: np.ndarray, tests: int, tiny: float) -> _Judged:
+    """Return t and p of what was taken out, by the scatter of the rest, `apart`; `fit` is that with it."""
+    worst = rows[np.argmax(np.abs(fit.t[rows]))]
+    force = float(fit.mean[worst])
+    sd = max(float(apart.scatter.sd_N(force)), tiny) * np.sqrt(fit.share[worst])
+    t = float(fit.residual[worst] / sd)
+    p_one = 2.0 * stdtr(apart.df_at(force), -abs(t))
+    p = -np.expm1((tests - (len(rows) - 1)) * np.log1p(-min(p_one, 1.0 - 1e-16)))
+    return _Judged(rows, t, float(p), float(apart.mean[worst]) if len(rows) == 1 else force)
 
 
 # ---------------------------------------------------------------- peers

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pandas as pd
-import pytest
 
 from sealfit.ingest import repeat_checks
 from sealfit.ingest.files import inside
 from sealfit.ingest.listing import files_beside
-from sealfit.ingest.repeat_checks import outlying_repeats
 
 HEAD = "file,run_id,repeat,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at"
 
@@ -52,43 +50,6 @@ def test_files_beside_have_an_ending_of_the_listed_and_are_files(tmp_path):
     (tmp_path / "broken.csv").symlink_to(tmp_path / "none")
     assert files_beside(tmp_path, {"a.csv", "t/none.csv", "gone/x.csv"}) == {"b.csv", "link.csv", "t/d.csv"}
     assert files_beside(tmp_path / "none", {"a.csv"}) == set()
-
-
-def repeats(runs, seed, far):
-    """Three repeats a run; `far` of them 8 to 20 SDs off, and in some runs two."""
-    rng = np.random.default_rng(seed)
-    level = rng.uniform(5.0, 50.0, runs)[:, None]
-    sd = np.sqrt(0.1**2 + (0.01 * level) ** 2)
-    force = level * np.array([1.02, 1.0, 0.985]) + sd * rng.standard_normal((runs, 3))
-    off = rng.choice(runs, far, replace=False)
-    force[off, 0] += rng.uniform(8, 20, far) * sd[off, 0]
-    force[off[::7], 1] -= 15 * sd[off[::7], 0]
-    names = pd.DataFrame({"file": [f"{r}/{k}" for r in range(runs) for k in range(3)]})
-    return names.assign(
-        run_id=np.repeat(np.arange(runs), 3), repeat=np.tile([1, 2, 3], runs), force_N=force.ravel()
-    )
-
-
-def test_fits_of_the_scatter_do_not_grow_with_the_number_of_far_repeats(monkeypatch):
-    fits = []
-    for runs in (2_000, 8_000):
-        calls = counted(monkeypatch, repeat_checks, "fit_scatter")
-        found = outlying_repeats(repeats(runs, 1, runs // 50), 0.001)
-        assert len(found) >= runs // 50
-        fits.append(len(calls))
-        monkeypatch.undo()
-    assert fits[1] < 1.5 * fits[0]
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_taken_together_the_same_repeats_are_found_as_one_by_one(seed, monkeypatch):
-    means = repeats(1_500, seed, 20)
-    together = outlying_repeats(means, 0.001).set_index("file").sort_index()
-    monkeypatch.setattr(repeat_checks, "TOGETHER", 0.0)
-    alone = outlying_repeats(means, 0.001).set_index("file").sort_index()
-    assert together.index.tolist() == alone.index.tolist()
-    np.testing.assert_allclose(together["run_mean_N"], alone["run_mean_N"], rtol=1e-3)
-    np.testing.assert_allclose(together["t"], alone["t"], rtol=0.05)
 
 
 def test_strokes_with_turned_signs_are_not_each_compared_with_all(monkeypatch):
