@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-import regex
 
 from sealfit.config import Files
 from sealfit.errors import ConfigError, shortened
 from sealfit.ingest.columns import Columns, taken
 from sealfit.ingest.expression import evaluate, parse
-from sealfit.ingest.files import PATTERN_S, as_number, found_by
+from sealfit.ingest.files import as_number, found_by
 from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- refs
@@ -131,56 +128,31 @@ def channels_of(named: Named | None) -> dict[str, float | str]:
     return {name: value for name, value in (named or {}).items() if not name.startswith("_")}
 
 
-# A group or a choice of which nothing is there yet.
-_OPEN = re.compile(r"(\((\?(:|P<\w+>|=|!|<=|<!|<)?)?|\|)$")
-
-
-def matched_part(pattern: str, file: str) -> tuple[str, str]:
-    """Return as much of a path as the longest matching part of a pattern matches, and the pattern's rest.
+def fits_up_to(pattern: str, file: str) -> str:
+    """Return the longest beginning of a path with which a match of the pattern can begin.
 
     Examples
     --------
-    >>> matched_part(r"T(?P<T>\\d+)_d(?P<aging_days>\\d+)[.]csv", "T80_C20_d4.csv")
-    ('T80_', 'd(?P<aging_days>\\\\d+)[.]csv')
+    >>> fits_up_to(r"T(?P<T>\\d+)_d(?P<aging_days>\\d+)[.]csv", "T80_C20_d4.csv")
+    'T80_'
     """
-    for part, length in _parts_of(pattern):
-        try:
-            found = part.match(file, timeout=PATTERN_S)
-        except TimeoutError:
-            break
-        if found:
-            return found.group(), pattern[length:]
-    return "", pattern
-
-
-@cache
-def _parts_of(pattern: str) -> list[tuple[regex.Pattern, int]]:
-    """Return the valid beginnings of a pattern, with open groups closed, and their lengths, longest first."""
-    found = []
-    for length in range(len(pattern), 0, -1):
-        begin = pattern[:length]
-        for closing in ("", ")", "))", ")))") if not _OPEN.search(begin) else ():
-            with suppress(regex.error), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of half a set
-                found.append((regex.compile(begin + closing), length))
-                break
-    return found
+    begins = (file[:length] for length in range(len(file), 0, -1))
+    with suppress(ConfigError):  # it takes too long
+        return next((begin for begin in begins if found_by(pattern, begin, whole=True, cut=True)), "")
+    return ""
 
 
 def unmatched(file: str, pattern: str) -> tuple[str, str]:
     """Return why a path does not match the config's pattern, without the path, and the fix."""
-    begin, rest = matched_part(pattern, file)
+    begin = fits_up_to(pattern, file)
     up_to = f"it fits up to '{begin}', then" if begin else "from its start"
-    where = f"{up_to} the pattern has {_short(rest)} and the path {_short(file[len(begin) :])}"
+    rest = f"'{shortened(file[len(begin) :], 30)}'" if begin != file else "nothing more"
+    where = f"{up_to} the path has {rest}"
     reason = f"the whole path below the campaign folder does not match files.name_pattern: {where}."
     fix = "Rename it, widen the pattern, or list it under files.exclude."
     if "/" in file and found_by(pattern, file.rpartition("/")[2], whole=True):
         fix = "The pattern matches the name without its folders: begin it with '(?:.*/)?'."
     return reason, fix
-
-
-def _short(text: str) -> str:
-    return f"'{shortened(text, 30)}'" if text else "nothing"
 
 
 def _value(text: str) -> float | str:

@@ -295,8 +295,10 @@ PATTERN_S = 0.5
 _compiled = cache(regex.compile)
 
 
-def found_by(pattern: str, text: str, *, whole: bool = False) -> regex.Match | None:
+def found_by(pattern: str, text: str, *, whole: bool = False, cut: bool = False) -> regex.Match | None:
     """Return the first place in a text where a pattern of the config matches; with `whole`, all of the text.
+
+    With `cut` the text may end before the match does.
 
     Raises
     ------
@@ -305,7 +307,7 @@ def found_by(pattern: str, text: str, *, whole: bool = False) -> regex.Match | N
     """
     match = _compiled(pattern).fullmatch if whole else _compiled(pattern).search
     try:
-        return match(text, timeout=PATTERN_S)
+        return match(text, partial=cut, timeout=PATTERN_S)
     except TimeoutError:
         reason = f"the pattern '{shortened(pattern)}' takes too long on '{shortened(text)}'."
         fix = "Write it without repeats within repeats, such as (a+)+."

@@ -53,7 +53,7 @@ from sealfit.ingest.derived_columns import (
     with_computed,
     with_day_0,
 )
-from sealfit.ingest.file_names import Listing, TraceRef, channels_of, matched_part, name_parts, unmatched
+from sealfit.ingest.file_names import Listing, TraceRef, channels_of, fits_up_to, name_parts, unmatched
 from sealfit.ingest.files import as_number, bad_file, cut_files, read_bytes
 from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt
@@ -346,7 +346,7 @@ def _named(entries: list[Entry], config: Config) -> tuple[list[int], Columns, li
             parts.append(channels_of(named))
     if not kept:
         pattern = config.files.name_pattern
-        nearest = max(faults, key=lambda fault: len(pattern) - len(matched_part(pattern, fault.file)[1]))
+        nearest = max(faults, key=lambda fault: len(fits_up_to(pattern, fault.file)))
         reason = f"none of {len(entries)} files is matched; of this one, the nearest, {nearest.reason}"
         raise CampaignError([replace(nearest, reason=reason, severity="error", action="stopped")])
     return kept, columns_of(parts), faults
