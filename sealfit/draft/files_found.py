@@ -183,7 +183,7 @@ def text_of(folder: Path, file: str, *, first_sheet: bool = False) -> str:
         return _text_of_arrays(read_bytes(folder, file), file)
     if kind == "xlsx":
         sheet = 1 if first_sheet else LONGEST
-        return read_sheet(read_bytes(folder, file), file, sheet).text.decode()
+        return read_sheet(read_bytes(folder, file), file, sheet).decode()
     whole = (folder / file).stat().st_size <= WHOLE_BYTES if (folder / file).exists() else True
     raw = read_bytes(folder, file, head=not whole)
     text = as_utf8(raw, "auto", file, head=not whole).decode("utf-8", "replace")

@@ -161,11 +161,9 @@ def _text(
         text = as_utf8(raw, settings.encoding, file, head=head)
         refuse_marked_up(text, file)
         return text, find_layout(text, settings, file), settings
-    sheet = read_sheet(raw, file, settings.sheet, decimal=settings.decimal, head=head)
+    text = read_sheet(raw, file, settings.sheet, decimal=settings.decimal, head=head)
     settings = settings.model_copy(update={"delimiter": "tab"})
-    layout = find_layout(sheet.text, settings, file)
-    sheet.check(layout.first_line, file)
-    return sheet.text, layout, settings
+    return text, find_layout(text, settings, file), settings
 
 
 def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | str]:

@@ -6,14 +6,10 @@ The number of a line is that of the sheet's row. Numbers are written without los
 from __future__ import annotations
 
 import io
-import re
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from xml.etree import ElementTree
 
 from sealfit.config import Config
 from sealfit.errors import nearest
@@ -26,53 +22,40 @@ HEAD_ROWS = 1000  # a header longer than this is no header
 LONGEST = object()  # stands for the sheet with the most rows
 _OLE = b"\xd0\xcf\x11\xe0"  # of .xls, and of the shell that Excel puts around an encrypted workbook
 _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
-_MERGED = re.compile(rb'mergeCell\b[^>]*?\bref="([A-Z]+\d+:[A-Z]+\d+)"')
-_RELATION = "{http://schemas.openxmlformats.org/officeDocument/2006/relationships}id"
-
-
-@dataclass(frozen=True, slots=True)
-class Sheet:
-    """The text of a sheet, and its merged cells, as `A1:B2`."""
-
-    text: bytes
-    merged: tuple[str, ...]
-
-    def check(self, first_row: int, file: str) -> None:
-        """Raise `BadFile` if cells are merged at or below the first row of data.
-
-        A merged cell has its value in its first row only; those below it would be taken as empty.
-        """
-        for cells in self.merged:
-            row, last = map(int, re.findall(r"\d+", cells))
-            if last >= first_row:
-                fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
-                raise bad_file(file, "merged_cells", f"the cells {cells} are merged.", fix, line=row)
 
 
 def read_sheet(
-    raw: bytes, file: str, sheet: str | int | object | None, *, decimal: str = ".", head: bool = False
-) -> Sheet:
+    raw: bytes,
+    file: str,
+    sheet: str | int | object | None,
+    *,
+    decimal: str = ".",
+    head: bool = False,
+    merged: bool = True,
+) -> bytes:
     """Return a sheet of a workbook as text: its name or number (from 1), or None for the only one with cells.
 
     `LONGEST` is the one with the most rows. With `head`, `HEAD_ROWS` rows are enough. Numbers are written
-    with the mark `decimal`.
+    with the mark `decimal`. A merged cell has its value in its first place only; the others are empty.
 
     Raises
     ------
     BadFile
-        If it is no workbook that can be read, has no such sheet, or formulas without values.
+        If it is no workbook that can be read, has no such sheet, formulas without values, or merged cells
+        that may not be there.
     CampaignError
         If openpyxl is not installed.
     """
-    with _book(raw, file, formulas=True) as book:
+    with _book(raw, file, formulas=True, by_row=merged) as book:
         title = _title(book, sheet, file)
         lines, formulas = _lines(book[title], decimal, head)
-        merged = () if head else _merged(raw, title)
+        if not merged:
+            _refuse_merged(book[title], file)
     if formulas:
         with _book(raw, file, formulas=False) as book:
             lines, _ = _lines(book[title], decimal, head)
             _refuse_unsaved(book[title], formulas, file)
-    return Sheet("\n".join(lines).encode("utf-8", "replace"), merged)
+    return "\n".join(lines).encode("utf-8", "replace")
 
 
 def rows_of_sheets(raw: bytes, file: str) -> dict[str, int]:
@@ -87,13 +70,16 @@ def _rows(book) -> dict[str, int]:
 
 
 @contextmanager
-def _book(raw: bytes, file: str, *, formulas: bool) -> Iterator:
-    """Open a workbook to be read row by row, with its formulas or with the values that Excel kept of them."""
+def _book(raw: bytes, file: str, *, formulas: bool, by_row: bool = True) -> Iterator:
+    """Open a workbook with its formulas or with the values that Excel kept of them.
+
+    Read `by_row` it takes little memory, and does not say which cells are merged.
+    """
     _refuse_others(raw, file)
     openpyxl = library("openpyxl", file)
-    options = {"read_only": True, "data_only": not formulas, "keep_links": False}
+    options = {"read_only": by_row, "data_only": not formulas, "keep_links": False}
     with damage_named(file, "xlsx"), closing(openpyxl.load_workbook(io.BytesIO(raw), **options)) as book:
-        for sheet in book.worksheets:
+        for sheet in book.worksheets if by_row else ():
             sheet.reset_dimensions()  # some writers note a size that is not so
         yield book
 
@@ -188,26 +174,12 @@ def _refuse_unsaved(sheet, formulas: list[tuple[int, int]], file: str) -> None:
                 raise bad_file(file, "formula", reason, fix, line=number, column=get_column_letter(place))
 
 
-def _merged(raw: bytes, title: str) -> tuple[str, ...]:
-    """Return the merged cells of a sheet, which openpyxl does not read row by row."""
-    found: dict[str, None] = {}
-    with zipfile.ZipFile(io.BytesIO(raw)) as packed, packed.open(_part(packed, title)) as part:
-        rest = b""
-        while block := part.read(1 << 20):
-            rest += block
-            found |= dict.fromkeys(cells.decode() for cells in _MERGED.findall(rest))
-            rest = rest[-200:]
-    return tuple(found)
-
-
-def _part(packed: zipfile.ZipFile, title: str) -> str:
-    """Return the file inside a workbook that holds a sheet."""
-    sheets = ElementTree.fromstring(packed.read("xl/workbook.xml")).iter()
-    numbers = (sheet.get(_RELATION) for sheet in sheets if sheet.get("name") == title)
-    number = next(filter(None, numbers))
-    relations = ElementTree.fromstring(packed.read("xl/_rels/workbook.xml.rels"))
-    target = next(relation.get("Target") for relation in relations if relation.get("Id") == number)
-    return target.removeprefix("/") if target.startswith("/") else f"xl/{target}"
+def _refuse_merged(sheet, file: str) -> None:
+    """Raise `BadFile` if cells are merged."""
+    if merged := sorted(sheet.merged_cells.ranges, key=lambda cells: cells.min_row):
+        fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
+        reason = f"the cells {merged[0]} are merged."
+        raise bad_file(file, "merged_cells", reason, fix, line=merged[0].min_row)
 
 
 # ---------------------------------------------------------------- tables of runs
@@ -232,9 +204,8 @@ def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]
         with damage_named(file, kind):
             return _parquet_text(raw), "\t"
     if kind == "xlsx":
-        sheet = read_sheet(raw, file, 1 if config.files.runs_sheet is None else config.files.runs_sheet)
-        sheet.check(1, file)
-        return sheet.text, "\t"
+        sheet = 1 if config.files.runs_sheet is None else config.files.runs_sheet
+        return read_sheet(raw, file, sheet, merged=False), "\t"
     fix = "Save it as .csv, .xlsx or .parquet."
     raise bad_file(file, "binary_file", f"is {CALLED[kind]}, which is no table of runs.", fix)
 

@@ -198,7 +198,7 @@ def test_the_sheet_is_the_only_one_with_cells_or_the_one_named(tmp_path):
     assert "it has 2" in refused(tmp_path, "two.xlsx", "[trace]\nsheet = 3").reason
 
 
-def test_formulas_count_by_their_values_and_merged_cells_are_named(tmp_path):
+def test_formulas_count_by_their_values_and_what_a_merged_cell_covers_is_empty(tmp_path):
     wanted = table(digits=15)
     rows = [list(wanted), *wanted.itertuples(index=False)]
 
@@ -209,9 +209,11 @@ def test_formulas_count_by_their_values_and_merged_cells_are_named(tmp_path):
     fault = refused(tmp_path, "formula.xlsx")
     assert (fault.check, fault.line, fault.column) == ("formula", 7, "C")
     book(tmp_path / "merged.xlsx", rows, change=lambda sheet: sheet.merge_cells("B9:B11"))
-    fault = refused(tmp_path, "merged.xlsx")
-    assert (fault.check, fault.line) == ("merged_cells", 9)
-    assert "B9:B11" in fault.reason
+    found = read(tmp_path, "merged.xlsx", "[quality]\nmax_bad_rows = 0.5").faults
+    assert [(fault.check, fault.line, fault.column) for fault in found] == [
+        ("empty_cell", 10, "displacement_mm"),
+        ("empty_cell", 11, "displacement_mm"),
+    ]
     titled = [["Report", None, None], *rows]
     book(tmp_path / "title.xlsx", titled, change=lambda sheet: sheet.merge_cells("A1:C1"))
     text = "[trace]\nheader_lines = 2"
