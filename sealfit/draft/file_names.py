@@ -10,8 +10,9 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
-from sealfit.config import AGING_CONDITION
+from sealfit.config import AGING_CONDITION, Files
 from sealfit.draft.vocabulary import DIRECTIONS, RUBBERS, UNAGED, after_number, before_number
 
 # The ending of a file's name: with a letter, as in `v0.5` the last figure is none.
@@ -24,7 +25,6 @@ _TOKEN = re.compile(
     r"|(?P<number>(?:(?:(?<=[/_\s=(])|^)-)?\d+(?:[.,]\d+|p\d+)?)"
     r"|(?P<sep>[^\w%°]+|_+)"
 )
-_ISO = re.compile(r"(20\d\d)([-_.]?)(\d\d)\2(\d\d)(?:([T_\- ])(\d\d)([-:.h]?)(\d\d)(?:\7(\d\d))?)?$")
 # Different values up to which a word is a label and a bare number may be a repeat.
 FEW = 12
 # Percent: a smaller compression is how much the rubber was compressed; none is squeezed below half.
@@ -49,38 +49,68 @@ class Token:
 class Part:
     """A piece of the names that stands for something.
 
-    `ours` is the column that it gives, "" for none; `group` names it in the pattern, "" for a piece that is
-    matched only. `texts` are its different values; `expression` what computes the column where it is not the
-    number itself; `unit` that of the number, "" for the column's own.
+    `ours` is the column that it gives, "" for a piece that is matched only. `texts` are its different values;
+    `expression` what computes the column where it is not the number itself; `unit` that of the number, "" for
+    the column's own; `signs` those of words for a direction.
     """
 
     at: int
     ours: str
-    group: str
     pattern: str
     texts: tuple[str, ...]
     why: str
     expression: str = ""
     unit: str = ""
     doubt: str = ""
+    signs: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def group(self) -> str:
+        """Its name in the pattern: that of the column, or with a leading `_` where that is made from it."""
+        if self.expression or self.ours in ("direction", "specimen_id"):
+            return f"_{self.ours.split('_')[0]}"
+        return self.ours
 
 
 @dataclass(frozen=True)
 class Names:
-    """What names say, ready for a config: the pattern, value maps, expressions, templates and units."""
+    """What names of files say: the pieces of the first of them, and the parts that stand for something.
 
-    pattern: str | None
+    One of the `words` for unaged rubber may stand in place of the pieces in the range `middle`. `templates`
+    are columns beside those of the parts.
+    """
+
+    files: tuple[str, ...]
+    pieces: tuple[Token, ...] = ()
     parts: tuple[Part, ...] = ()
-    values: Mapping[str, Mapping[str, float | str]] = field(default_factory=dict)
-    compute: Mapping[str, str] = field(default_factory=dict)
-    columns: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    unmatched: tuple[str, ...] = ()
+    middle: tuple[int, int] | None = None
+    words: tuple[str, ...] = ()
+    templates: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def settings(self) -> Files:
+        """How a config reads the names; without a pattern if they say nothing."""
+        return settings_of(self) if any(part.ours for part in self.parts) else Files()
 
     @property
     def given(self) -> set[str]:
         """Our columns that the names give."""
-        return {part.ours for part in self.parts if part.ours} | set(self.columns)
+        return {part.ours for part in self.parts if part.ours} | set(self.settings.columns)
+
+    @property
+    def unmatched(self) -> tuple[str, ...]:
+        """The files that the pattern does not match; none without a pattern."""
+        pattern = self.settings.name_pattern
+        return tuple(file for file in self.files if pattern and not re.fullmatch(pattern, file))
+
+    def changed(self, part: Part, **changes: object) -> Names:
+        """Return the names with one of the parts changed."""
+        parts = tuple(replace(own, **changes) if own is part else own for own in self.parts)
+        return replace(self, parts=parts)
+
+    def without(self, part: Part) -> Names:
+        """Return the names without what one of the parts says: it is matched only."""
+        return self.changed(part, ours="", doubt="")
 
 
 def tokens(name: str) -> list[Token]:
@@ -107,54 +137,50 @@ def as_float(text: str) -> float:
 # ---------------------------------------------------------------- pattern
 
 
-def pattern_of(
-    rows: Sequence[Sequence[Token]],
-    parts: Sequence[Part],
-    suffix: str,
-    middle: tuple[int, int] | None,
-    words: Sequence[str],
-) -> str:
-    """Return the regular expression that finds parts of names; `middle` is what one of the words replaces."""
-    optional = next((part for part in parts if part.texts[0] == ""), None)
-    by_place = {part.at: part for part in parts if part is not optional}
+def pattern_of(names: Names) -> str:
+    """Return the regular expression that finds the parts of names."""
+    optional = next((part for part in names.parts if part.texts[0] == ""), None)
+    by_place = {part.at: part for part in names.parts if part is not optional}
     pieces = []
-    for at, token in enumerate(rows[0]):
+    for at, token in enumerate(names.pieces):
         part = by_place.get(at)
         if part is None:
             pieces.append(re.escape(token.text) if token.kind != "number" else r"\d+(?:[.,p]\d+)?")
-        elif part.group.startswith("_date"):
+        elif part.ours == "started_at":
             pieces.append(_date_pattern(token.text, token.kind))
         else:
-            pieces.append(f"(?P<{part.group}>{part.pattern})" if part.group else f"(?:{part.pattern})")
+            pieces.append(f"(?P<{part.group}>{part.pattern})" if part.ours else f"(?:{part.pattern})")
         if optional is not None and optional.at == at:
             pieces[-1] = f"(?P<{optional.group}>{optional.pattern}){pieces[-1]}"
-    if middle is not None:
-        first, last = middle
+    if names.middle is not None:
+        first, last = names.middle
         inner = "".join(pieces[first:last])
-        pieces[first:last] = [f"(?:{inner}|{'|'.join(map(re.escape, words))})"]
-    return "".join(pieces).replace(r"\ ", " ").replace(r"\-", "-").replace(r"\%", "%") + suffix
+        pieces[first:last] = [f"(?:{inner}|{'|'.join(map(re.escape, names.words))})"]
+    pattern = "".join(pieces).replace(r"\ ", " ").replace(r"\-", "-").replace(r"\%", "%")
+    return pattern + suffix_pattern(names.files)
 
 
 def _date_pattern(text: str, kind: str) -> str:
+    """Return the pattern of a date, with its numbers named in their order."""
+    names = iter(("_year", "_month", "_day", "_hour", "_minute", "_second"))
+    numbers = r"^\d{4}|\d\d"
     if kind == "dmy":
-        mark = re.escape(text[2])
-        return rf"(?P<_day>\d\d){mark}(?P<_month>\d\d){mark}(?P<_year>\d{{4}})"
-    match = _ISO.match(text)
-    between = re.escape(match[2])
-    pattern = rf"(?P<_year>\d{{4}}){between}(?P<_month>\d\d){between}(?P<_day>\d\d)"
-    if match[5] is not None:
-        colon = re.escape(match[7])
-        pattern += rf"{re.escape(match[5])}(?P<_hour>\d\d){colon}(?P<_minute>\d\d)"
-        pattern += rf"{colon}(?P<_second>\d\d)" if match[9] is not None else ""
-    return pattern
+        names, numbers = iter(("_day", "_month", "_year")), r"\d{4}$|\d\d"
+    return re.sub(numbers, lambda found: rf"(?P<{next(names)}>\d{{{len(found[0])}}})", re.escape(text))
 
 
-def settings_with(pattern: str, parts: Sequence[Part], middle: tuple[int, int] | None) -> Names:
-    """Return the value maps, expressions, templates and units that go with the pattern."""
+def settings_of(names: Names) -> Files:
+    """Return the pattern of names, and the value maps, expressions, templates and units that go with it."""
     values: dict[str, dict[str, float | str]] = {}
     compute: dict[str, str] = {}
-    for part in parts:
-        if not part.group or part.ours == "started_at":
+    ours = {part.ours: part for part in names.parts}
+    if "direction" in ours and "speed_mm_s" in ours:
+        names = names.changed(ours["speed_mm_s"], expression="_direction * {}")
+    elif "direction" in ours:
+        compute["direction_set"] = "_direction"
+    pattern, middle = pattern_of(names), names.middle
+    for part in names.parts:
+        if part.ours in ("", "started_at"):
             continue
         if any(mark in text for text in part.texts for mark in ",p") and part.ours != "rubber":
             values[part.group] = {text: as_float(text) for text in part.texts if text[:1] in "-0123456789"}
@@ -163,13 +189,12 @@ def settings_with(pattern: str, parts: Sequence[Part], middle: tuple[int, int] |
             values.setdefault(part.group, {})[""] = 0.0
         if part.ours == "direction":
             signs = {text: DIRECTIONS.get(text.lower(), -1 if text else 1) for text in part.texts}
-            values[part.group] = {text: float(sign) for text, sign in signs.items()}
-        elif part.expression or (part.group.startswith("_") and part.ours != "specimen_id"):
-            compute[part.ours] = (part.expression or "{}").format(part.group)
-    columns = _date_template(pattern) | _specimen_template(parts)
-    compute |= signed_speed(parts, compute)
-    units = {part.ours: part.unit for part in parts if part.unit}
-    return Names(pattern, tuple(parts), values, compute, columns, units)
+            values[part.group] = {text: float(sign) for text, sign in (part.signs or signs).items()}
+        elif part.expression:
+            compute[part.ours] = part.expression.format(part.group)
+    columns = _date_template(pattern) | _specimen_template(names.parts) | dict(names.templates)
+    units = {part.ours: part.unit for part in names.parts if part.unit}
+    return Files(name_pattern=pattern, values=values, compute=compute, columns=columns, units=units)
 
 
 def _date_template(pattern: str) -> dict[str, str]:
@@ -187,16 +212,6 @@ def _specimen_template(parts: Sequence[Part]) -> dict[str, str]:
         return {}
     settings = [part.group for part in parts if part.ours in ("rubber", *AGING_CONDITION)]
     return {"specimen_id": " ".join("{" + name + "}" for name in [*settings, "_specimen"])}
-
-
-def signed_speed(parts: Sequence[Part], compute: Mapping[str, str]) -> dict[str, str]:
-    """Return the expression of a speed with the sign of its direction, where names say it in a word."""
-    if not any(part.ours == "direction" for part in parts):
-        return {}
-    speed = next((part for part in parts if part.ours == "speed_mm_s"), None)
-    if speed is None:
-        return {"direction_set": "_direction"}
-    return {"speed_mm_s": f"_direction * ({compute.get('speed_mm_s', speed.group)})"}
 
 
 def suffix_pattern(files: Sequence[str]) -> str:
@@ -223,14 +238,10 @@ def read_names(files: Sequence[str]) -> Names:
         signed = [pieces for pieces in cut.values() if _has_word(pieces, sign, rows[0])]
         rows += [pieces[: sign[0]] + pieces[sign[0] + 1 :] for pieces in signed]
     parts = _parts(rows)
-    if not any(part.group for part in parts):
-        return Names(None)
     middle, words = _unaged(rows[0], parts, [cut[f] for f in files if f not in set(main)])
-    if sign is not None:
+    if sign is not None and any(part.ours for part in parts):
         parts = _with_sign(parts, sign)
-    pattern = pattern_of(rows, parts, suffix_pattern(files), middle, words)
-    names = settings_with(pattern, parts, middle)
-    return replace(names, unmatched=tuple(file for file in files if not re.fullmatch(pattern, file)))
+    return Names(tuple(files), tuple(rows[0]), tuple(parts), middle, tuple(words))
 
 
 # ---------------------------------------------------------------- parts
@@ -243,12 +254,12 @@ def _parts(rows: Sequence[Sequence[Token]]) -> list[Part]:
         texts = tuple(dict.fromkeys(row[at].text for row in rows))
         if token.kind in ("date", "dmy"):
             doubt = "the day is taken to stand before the month" if token.kind == "dmy" else ""
-            found.append(Part(at, "started_at", f"_date_{at}", "", texts, "a date", doubt=doubt))
+            found.append(Part(at, "started_at", "", texts, "a date", doubt=doubt))
         elif token.kind == "word" and (part := _word(at, texts)):
             found.append(part)
         elif token.kind == "number":
             found.append(_number(at, rows, texts))
-    return _named(_without_doubles(_with_bare_numbers(found, rows), rows))
+    return _without_doubles(_with_bare_numbers(found, rows), rows)
 
 
 def _word(at: int, texts: tuple[str, ...]) -> Part | None:
@@ -259,11 +270,11 @@ def _word(at: int, texts: tuple[str, ...]) -> Part | None:
     if len(texts) <= FEW:
         pattern = "|".join(sorted(map(re.escape, texts), key=len, reverse=True))
     if low <= DIRECTIONS.keys():
-        return Part(at, "direction", "_direction", pattern, texts, "a word for the direction")
+        return Part(at, "direction", pattern, texts, "a word for the direction")
     if low <= RUBBERS:
-        return Part(at, "rubber", "rubber", pattern, texts, "the short name of a rubber")
+        return Part(at, "rubber", pattern, texts, "the short name of a rubber")
     doubt = "what this word stands for is not known; it is kept as a label"
-    return Part(at, f"label_{at}", f"label_{at}", pattern, texts, "a word that varies", doubt=doubt)
+    return Part(at, f"label_{at}", pattern, texts, "a word that varies", doubt=doubt)
 
 
 def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) -> Part:
@@ -273,12 +284,12 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     if after and (said := after_number(re.sub(r"[-_ /]", "", after))):
         ours, unit = said
         why = f"'{after}' stands after the number"
-        return _as_height(Part(at, ours, "", pattern, texts, why, unit=unit), before)
+        return _as_height(Part(at, ours, pattern, texts, why, unit=unit), before)
     ours = before_number(before) if before else ""
     if ours in NO_COUNTS and _counts_up(texts):
         ours = ""
     why = f"'{before}' stands before the number" if before else "a bare number"
-    return _as_height(Part(at, ours, "", pattern, texts, why), before)
+    return _as_height(Part(at, ours, pattern, texts, why), before)
 
 
 def _counts_up(texts: Sequence[str]) -> bool:
@@ -374,25 +385,12 @@ def _without_doubles(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> 
             made.append(part)
         elif part.ours == "started_at":
             why = "a date before another one"
-            made.append(replace(part, ours="", group="", pattern=r"[\dTh:_. -]+", why=why))
+            made.append(replace(part, ours="", pattern=r"[\dTh:_. -]+", why=why))
         elif all(row[part.at].text == row[later.at].text for row in rows):
             made.append(replace(part, ours="", why=f"{part.why}, said again later in the path"))
         else:
             doubt = f"a second number that looks like {part.ours}; it is kept as a channel"
-            made.append(replace(part, ours=f"part_{part.at}", group="", expression="", unit="", doubt=doubt))
-    return made
-
-
-def _named(parts: Sequence[Part]) -> list[Part]:
-    """Return the parts with the names of their groups: a leading `_` where the column is made from them."""
-    made = []
-    for part in parts:
-        if part.group or not part.ours:
-            made.append(part)
-        elif part.expression or part.ours == "specimen_id":
-            made.append(replace(part, group=f"_{part.ours.split('_')[0]}"))
-        else:
-            made.append(replace(part, group=part.ours))
+            made.append(replace(part, ours=f"part_{part.at}", expression="", unit="", doubt=doubt))
     return made
 
 
@@ -447,4 +445,4 @@ def _with_sign(parts: Sequence[Part], sign: tuple[int, str]) -> list[Part]:
     why = f"'{text}' stands before the number in some names"
     doubt = f"'{text}' is taken for the other direction"
     pattern = f"(?:{re.escape(text)})?"
-    return [*parts, Part(at, "direction", "_direction", pattern, ("", text), why, doubt=doubt)]
+    return [*parts, Part(at, "direction", pattern, ("", text), why, doubt=doubt)]

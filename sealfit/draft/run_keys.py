@@ -10,11 +10,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePosixPath
 
-from sealfit.config import AGING_CONDITION, Files
+from sealfit.config import AGING_CONDITION
 from sealfit.draft.columns import Roles
 from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import CLOCK, Dialect
-from sealfit.draft.file_names import FEW, HEIGHT_FROM, Names, Part, signed_speed
+from sealfit.draft.file_names import FEW, HEIGHT_FROM, Names, Part
 from sealfit.draft.files_found import Found, RunsTable
 from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import channels_of, name_parts
@@ -35,9 +35,8 @@ _WHOLE_DAY = re.compile(r"\d{4}-\d\d-\d\d(?:[ T]00:00(?::00)?)?")  # a workbook'
 
 def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, float | str]]:
     """Return what the names of files say, by file."""
-    given = {"values": names.values, "compute": names.compute, "columns": names.columns, "units": names.units}
-    settings = Files(name_pattern=names.pattern, **given)
-    conversions = {name: conversion(unit, Units().of(name)) for name, unit in names.units.items()}
+    settings = names.settings
+    conversions = {name: conversion(unit, Units().of(name)) for name, unit in settings.units.items()}
     found = {}
     for file in files:
         try:
@@ -55,7 +54,7 @@ def improved(names: Names, speeds: Mapping[str, float], found: Found, notes: Not
 
     `speeds` are the measured ones, negative backward.
     """
-    if names.pattern is None:
+    if names.settings.name_pattern is None:
         return names
     names = _with_direction(_with_speed(names, speeds, notes), speeds)
     return _unaged_apart(_told_apart(names, found, notes), found)
@@ -71,9 +70,8 @@ def _with_direction(names: Names, speeds: Mapping[str, float]) -> Names:
         ways = {(one[part.ours], speeds[file] > 0) for file, one in said.items() if part.ours in one}
         signs = {word: 1.0 if forward else -1.0 for word, forward in sorted(ways)}
         if part.ours.startswith("label_") and len(ways) == len(signs) == len(set(signs.values())) == 2:
-            made = _renamed(names, part, "direction", "_direction", "follows the displacement")
-            compute = {**made.compute, **signed_speed(made.parts, made.compute)}
-            return replace(made, values={**made.values, "_direction": signs}, compute=compute)
+            why = f"{part.why}; follows the displacement"
+            return names.changed(part, ours="direction", why=why, doubt="", signs=signs)
     return names
 
 
@@ -89,7 +87,8 @@ def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Name
         if part.ours.startswith("part_") and len(part.texts) > 1:
             ratio = _ratio({f: v.get(part.ours) for f, v in said.items()}, speeds)
             if ratio is not None and abs(ratio - 1) <= AGREES:
-                return _as_speed(names, part)
+                why = f"{part.why}; agrees with the measured speed"
+                return names.changed(part, ours="speed_mm_s", why=why, doubt="")
     return names
 
 
@@ -114,27 +113,7 @@ def _speed_in_unit(names: Names, ratio: float, notes: Notes) -> Names:
         notes.doubt("files.name_pattern", reason, fix)
         return names
     why = f"{part.why}; {ratio:.3g} times the measured speed in mm/s, so it is in {unit}"
-    parts = tuple(replace(p, unit=unit, why=why) if p is part else p for p in names.parts)
-    return replace(names, units={**names.units, "speed_mm_s": unit}, parts=parts)
-
-
-def _as_speed(names: Names, part: Part) -> Names:
-    """Return the names with a number as the speed, signed if a word says the direction."""
-    signed = any(other.ours == "direction" for other in names.parts)
-    group = "_speed" if signed else "speed_mm_s"
-    compute = {name: text for name, text in names.compute.items() if name != "direction_set"}
-    compute |= {"speed_mm_s": "_direction * _speed"} if signed else {}
-    made = _renamed(names, part, "speed_mm_s", group, "agrees with the measured speed")
-    return replace(made, compute=compute)
-
-
-def _renamed(names: Names, part: Part, ours: str, group: str, why: str) -> Names:
-    """Return the names with another column, and group of the pattern, for a part."""
-    made = replace(part, ours=ours, group=group, why=f"{part.why}; {why}", doubt="")
-    parts = tuple(made if p is part else p for p in names.parts)
-    values = {(group if key == part.group else key): value for key, value in names.values.items()}
-    pattern = names.pattern.replace(f"(?P<{part.group}>", f"(?P<{group}>")
-    return replace(names, pattern=pattern, parts=parts, values=values)
+    return names.changed(part, unit=unit, why=why)
 
 
 def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
@@ -156,12 +135,12 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
     if "speed_mm_s" in of_run & names.given and max(_keys(said, of_run | words).values()) == 1:
         of_run = (of_run | words | {"direction"}) - {"repeat"}
         template = " ".join(f"{{{part.group}}}" for part in names.parts if part.ours in of_run)
-        return replace(names, columns={**names.columns, "run_id": template})
+        return replace(names, templates={**names.templates, "run_id": template})
     count = sum(number for number in keys.values() if number > 1)
     reason = f"the repeat in names does not tell {count} files apart that have the same settings."
     fix = "It is not used; repeats are numbered in the order of the files."
     notes.doubt("files.name_pattern", reason, fix)
-    return _without(names, repeat)
+    return names.without(repeat)
 
 
 def _keys(said: Mapping[str, dict], columns: Collection[str]) -> Counter:
@@ -180,19 +159,7 @@ def _unaged_apart(names: Names, found: Found) -> Names:
     if len(both) == len({otherwise for otherwise, _ in both}):
         return names
     template = " ".join(f"{{{part.group}}}" for part in series)
-    return replace(names, columns={**names.columns, "specimen_id": template})
-
-
-def _without(names: Names, part: Part) -> Names:
-    """Return the names without what one part says: it is matched only."""
-    return replace(
-        names,
-        pattern=names.pattern.replace(f"(?P<{part.group}>", "(?:"),
-        values={key: value for key, value in names.values.items() if key != part.group},
-        compute={key: value for key, value in names.compute.items() if key != part.ours},
-        units={key: value for key, value in names.units.items() if key != part.ours},
-        parts=tuple(other for other in names.parts if other is not part),
-    )
+    return replace(names, templates={**names.templates, "specimen_id": template})
 
 
 # ---------------------------------------------------------------- keys
@@ -280,7 +247,8 @@ def _excluded(surplus: set[str], matched: set[str]) -> list[str]:
 
 def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
     """Add what names say; that they say nothing matters only where nothing else has `told` the conditions."""
-    if names.pattern is None:
+    settings = names.settings
+    if settings.name_pattern is None:
         if told:
             return
         reason = "the names of the files say nothing that is known here: temperature, days, speed, repeat."
@@ -289,19 +257,19 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         return
     ours, matched = [part for part in names.parts if part.ours], files - len(names.unmatched)
     said = "; ".join(f"{_example(part)} -> {part.ours} ({part.why}: {_values(part)})" for part in ours)
-    notes.guess("files.name_pattern", names.pattern, f"matches {matched} of {files} files. {said}")
+    notes.guess("files.name_pattern", settings.name_pattern, f"matches {matched} of {files} files. {said}")
     for part in ours:
         if part.doubt:
             reason = f"'{_example(part)}': {part.doubt}."
             notes.doubt("files.name_pattern", reason, "Check what it stands for.")
-    for name, template in names.columns.items():
+    for name, template in settings.columns.items():
         evidence = _specimens(names, notes) if name == "specimen_id" else "made of parts of the name"
         notes.guess(f"files.columns.{name}", template, evidence)
-    for group, mapped in names.values.items():
+    for group, mapped in settings.values.items():
         notes.guess(f"files.values.{group}", dict(mapped), "how these are written in the names")
-    for name, expression in names.compute.items():
+    for name, expression in settings.compute.items():
         notes.guess(f"files.compute.{name}", expression, "computed from parts of the name")
-    for name, unit in names.units.items():
+    for name, unit in settings.units.items():
         notes.guess(f"files.units.{name}", unit, "the unit of the number in the names")
 
 
@@ -428,4 +396,4 @@ def needs_no_load(names: Names, roles: Roles) -> Names:
     if roles.force is None or roles.force.unit is None or roles.force.unit.dimension == "force":
         return names
     load = next((part for part in names.parts if part.ours == "load_N"), None)
-    return names if load is None or len(load.texts) > 1 else _without(names, load)
+    return names if load is None or len(load.texts) > 1 else names.without(load)

@@ -81,10 +81,15 @@ def test_a_word_for_the_other_direction_makes_the_speed_negative(words):
     assert told(files, 1)["speed_mm_s"] == -5.0
 
 
+def test_a_speed_with_a_direction_and_a_unit_is_converted_once():
+    files = made("d{d}_v{v}mmmin_{w}.csv", d=(1, 2), v=(300, 600), w=("fwd", "rev"))
+    assert told(files, 1)["speed_mm_s"] == -5.0
+
+
 def test_a_letter_before_some_numbers_is_the_other_direction():
     plain = made("{v}_d{d}.csv", v=(5, 10), d=(1, 2))
     names = read_names([*plain, *("n" + file for file in plain)])
-    assert names.values["_direction"] == {"": 1.0, "n": -1.0}
+    assert names.settings.values["_direction"] == {"": 1.0, "n": -1.0}
     assert names.unmatched == ()
 
 
@@ -127,7 +132,7 @@ def test_names_without_an_ending_may_end_in_a_decimal():
 
 
 def test_names_that_only_count_say_nothing():
-    assert read_names([f"run_{number:03d}.csv" for number in range(1, 10)]).pattern is None
+    assert read_names([f"run_{number:03d}.csv" for number in range(1, 10)]).settings.name_pattern is None
 
 
 @pytest.mark.parametrize("letter", ["T", "C", "N"])
