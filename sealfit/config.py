@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import partial
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, get_args
@@ -39,6 +40,35 @@ class Strict(BaseModel):
     """A table of a config or SPEC: unknown keys refused, values fixed, numbers finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+def _regular(pattern: str) -> str:
+    """Raise ValueError for a text that is no regular expression, or a long one."""
+    import regex  # here, so that commands that read no pattern start quickly
+
+    if len(pattern) > LONGEST_PATTERN:
+        raise ValueError(f"is not a regular expression: it has more than {LONGEST_PATTERN} characters")
+    try:
+        regex.compile(pattern)
+    except (regex.error, RecursionError, OverflowError) as error:
+        raise ValueError(f"is not a regular expression: {error}") from None
+    return pattern
+
+
+def _expression(text: str, *, condition: bool = False) -> str:
+    """Raise ValueError for a text that is no expression."""
+    from sealfit.ingest.expression import parse  # here, so that commands that read no config start quickly
+
+    try:
+        parse(text, condition=condition)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+    return text
+
+
+Pattern = Annotated[str, AfterValidator(_regular)]
+Expression = Annotated[str, AfterValidator(_expression)]
+Condition = Annotated[str, AfterValidator(partial(_expression, condition=True))]
 
 
 class FileColumn(Strict):
@@ -102,7 +132,7 @@ class TraceFormat(Strict):
     """`"."` or `","`."""
     header_lines: int | None = Field(None, ge=0, le=MOST)
     """Lines before the first data row, column names included."""
-    header_ends_at: str | None = None
+    header_ends_at: Pattern | None = None
     """Regular expression; the header ends with the line that it matches."""
     names: Literal["header", "none"] = "header"
     """`"none"`: there is no line of names, columns are given by position."""
@@ -132,11 +162,11 @@ class TraceFormat(Strict):
     """Those of `columns` that a file may lack."""
     other_columns: Literal["channels", "ignore"] = "channels"
     """Columns not listed in `columns`: kept as channels, or `"ignore"`."""
-    header_fields: dict[str, str] = Field(default_factory=dict)
+    header_fields: dict[str, Pattern] = Field(default_factory=dict)
     """Channel = regular expression with one group, searched in the header lines."""
-    keep: str | None = None
+    keep: Condition | None = None
     """Row filter, e.g. `"load_N > 4.9"`."""
-    compute: dict[str, str] = Field(default_factory=dict)
+    compute: dict[str, Expression] = Field(default_factory=dict)
     """Column = expression over columns, parts of the file name and constants."""
     constants: dict[str, float] = Field(default_factory=dict)
     """Numbers that expressions may name."""
@@ -152,7 +182,7 @@ class TraceFormat(Strict):
     def _some_rate(cls, rate: float | str | None) -> float | str | None:
         if isinstance(rate, float) and not 0 < rate <= MOST:
             raise ValueError(f"{rate:g} rows per second are not possible")
-        return rate
+        return _expression(rate) if isinstance(rate, str) else rate
 
     @model_validator(mode="before")
     @classmethod
@@ -181,19 +211,6 @@ def _glob(pattern: str | None) -> str | None:
     return pattern
 
 
-def _not_regular(pattern: str) -> str:
-    """Return why a text is no regular expression that can be used; "" if it is one."""
-    import regex  # here, so that commands that read no pattern start quickly
-
-    if len(pattern) > LONGEST_PATTERN:
-        return f"it has more than {LONGEST_PATTERN} characters"
-    try:
-        regex.compile(pattern)
-    except (regex.error, RecursionError, OverflowError) as error:
-        return str(error)
-    return ""
-
-
 class Files(Strict):
     """Where the trace files are when runs.csv does not list them, and what their names say."""
 
@@ -201,7 +218,7 @@ class Files(Strict):
     """E.g. `"raw/**/*.csv"`; then runs.csv is not needed."""
     exclude: list[str] = Field(default_factory=list)
     """Globs of files that are not traces."""
-    name_pattern: str | None = None
+    name_pattern: Pattern | None = None
     """Regular expression with named groups, matched against the whole relative path. Every part is a channel,
     except names that start with `_`. Files without a match are listed, with where the match broke.
     """
@@ -209,7 +226,7 @@ class Files(Strict):
     """Value map per part: `sign = {"" = 1, n = -1}`."""
     columns: dict[str, str] = Field(default_factory=dict)
     """Our column = template over the parts: `run_id = "{rig}_{bar}bar"`."""
-    compute: dict[str, str] = Field(default_factory=dict)
+    compute: dict[str, Expression] = Field(default_factory=dict)
     """Our column = expression over the parts: `speed_mm_s = "sign * rpm"`."""
     units: dict[str, str] = Field(default_factory=dict)
     """Unit of a part, of a column made of parts, or of a header field: `temperature_C = "degF"`."""
@@ -261,7 +278,7 @@ class Files(Strict):
 class Runs(Strict):
     """What is worked out from runs.csv, or what it leaves out."""
 
-    compute: dict[str, str] = Field(default_factory=dict)
+    compute: dict[str, Expression] = Field(default_factory=dict)
     """Our column = expression over the columns that are known of each file, from runs.csv, names and headers:
     `load_N = "9.80665 * mass_kg + 2.1"`. Without a value where one of these has none.
     """
@@ -410,36 +427,6 @@ class Config(Strict):
         if not value or len(set(value)) != len(value):
             raise ValueError("name at least one column, each once")
         return value
-
-    @model_validator(mode="after")
-    def _patterns_compile(self) -> Config:
-        for place, pattern in (
-            ("files.name_pattern", self.files.name_pattern),
-            ("trace.header_ends_at", self.trace.header_ends_at),
-            *((f"trace.header_fields.{k}", v) for k, v in self.trace.header_fields.items()),
-        ):
-            if pattern is not None and (reason := _not_regular(pattern)):
-                raise ValueError(f"{place} is not a regular expression: {reason}")
-        return self
-
-    @model_validator(mode="after")
-    def _expressions_are_safe(self) -> Config:
-        # Here, so that commands that read no config start quickly.
-        from sealfit.ingest.expression import parse
-
-        texts = {f"trace.compute.{k}": v for k, v in self.trace.compute.items()}
-        texts |= {f"files.compute.{k}": v for k, v in self.files.compute.items()}
-        texts |= {f"runs.compute.{k}": v for k, v in self.runs.compute.items()}
-        if self.trace.keep is not None:
-            texts["trace.keep"] = self.trace.keep
-        if isinstance(self.trace.rate_Hz, str):
-            texts["trace.rate_Hz"] = self.trace.rate_Hz
-        for place, text in texts.items():
-            try:
-                parse(text, condition=place == "trace.keep")
-            except ConfigError as error:
-                raise ValueError(f"{place}: {error}") from None
-        return self
 
     @model_validator(mode="after")
     def _units_convert(self) -> Config:
