@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
@@ -20,22 +21,32 @@ from sealfit.ingest.files import Layout, as_number, bad_file, split_line, withou
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Columns of equal length on their way through the checks, and the lines they come from."""
+    """Rows of a file on their way through the checks.
+
+    `columns` are float64 arrays, or object arrays of text (None where empty), by our names; `line` is the
+    1-based line in the file of every row; `bad` marks rows to leave out; `faults` names what was found.
+    """
 
     columns: dict[str, np.ndarray]
     line: np.ndarray
+    bad: np.ndarray
+    faults: tuple[Fault, ...] = ()
 
     def where(self, mask: np.ndarray) -> Rows:
         """Return the rows that the mask chooses."""
-        return Rows({name: values[mask] for name, values in self.columns.items()}, self.line[mask])
+        columns = {name: values[mask] for name, values in self.columns.items()}
+        return Rows(columns, self.line[mask], self.bad[mask], self.faults)
+
+    def having(self, columns: Mapping[str, np.ndarray]) -> Rows:
+        """Return the rows with further columns."""
+        return replace(self, columns={**self.columns, **columns})
 
 
-def clean(rows: Rows, names: list[str], file: str) -> tuple[Rows, int, list[Fault]]:
-    """Return the rows whose slots are finite and whose time rises, the number left out, and the faults."""
-    names = [name for name in names if name in rows.columns]
+def clean(rows: Rows, names: list[str], file: str) -> Rows:
+    """Return the rows whose slots are finite and whose time rises, with the faults of the others."""
     faults: list[Fault] = []
     finite = np.ones(len(rows.line), bool)
-    for name in names:
+    for name in (name for name in names if name in rows.columns):
         sizes = np.abs(rows.columns[name])
         wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
         finite &= ~(wrong | overload)
@@ -44,7 +55,7 @@ def clean(rows: Rows, names: list[str], file: str) -> tuple[Rows, int, list[Faul
     good = rows.where(finite)
     back = _out_of_order(good.columns["time_s"])
     faults += _row_faults("time_order", "time_s", good, back, file)
-    return good.where(~back), int((~finite).sum() + back.sum()), faults
+    return replace(good.where(~back), faults=(*rows.faults, *faults))
 
 
 _ROW_FAULTS = {  # check: (reason, fix)
@@ -98,25 +109,10 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 # way: text where a number belongs, remarks typed beside a number, lines with too few or too many cells.
 
 OVERLOAD = 1e24  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
-OTHER_CELLS = "cells of this column that are not numbers."
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
 _CLOCK = re.compile(r"(?:.*[\sT])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:\s*([ap])\.?m\.?)?Z?", re.IGNORECASE)
 _DAY_S = 86400.0
 _NUMBER = re.compile(r"\s*[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?(?=[\s,;])")
-
-
-@dataclass(frozen=True, slots=True)
-class Cells:
-    """Columns by position from 0: float64 arrays, or object arrays of text (None where empty).
-
-    `line` is the 1-based line number of every row; `bad` marks rows with a cell that is not a number;
-    `faults` names what was found in them.
-    """
-
-    columns: dict[int, np.ndarray]
-    line: np.ndarray
-    bad: np.ndarray
-    faults: tuple[Fault, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,11 +128,6 @@ class ColumnOfFile:
         """Return a fault of the cell in a row, which is left out."""
         line, action = int(self.line[row]), "row left out"
         return Fault(check, reason, file=self.file, line=line, column=self.name, action=action, **more)
-
-    def not_a_number(self, row: int, cell: str) -> Fault:
-        """Return the fault of a cell that holds text; the fix is another decimal mark where that would do."""
-        fix = decimal_fix(cell, self.decimal) or "Put a number there or delete the line."
-        return self.fault(row, "not_a_number", "is not a number.", value=cell.strip(), fix=fix)
 
 
 def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str) -> list[Fault]:
@@ -170,48 +161,55 @@ def width_of(body: bytes, delimiter: str) -> int:
 
 
 def read_cells(
-    body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str], file: str
-) -> Cells:
+    body: bytes,
+    layout: Layout,
+    settings: TraceFormat,
+    ours: Mapping[int, str],
+    must: Collection[str],
+    file: str,
+) -> Rows:
     """Return the data of a trace file.
 
-    `body` are its data lines as clean UTF-8 (`body_of`); `numeric` are the positions (from 0) that must hold
-    numbers, and the names that messages call them.
+    `body` are its data lines as clean UTF-8 (`body_of`); `ours` are our names of the positions (from 0), and
+    `must` those of them that must hold numbers.
     """
     rows = body.count(b"\n") + 1
+    numeric = {i: name for i, name in ours.items() if name in must}
+    line, bad, faults = np.arange(layout.first_line, layout.first_line + rows), np.zeros(rows, bool), []
     columns = _fast(body, rows, layout, settings, numeric)
     if columns is None:
-        return _patient(body, layout, settings, numeric, file)
-    line = np.arange(layout.first_line, layout.first_line + rows)
-    return Cells(columns, line, np.zeros(rows, bool), ())
+        columns, line, bad, faults = _patient(body, layout, settings, numeric, file)
+    return Rows({name: columns[i] for i, name in ours.items() if i in columns}, line, bad, tuple(faults))
 
 
 def array_cells(
-    columns: Sequence[np.ndarray], numeric: Mapping[int, str], settings: TraceFormat, file: str
-) -> Cells:
+    columns: Sequence[np.ndarray],
+    ours: Mapping[int, str],
+    must: Collection[str],
+    settings: TraceFormat,
+    file: str,
+) -> Rows:
     """Return the columns of a file that is not text, a row of each sample; their numbers count from 1.
 
     Times of day, as datetime64, are seconds since the first where a number is needed, and else text in ISO
-    8601.
+    8601. `ours` and `must` as for `read_cells`.
     """
     line = np.arange(1, len(columns[0]) + 1)
     bad = np.zeros(len(line), bool)
-    made: dict[int, np.ndarray] = {}
+    made: dict[str, np.ndarray] = {}
     faults: list[Fault] = []
-    for i, values in enumerate(columns):
+    for i, name in ours.items():
+        values = columns[i]
         if values.dtype.kind == "M":
-            values = _seconds(values) if i in numeric else _iso(values)
+            values = _seconds(values) if name in must else _iso(values)
         numbers = values if values.dtype.kind == "f" else numbers_of(values, settings.decimal)
-        if i in numeric:
-            wrong = np.flatnonzero(~np.isfinite(numbers))
-            bad[wrong] = True
-            cells = {
-                row: "" if values[row] is None or values[row] != values[row] else str(values[row])
-                for row in wrong
-            }
-            faults += _cell_faults(ColumnOfFile(file, numeric[i], line, settings.decimal), wrong, cells, ())
-        plain = i in numeric or not any(cell is not None for cell in values[np.isnan(numbers)])
-        made[i] = numbers if plain else values
-    return Cells(made, line, bad, tuple(faults))
+        if name in must:
+            wrong = ~np.isfinite(numbers)
+            bad |= wrong
+            faults += cell_faults(ColumnOfFile(file, name, line, settings.decimal), wrong, values)
+        plain = name in must or not any(cell is not None for cell in values[np.isnan(numbers)])
+        made[name] = numbers if plain else values
+    return Rows(made, line, bad, tuple(faults))
 
 
 def _seconds(times: np.ndarray) -> np.ndarray:
@@ -285,8 +283,8 @@ def _single_tabs(body: bytes) -> bytes:
 
 def _patient(
     body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str], file: str
-) -> Cells:
-    """Return the cells line by line, with a fault for everything that is not as it should be."""
+) -> tuple[dict[int, np.ndarray], np.ndarray, np.ndarray, list[Fault]]:
+    """Return columns, lines, bad rows and faults, cell by cell: one for all that is not as it should be."""
     lines = body.decode("utf-8", "replace").split("\n")
     rows, number = [], []
     for i, line in enumerate(lines):
@@ -305,7 +303,7 @@ def _patient(
         wrong = ~np.isfinite(columns[i])
         bad |= wrong
         column = ColumnOfFile(file, name, line, settings.decimal)
-        faults += _cell_faults(column, np.flatnonzero(wrong), cells, rows)
+        faults += cell_faults(column, wrong, cells, rows)
     beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows], dtype=bool)
     faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width, file)
     bad |= beyond
@@ -313,7 +311,7 @@ def _patient(
         cells = [(row[i].strip() or None) if i < len(row) else None for row in rows]
         words = any(cell is not None and as_number(cell, settings.decimal) is None for cell in cells)
         columns[i] = np.array(cells, dtype=object) if words else numbers_of(cells, settings.decimal)
-    return Cells(columns, line, bad, tuple(faults))
+    return columns, line, bad, faults
 
 
 def seconds_of_day(cells: Sequence[str | None]) -> np.ndarray | None:
@@ -348,34 +346,34 @@ def numbers_of(cells: Iterable[str | None], decimal: str) -> np.ndarray:
     return np.array([np.nan if number is None else number for number in found], dtype=float)
 
 
-def _cell_faults(
-    column: ColumnOfFile,
-    at: np.ndarray,
-    cells: Sequence[str | None] | Mapping[int, str],
-    rows: Sequence[Sequence[str]],
+def cell_faults(
+    column: ColumnOfFile, wrong: np.ndarray, cells: Sequence, rows: Sequence[Sequence[str]] | None = None
 ) -> list[Fault]:
+    """Return the faults of cells that hold no number; None is one that its line of `rows` does not reach."""
+
     def make(i: int) -> Fault:
         cell = cells[i]
-        if cell is None:
+        if cell is None and rows is not None:
             reason = f"the line ends after {len(rows[i])} cells."
             return column.fault(i, "too_few_cells", reason, fix="Complete or delete the line.")
+        cell = "" if pd.isna(cell) else str(cell)  # as text: JSON has no inf
         value = cell.strip()
         check, reason, fix = "not_a_number", "is not a number.", ""
         if not value:
             check, reason, fix = "empty_cell", "the cell is empty.", "Fill it or delete the line."
         elif as_number(value, column.decimal) is not None:
-            check, reason, fix = "not_finite", "is not a finite number.", "Delete the line."
+            check, reason, fix = "not_finite", "is not a measured number.", "Delete the line."
         elif remark := _remark(cell):
             check, reason = "remark", f"a remark stands beside the number: {remark!r}."
             fix = "Put the right number alone in the cell."
-        elif i == 0 and len(at) < len(cells) and not any(char.isdigit() for char in value):
+        elif i == 0 and not wrong.all() and not any(char.isdigit() for char in value):
             fix = "If this is a row of units, set units_row = true in the rig config; "
             fix += "otherwise delete the line."
         else:
-            return column.not_a_number(i, cell)
+            fix = decimal_fix(cell, column.decimal) or "Put a number there or delete the line."
         return column.fault(i, check, reason, value=value, fix=fix)
 
-    return listed(at, make, "not_a_number", OTHER_CELLS)
+    return listed(np.flatnonzero(wrong), make, "not_a_number", "cells of this column that are not numbers.")
 
 
 def _remark(cell: str) -> str:

@@ -9,9 +9,9 @@ import pandas as pd
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import KEPT, NOTED, BadFile, Fault, SealfitError, nearest, shortened
-from sealfit.ingest.cells import OTHER_CELLS, OVERLOAD, ColumnOfFile, listed, numbers_of
+from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, Rows, cell_faults, listed, numbers_of
 from sealfit.ingest.expression import parse
-from sealfit.ingest.files import Layout, as_number, bad_file, split_line
+from sealfit.ingest.files import Layout, bad_file, split_line
 from sealfit.tables import BINS, RUNS
 
 Value = float | str
@@ -306,24 +306,15 @@ def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat, file:
 MAX_LABELS = 20
 
 
-def channel_columns(
-    columns: Mapping[str, np.ndarray], good: np.ndarray, line: np.ndarray, config: Config, file: str
-) -> tuple[dict[str, np.ndarray], np.ndarray, list[Fault]]:
-    """Return the columns that are of use, a mask of rows to leave out, and the faults.
+def channel_columns(rows: Rows, config: Config, file: str) -> Rows:
+    """Return the rows with the columns that are of use, and what was found in the channels.
 
     A channel with a few cells missing costs these rows; one with more than `quality.max_bad_rows` of them
     missing is left out itself, and the file stays. Text is a label; where most cells are numbers, the others
     are faults; where most cells are empty, the rest are remarks, and each is named.
-
-    Parameters
-    ----------
-    columns : mapping of str to ndarray, shape (n,)
-        Float or object columns under our names; those of `SLOTS` are passed on as they are.
-    good, line : ndarray, shape (n,)
-        Rows that are good so far, and the line numbers of all rows.
     """
-    kept, drop, faults = dict(columns), np.zeros(len(good), bool), []
-    for name, values in columns.items():
+    kept, drop, faults, good = dict(rows.columns), np.zeros(len(rows.line), bool), [], ~rows.bad
+    for name, values in rows.columns.items():
         if name in SLOTS:
             continue
         numbers = values
@@ -331,7 +322,7 @@ def channel_columns(
             full = np.array([cell is not None for cell in values])
             numbers = numbers_of(values, config.trace.decimal)
             if np.isfinite(numbers).sum() <= 0.5 * full.sum():
-                found = _label_faults(name, values, full, line, file)
+                found = _label_faults(name, values, full, rows.line, file)
                 faults += found
                 if found:
                     del kept[name]
@@ -349,9 +340,8 @@ def channel_columns(
             del kept[name]
         elif share:
             drop |= missing
-            column = ColumnOfFile(file, name, line, config.trace.decimal)
-            faults += _cell_faults(column, np.flatnonzero(missing), values)
-    return kept, drop, faults
+            faults += cell_faults(ColumnOfFile(file, name, rows.line, config.trace.decimal), missing, values)
+    return Rows(kept, rows.line, rows.bad | drop, (*rows.faults, *faults))
 
 
 def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarray, file: str) -> list[Fault]:
@@ -372,15 +362,3 @@ def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarr
 def _left_out(name: str, reason: str, fix: str, file: str, done: Mapping[str, str]) -> Fault:
     reason = f"{reason}; the column is not used."
     return Fault("channel_left_out", reason, file=file, column=name, fix=fix, **done)
-
-
-def _cell_faults(column: ColumnOfFile, at: np.ndarray, cells: np.ndarray) -> list[Fault]:
-    def make(i: int) -> Fault:
-        cell = cells[i]
-        if isinstance(cell, str) and as_number(cell, column.decimal) is None:
-            return column.not_a_number(i, cell)
-        value = "" if pd.isna(cell) else str(cell)  # as text: JSON has no inf
-        reason = "is not a measured number." if value != "" else "the cell holds no number."
-        return column.fault(i, "not_finite", reason, value=value, fix="Fill it or delete the line.")
-
-    return listed(at, make, "not_a_number", OTHER_CELLS)

@@ -12,7 +12,7 @@ import pandas as pd
 
 from sealfit.config import MOST, Config, TraceFormat
 from sealfit.errors import KEPT, BadFile, ConfigError, Fault
-from sealfit.ingest.cells import Cells, Rows, array_cells, body_of, clean, read_cells, width_of
+from sealfit.ingest.cells import Rows, array_cells, body_of, clean, read_cells, width_of
 from sealfit.ingest.columns import (
     RESERVED,
     SLOTS,
@@ -92,16 +92,16 @@ def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
     return _trace(*read(raw, ref, config.trace), ref, config)
 
 
-def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Cells, dict[int, str], Layout]:
-    """Return the cells of a file of arrays, our name of each position (from 0), and the layout."""
+def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Rows, Layout]:
+    """Return the rows of a file of arrays, and its layout."""
     found = read_arrays(raw, ref.file, settings)
     layout = Layout(found.header, found.names, None, 0, 1)
     ours = locate(layout, len(found.names) or len(found.columns), settings, ref.file)
-    cells = array_cells(found.columns, _numeric(ours, settings), settings, ref.file)
-    return replace(cells, faults=(*found.faults, *cells.faults)), ours, layout
+    rows = array_cells(found.columns, ours, numeric_names(settings), settings, ref.file)
+    return replace(rows, faults=(*found.faults, *rows.faults)), layout
 
 
-def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Cells, dict[int, str], Layout]:
+def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Rows, Layout]:
     """Return of a text file or workbook what `_read_arrays` returns."""
     file, cut = ref.file, ()
     text, layout, settings = _text(raw, file, settings)
@@ -115,14 +115,8 @@ def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Cells,
         ours = locate(layout, len(layout.names) or width, settings, file)
     except BadFile as error:
         raise _names_elsewhere(error, layout, body, settings) from None
-    cells = read_cells(body, layout, settings, _numeric(ours, settings), file)
-    return replace(cells, faults=(*cut, *cells.faults)), ours, layout
-
-
-def _numeric(ours: Mapping[int, str], settings: TraceFormat) -> dict[int, str]:
-    """Return the positions that must hold numbers, and our names of them."""
-    must = numeric_names(settings)
-    return {i: name for i, name in ours.items() if name in must}
+    rows = read_cells(body, layout, settings, ours, numeric_names(settings), file)
+    return replace(rows, faults=(*cut, *rows.faults)), layout
 
 
 def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat, file: str) -> None:
@@ -183,41 +177,34 @@ def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | 
     return header_fields(header, config)
 
 
-def _trace(cells: Cells, ours: Mapping[int, str], layout: Layout, ref: TraceRef, config: Config) -> Trace:
-    """Return the trace that the cells of a file make; raises as `read_trace`."""
+def _trace(rows: Rows, layout: Layout, ref: TraceRef, config: Config) -> Trace:
+    """Return the trace that the rows of a file make; raises as `read_trace`."""
     settings, file = config.trace, ref.file
-    columns = {name: cells.columns[i] for i, name in ours.items() if i in cells.columns}
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None or settings.rate_Hz is not None:
         named = name_parts(file, config.files, config.conversions("names")) or {}
         known = {**ref.channels, **named, **header_fields(layout.header, config), **settings.constants}
-    good = ~cells.bad
-    first = settings.drop_first_rows
-    counted = max(len(good) - first, 1)
-    columns, dropped, found = channel_columns(columns, good, cells.line, config, file)
-    faults = [*cells.faults, *found]
-    columns = _in_our_units(columns, config, layout, file)
+    read = np.arange(len(rows.line))
+    rows = _in_our_units(channel_columns(rows, config, file), config, layout, file)
     if settings.rate_Hz is not None:  # a row that is left out takes its time, too
-        columns["time_s"] = np.arange(len(good)) / _rate_Hz(settings.rate_Hz, known, file)
-    good &= ~dropped
-    bad = len(good[first:]) - int(np.count_nonzero(good[first:]))
-    good[:first] = False
-    rows, wrong, found = _derive(Rows(columns, cells.line).where(good), known, settings, layout, file)
-    faults += found
-    _refuse_too_many(bad + wrong, counted, faults, config, file)
+        rows = rows.having({"time_s": read / _rate_Hz(settings.rate_Hz, known, file)})
+    rows = rows.where(read >= settings.drop_first_rows)
+    counted = len(rows.line)
+    rows = _derive(rows.where(~rows.bad), known, settings, layout, file)
+    _refuse_too_many(counted, rows, config, file)
     if settings.keep is not None:
         keep = _evaluate(parse(settings.keep, condition=True), {**known, **rows.columns}, file)
         rows = rows.where(np.broadcast_to(keep, rows.line.shape))
-    faults += _not_computed(rows, settings, file)
+    faults = [*rows.faults, *_not_computed(rows, settings, file)]
     if len(rows.line) < MIN_ROWS:
-        reason = f"{len(rows.line)} of {len(good)} data rows are left; a trace needs {MIN_ROWS}."
+        reason = f"{len(rows.line)} of {len(read)} data rows are left; a trace needs {MIN_ROWS}."
         fix = "Check drop_first_rows, keep and the export."
         raise BadFile(*faults, bad_file(file, "no_rows", reason, fix).fault)
     if fault := speed_fault(ref, rows.columns["time_s"], rows.columns["displacement_mm"], config):
         faults.append(fault)
         if fault.action == "file left out":
             raise BadFile(*faults)
-    return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(good), tuple(faults))
+    return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(read), tuple(faults))
 
 
 def _rate_Hz(rate: float | str, known: Mapping[str, object], file: str) -> float:
@@ -229,23 +216,24 @@ def _rate_Hz(rate: float | str, known: Mapping[str, object], file: str) -> float
     return value
 
 
-def _in_our_units(
-    columns: dict[str, np.ndarray], config: Config, layout: Layout, file: str
-) -> dict[str, np.ndarray]:
-    """Return the columns with numbers of other units converted; raises `BadFile` where they are labels."""
-    changed = {name: convert for name, convert in config.conversions("trace").items() if name in columns}
-    for name in changed:
-        if columns[name].dtype.kind != "f":
+def _in_our_units(rows: Rows, config: Config, layout: Layout, file: str) -> Rows:
+    """Return the rows with numbers of other units converted; raises `BadFile` where they are labels."""
+    changed = {}
+    for name, convert in config.conversions("trace").items():
+        if name not in rows.columns:
+            continue
+        if rows.columns[name].dtype.kind != "f":
             reason = "has a unit in the rig config and holds no numbers."
             fix = "Take its unit out of [trace.columns], or export numbers."
             raise bad_file(file, "not_a_number", reason, fix, column=name, line=layout.names_line)
-    return columns | {name: convert(columns[name]) for name, convert in changed.items()}
+        changed[name] = convert(rows.columns[name])
+    return rows.having(changed)
 
 
 def _derive(
     rows: Rows, known: Mapping[str, object], settings: TraceFormat, layout: Layout, file: str
-) -> tuple[Rows, int, list[Fault]]:
-    """Return rows with computed columns and integrated displacement, the number of bad ones, and faults."""
+) -> Rows:
+    """Return the good ones of rows, with computed columns and integrated displacement."""
     speed = settings.integrate_displacement
     compute = {name: parse(text) for name, text in settings.compute.items()}
     later = _after_integral(compute) if speed else []
@@ -258,11 +246,11 @@ def _derive(
         if name not in rows.columns:
             fix = "Name it under [trace.columns], or compute it under [trace.compute]."
             raise BadFile(missing_column(name, layout, file, fix))
-    rows, bad, faults = clean(rows, ["time_s", speed, "force_N"], file)
-    rows = Rows({**rows.columns, "displacement_mm": _integral(rows, speed, settings)}, rows.line)
+    rows = clean(rows, ["time_s", speed, "force_N"], file)
+    rows = rows.having({"displacement_mm": _integral(rows, speed, settings)})
     rows = _computed(rows, {name: compute[name] for name in later}, known, file)
     required(rows.columns, layout, file)
-    return rows, bad, faults
+    return rows
 
 
 def _after_integral(compute: Mapping[str, Expression]) -> list[str]:
@@ -275,11 +263,10 @@ def _after_integral(compute: Mapping[str, Expression]) -> list[str]:
 
 
 def _computed(rows: Rows, compute: Mapping[str, Expression], known: Mapping[str, object], file: str) -> Rows:
-    columns = dict(rows.columns)
     for name, expression in compute.items():
-        value = _evaluate(expression, {**known, **columns}, file)
-        columns[name] = np.broadcast_to(value, rows.line.shape).astype(float)
-    return Rows(columns, rows.line)
+        value = _evaluate(expression, {**known, **rows.columns}, file)
+        rows = rows.having({name: np.broadcast_to(value, rows.line.shape).astype(float)})
+    return rows
 
 
 def _not_computed(rows: Rows, settings: TraceFormat, file: str) -> list[Fault]:
@@ -307,14 +294,15 @@ def _integral(rows: Rows, speed: str, settings: TraceFormat) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(steps)]) if len(v) else v
 
 
-def _refuse_too_many(bad: int, counted: int, faults: list[Fault], config: Config, file: str) -> None:
-    """Raise `BadFile` if more rows are bad than the config allows."""
+def _refuse_too_many(counted: int, rows: Rows, config: Config, file: str) -> None:
+    """Raise `BadFile` if more of the rows are bad than the config allows; `rows` are those that are left."""
+    bad = counted - len(rows.line)
     if bad > config.quality.max_bad_rows * counted:
-        fixes = Counter(fault.fix for fault in faults if fault.action == "row left out" and fault.fix)
+        fixes = Counter(fault.fix for fault in rows.faults if fault.action == "row left out" and fault.fix)
         fix = fixes.most_common(1)[0][0] if fixes else ""
         reason = f"{bad} of {counted} rows are bad, more than {100 * config.quality.max_bad_rows:g} %."
         too_many = bad_file(file, "too_many_bad_rows", reason, fix, value=float(bad))
-        raise BadFile(*faults, too_many.fault)
+        raise BadFile(*rows.faults, too_many.fault)
 
 
 def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:

@@ -98,7 +98,7 @@ def test_channels_are_numbers_or_labels_and_remarks_are_named(tmp_path):
     assert trace.table["humidity_pct"].dtype == float
     checks = {(fault.check, fault.line, fault.column, fault.value, fault.action) for fault in trace.faults}
     assert ("remark", 9, "note", "noise here", "kept") in checks
-    assert ("not_finite", 11, "stroke", "", "row left out") in checks
+    assert ("empty_cell", 11, "stroke", "", "row left out") in checks
     assert ("channel_left_out", None, "empty", None, "kept") in checks
     assert 11 not in trace.line
 
