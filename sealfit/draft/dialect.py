@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -40,8 +40,8 @@ SETTINGS = {
 }
 _LINE = re.compile(r'^\W*(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
 _SPECIMEN = re.compile(r"(specimen|probe|sample|pruefling|muster)( (id|nr|no|number|nummer|name))?")
-_NUMBER = re.compile(r"^[-+]?\d+(?:[.,]\d+)?(?=$|[\s;,\t\"°%A-Za-zµ])")
-_SIZE = re.compile(r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?")
+_SIZE = r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?"
+_NUMBER = re.compile(rf"{_SIZE}(?=$|[\s;,\t\"°%A-Za-zµ])")
 _SAMPLED = r"(?:sampl|abtast|mess|scan|acqui|logg|data|daten|campion|echantillon|muestre)"
 _RATE = re.compile(rf"{_SAMPLED}.*(?:rate|freq)|(?:rate|freq).*{_SAMPLED}")  # not that of a motion
 _STEP = re.compile(rf"{_SAMPLED}.*(?:interval|period)|(?:interval|period).*{_SAMPLED}|\bdt\b|\bdelta [tx]\b")
@@ -256,17 +256,19 @@ def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A setting in a header line: our name of it, the pattern that finds it, its unit and the line.
+    """A setting in a header line of every file: our name of it, "" for none, and what the files call it.
 
-    `counts` is whether no two files have the same.
+    `pattern` finds it, and `values` are what each of the files has; `line` and `text` are its line in the
+    first.
     """
 
     ours: str
+    name: str
     pattern: str
     unit: Unit | None
+    values: tuple[str, ...]
     line: int
     text: str
-    counts: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,33 +285,35 @@ class When:
     clock: str = ""
 
 
+def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Setting]:
+    """Yield the numbers and the specimens that the header lines of every file give."""
+    for line, text in enumerate(headers[0], start=1):
+        match = _LINE.match(text)
+        if match is None or match["key"].count("/") > 1:
+            continue  # group/channel/property of a TDMS file: it is about the channel
+        name, unit = name_and_unit(match["key"])
+        value = match["value"].strip()
+        number = _NUMBER.match(value)
+        if _SPECIMEN.fullmatch(plain(match["key"])):
+            ours, pattern = "specimen_id", _after(match["key"], r'([^\s;,"][^;,\t"]*)')
+        elif number and as_number(number.group(), decimal or ".") is not None:
+            ours, pattern = setting(name), _after(match["key"], rf"({_SIZE})")
+            unit = unit or unit_of(value[number.end() :].strip(' ;,\t"'))
+        else:
+            continue
+        values = tuple(_found(pattern, headers))
+        if "" not in values:
+            yield Setting(ours, name, pattern, unit, values, line, text.strip())
+
+
 def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]:
     """Return the settings that the header lines of every file give, those that their words name."""
     found: dict[str, Setting] = {}
-    for number, line in enumerate(headers[0], start=1):
-        match = _LINE.match(line)
-        if match and match["key"].count("/") > 1:
-            continue  # group/channel/property of a TDMS file: it is about the channel
-        if match and _SPECIMEN.fullmatch(plain(match["key"])):
-            pattern = _after(match["key"], r'([^\s;,"][^;,\t"]*)')
-            values = _found(pattern, headers)
-            if "" not in values and len(set(values)) > 1:
-                counts = len(set(values)) == len(values)
-                specimen = Setting("specimen_id", pattern, None, number, line.strip(), counts)
-                found.setdefault("specimen_id", specimen)
-            continue
-        number_found = _NUMBER.match(match["value"].strip()) if match else None
-        if number_found is None or as_number(number_found.group(), decimal or ".") is None:
-            continue
-        name, unit = name_and_unit(match["key"])
-        rest = match["value"].strip()[number_found.end() :].strip(' ;,\t"')
-        unit = unit or unit_of(rest)
-        ours = setting(name)
-        if ours not in SETTINGS or ours in found or (unit is not None and unit.dimension != SETTINGS[ours]):
-            continue
-        pattern = _after(match["key"], r"([-+]?[\d.,]*\d)")
-        if _everywhere(pattern, headers):
-            found[ours] = Setting(ours, pattern, unit, number, line.strip())
+    for one in _settings(headers, decimal):
+        fits = one.unit is None or one.unit.dimension == SETTINGS.get(one.ours)
+        differs = one.ours == "specimen_id" and len(set(one.values)) > 1
+        if differs or (one.ours in SETTINGS and fits):
+            found.setdefault(one.ours, one)
     return list(found.values())
 
 
@@ -318,25 +322,18 @@ def rate_in(headers: Sequence[Sequence[str]], decimal: str) -> tuple[float | str
 
     Where files differ in them they are an expression over the number, `RATE`.
     """
-    for line in headers[0]:
-        match = _LINE.match(line)
-        size = _SIZE.match(match["value"]) if match else None
-        value = as_number(size.group(), decimal or ".") if size else None
+    for one in _settings(headers, decimal):
+        value, words = as_number(one.values[0], decimal or "."), plain(one.name)
         if not value or value < 0:
             continue
-        pattern = _after(match["key"], f"({_SIZE.pattern})")
-        if not _everywhere(pattern, headers):
-            continue
-        differ = len(set(_found(pattern, headers))) > 1
-        words, unit = plain(match["key"]), name_and_unit(match["key"])[1]
-        unit = unit or unit_of(match["value"][size.end() :].strip(' ;,\t"'))
+        differ = len(set(one.values)) > 1
         if _RATE.search(words):
-            scale = 1000.0 if unit is not None and unit.name == "kHz" else 1.0
-            return f"{scale:g} * {RATE}" if differ else value * scale, line.strip(), pattern
-        if _STEP.search(words) and (unit is None or unit.dimension == "time"):
-            scale = conversion(unit.name if unit else "s", "s")(1.0)
+            scale = 1000.0 if one.unit is not None and one.unit.name == "kHz" else 1.0
+            return f"{scale:g} * {RATE}" if differ else value * scale, one.text, one.pattern
+        if _STEP.search(words) and (one.unit is None or one.unit.dimension == "time"):
+            scale = conversion(one.unit.name if one.unit else "s", "s")(1.0)
             rate = f"1 / ({scale:g} * {RATE})" if differ else float(f"{1 / (scale * value):.9g}")
-            return rate, line.strip(), pattern
+            return rate, one.text, one.pattern
     return None
 
 

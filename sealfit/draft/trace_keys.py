@@ -381,7 +381,7 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
     for one in settings:
         evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
         notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
-        if one.counts:
+        if one.ours == "specimen_id" and len(set(one.values)) == len(one.values):
             reason = f"every file looked at has a specimen of its own: {_shown(one.text)}."
             fix = "If that counts the tests, delete this line."
             notes.doubt("trace.header_fields.specimen_id", reason, fix)
