@@ -66,6 +66,22 @@ def _expression(text: str, *, condition: bool = False) -> str:
     return text
 
 
+def _encoding(name: str) -> str:
+    """Raise ValueError for a name that is no encoding of text, as rot13 is none."""
+    try:
+        if name == "auto" or "a".encode(name):
+            return name
+    except (LookupError, ValueError):
+        raise ValueError(f"{name!r} is not an encoding. Use auto, utf-8, latin-1 or utf-16") from None
+
+
+def _delimiter(text: str) -> str:
+    """Raise ValueError for a text that cannot stand between cells."""
+    if text in ("tab", "whitespace") or (len(text) == 1 and text not in '"\n\r ' and not text.isalnum()):
+        return text
+    raise ValueError(f"{text!r} is not a delimiter. Use one character, 'tab' or 'whitespace'")
+
+
 Pattern = Annotated[str, AfterValidator(_regular)]
 Expression = Annotated[str, AfterValidator(_expression)]
 Condition = Annotated[str, AfterValidator(partial(_expression, condition=True))]
@@ -124,9 +140,9 @@ class TraceFormat(Strict):
     """MATLAB: the struct or matrix with the data, `"S.field"` for one in a struct, `"(vectors)"` for vectors
     by themselves; none: as `group`.
     """
-    encoding: str = "auto"
+    encoding: Annotated[str, AfterValidator(_encoding)] = "auto"
     """`utf-8`, `latin-1`, `utf-16`, or `auto`: byte-order mark, then UTF-8, then Latin-1."""
-    delimiter: str = ","
+    delimiter: Annotated[str, AfterValidator(_delimiter)] = ","
     """One character, `"tab"` or `"whitespace"`."""
     decimal: Literal[".", ","] = "."
     """`"."` or `","`."""
@@ -195,6 +211,18 @@ class TraceFormat(Strict):
                 raise ValueError(f"both rate_Hz and {key}.time_s give the time. Take one of them out")
         return {"columns": {name: name for name in ("displacement_mm", "force_N")}} | table
 
+    @model_validator(mode="after")
+    def _can_be_read(self) -> TraceFormat:
+        if self.delimiter == self.decimal:
+            raise ValueError(f"delimiter: {self.delimiter!r} is the decimal mark too. Set one of them")
+        for ours, theirs in self.their_columns.items() if self.names == "none" else ():
+            if isinstance(theirs, str):
+                raise ValueError(
+                    f"columns.{ours}: {theirs!r} is a name, but the files have none. "
+                    "Give its position, counted from 1, or names = 'header'"
+                )
+        return self
+
     @property
     def their_columns(self) -> dict[str, str | int]:
         """Our name = the file's column name, or its position from 1."""
@@ -247,6 +275,17 @@ class Files(Strict):
     """Table to read in place of runs.csv: a `.csv`, `.xlsx` or `.parquet` file in the folder."""
     runs_sheet: str | int | None = None
     """Excel: name or number, from 1, of its sheet; none: the first."""
+
+    @model_validator(mode="after")
+    def _parts_are_there(self) -> Files:
+        if self.name_pattern is None and (self.columns or self.compute):
+            from sealfit.ingest.file_names import name_parts
+
+            try:
+                name_parts("", self, {})
+            except ConfigError as error:
+                raise ValueError(str(error)) from None
+        return self
 
     @property
     def copies(self) -> dict[str, str]:
@@ -426,6 +465,8 @@ class Config(Strict):
     def _some_condition(cls, value: list[str]) -> list[str]:
         if not value or len(set(value)) != len(value):
             raise ValueError("name at least one column, each once")
+        for name in {"file", "speed_mm_s"} & set(value):
+            raise ValueError(f"{name!r} cannot be a condition column: it differs within a condition")
         return value
 
     @model_validator(mode="after")
@@ -447,10 +488,14 @@ class Config(Strict):
                     self._conversions.setdefault(table, {})[name] = conversion(unit, to)
                 except ConfigError as error:
                     raise ValueError(f"{place}.{name}: {error}") from None
-        try:
-            _ = self.mass
-        except ConfigError as error:
-            raise ValueError(f"rig.moving_mass_kg: {error}") from None
+        for key, needed in (
+            ("rig.moving_mass_kg", lambda: self.mass),
+            ("quantities", lambda: units.speed_factor),
+        ):
+            try:
+                needed()
+            except ConfigError as error:
+                raise ValueError(f"{key}: {error}") from None
         return self
 
     @property

@@ -42,6 +42,26 @@ class Units:
         """Return the true unit of `force`, `displacement`, `speed`, `load` or `time`."""
         return {**_DEFAULT, **self.declared}[slot][1]
 
+    @property
+    def speed_factor(self) -> float:
+        """What turns displacement unit per time unit into the speed's: 60 for turn, s and rpm, 1 for mm/s.
+
+        ConfigError if the units do not fit together (turn and mm/s), or are not known to pint and not spelled
+        "<displacement>/<time>".
+
+        Examples
+        --------
+        >>> Units({"displacement": ("angle", "turn"), "speed": ("speed", "rpm")}).speed_factor
+        60.0
+        """
+        displacement, time, speed = (self.unit(slot) for slot in ("displacement", "time", "speed"))
+        try:
+            return conversion(f"{displacement}/{time}", speed).factor
+        except ConfigError as error:
+            reason = f"displacement in {displacement!r} over time in {time!r} gives no speed in {speed!r}."
+            fix = f"Declare the speed's unit as '{displacement}/{time}', or one of its dimension."
+            raise ConfigError(reason, fix=fix) from error
+
     def of(self, column: str) -> str:
         """Return the true unit of a column by its name; "" if it has none that we know."""
         if column in self.channels:

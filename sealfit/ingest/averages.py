@@ -26,7 +26,7 @@ from sealfit.ingest.quality import (
 )
 from sealfit.ingest.reader import Trace, parse_trace
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
-from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, speed_factor
+from sealfit.ingest.trace_checks import displacement_spikes, force_spikes
 from sealfit.ingest.window import acceleration
 from sealfit.store.manifest import Fingerprint, fingerprint
 
@@ -365,7 +365,7 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         "steady": np.concatenate([stroke.steady for stroke in strokes]),
         "sliding": np.concatenate([stroke.sliding for stroke in strokes]),
         "presliding_N": np.concatenate([stroke.presliding_N for stroke in strokes]),
-        ALONG: speed_factor(config.units) * np.concatenate([stroke.speed_along_mm_s for stroke in strokes]),
+        ALONG: config.units.speed_factor * np.concatenate([stroke.speed_along_mm_s for stroke in strokes]),
         "distance_mm": np.abs(displacement - np.repeat(displacement[origin], size)),
         **{name: values for name, values in trace.columns.items() if name not in SLOTS},
     }
@@ -385,7 +385,7 @@ def _stroke_rows(
             "file": ref.file,
             "stroke": stroke.number + _strokes_before(ref),
             "direction": stroke.direction,
-            "speed_mm_s": speed_factor(config.units) * stroke.speed_mm_s,
+            "speed_mm_s": config.units.speed_factor * stroke.speed_mm_s,
             "several": several,
             "several_speeds": stroke.several_speeds,
         }

@@ -58,7 +58,7 @@ from sealfit.ingest.files import as_number, bad_file, cut_files, read_bytes
 from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt
 from sealfit.ingest.reader import read_header, read_trace
-from sealfit.ingest.trace_checks import measured_speed, speed_factor
+from sealfit.ingest.trace_checks import measured_speed
 from sealfit.units import Conversion, conversion
 
 EXCEL_DAY_0 = datetime(1899, 12, 30)
@@ -203,11 +203,8 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     ------
     CampaignError
         With every fault of the campaign at once: a missing folder or column, a path outside, cells that are
-        no numbers, doubled files or repeats, repeats that differ from their run, a config that cannot be
-        meant.
+        no numbers, doubled files or repeats, repeats that differ from their run.
     """
-    if faults := _config_faults(config):
-        raise CampaignError(faults)
     entries, cells, faults = list_entries(campaign, config)
     if any(fault.check in ("path_outside", "missing_file") for fault in faults):
         _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
@@ -274,54 +271,6 @@ def _stop_at_errors(faults: Sequence[Fault], campaign: Path | None = None, files
         except BadFile as error:
             errors += error.faults
     raise CampaignError(errors)
-
-
-def _config_faults(config: Config) -> list[Fault]:
-    """Return what is wrong with the config by itself, before any file is opened."""
-    settings, faults = config.trace, []
-    encoding, delimiter = settings.encoding, settings.delimiter
-
-    def add(column: str, value: str, reason: str, fix: str) -> None:
-        place = {"file": f"config '{config.name}'", "column": column, "value": value}
-        faults.append(Fault("config", reason, fix=fix, **place))
-
-    if not _is_encoding(encoding):
-        add("trace.encoding", encoding, "is not an encoding.", "Use auto, utf-8, latin-1 or utf-16.")
-    if not _is_delimiter(delimiter):
-        fix = "Use one character, 'tab' or 'whitespace'."
-        add("trace.delimiter", delimiter, "is not a delimiter.", fix)
-    if delimiter == settings.decimal:
-        fix = "Set trace.delimiter or trace.decimal."
-        add("trace.delimiter", delimiter, "is the decimal mark too.", fix)
-    for name in sorted({"file", "speed_mm_s"} & set(config.condition)):
-        reason = "cannot be a condition column: it differs within a condition."
-        add("condition", name, reason, "Take it out of condition.")
-    named = {ours: theirs for ours, theirs in settings.their_columns.items() if isinstance(theirs, str)}
-    for ours, theirs in named.items() if settings.names == "none" else ():
-        fix = "Give its position, counted from 1, or names = 'header'."
-        add(f"trace.columns.{ours}", theirs, "is a name, but the files have none.", fix)
-    checks = {"quantities": lambda: speed_factor(config.units)}
-    if config.files.name_pattern is None:
-        checks["files"] = lambda: name_parts("", config.files, config.conversions("names"))
-    for column, check in checks.items():
-        try:
-            check()
-        except ConfigError as error:
-            add(column, config.name, error.message, error.fix)
-    return faults
-
-
-def _is_encoding(name: str) -> bool:
-    try:
-        return name == "auto" or bool("a".encode(name))
-    except (LookupError, ValueError):  # rot13 and hex are codecs, but of no text
-        return False
-
-
-def _is_delimiter(text: str) -> bool:
-    if text in ("tab", "whitespace"):
-        return True
-    return len(text) == 1 and text not in '"\n\r ' and not text.isalnum()
 
 
 def _named(entries: list[Entry], config: Config) -> tuple[list[int], Columns, list[Fault]]:
@@ -399,7 +348,7 @@ def _from_traces(
                 faults += error.faults
             continue
         _, plateau = measured_speed(table["time_s"].to_numpy(), table["displacement_mm"].to_numpy())
-        measured[i] = plateau * speed_factor(config.units)
+        measured[i] = plateau * config.units.speed_factor
         sources = {name: beside(name, RESERVED) for name in FROM_TRACES} | {name: name for name in wanted}
         for name, column in sources.items():
             if columns.get(name, none)[i] is not None or column not in table:

@@ -9,10 +9,9 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from sealfit.config import Config, Quality
-from sealfit.errors import KEPT, ConfigError, Fault
+from sealfit.errors import KEPT, Fault
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm
-from sealfit.units import Units, conversion
 
 # ---------------------------------------------------------------- spikes
 
@@ -114,36 +113,6 @@ def _spike(file: str, stroke: int | None, column: str, value: float, off: float,
     return Fault("spike", reason, severity="warning", action="row left out", fix=FIX, **place)
 
 
-# ---------------------------------------------------------------- speed unit
-
-
-def speed_factor(units: Units) -> float:
-    """Return what turns displacement unit per time unit into the speed's unit.
-
-    It is 60 for turn, s and rpm, and 1 for mm, s and mm/s.
-
-    Raises
-    ------
-    ConfigError
-        If the units do not fit together (turn and mm/s), or are not known to pint and not spelled
-        "<displacement>/<time>".
-
-    Examples
-    --------
-    >>> speed_factor(Units({"displacement": ("angle", "turn"), "speed": ("speed", "rpm")}))
-    60.0
-    """
-    displacement, time, speed = (units.unit(slot) for slot in ("displacement", "time", "speed"))
-    try:
-        return conversion(f"{displacement}/{time}", speed).factor
-    except ConfigError as error:
-        raise ConfigError(
-            f"displacement in {displacement!r} over time in {time!r} does not give a speed in {speed!r}.",
-            column="quantities",
-            fix=f"Declare the speed's unit as '{displacement}/{time}', or one of its dimension.",
-        ) from error
-
-
 # ---------------------------------------------------------------- speed check
 
 # Pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke.
@@ -211,7 +180,7 @@ def speed_fault(
     commanded = ref.channels.get("speed_set_mm_s")
     if not isinstance(commanded, int | float) or not commanded > 0:
         return None
-    factor, tolerance = speed_factor(config.units), config.quality.speed_disagreement
+    factor, tolerance = config.units.speed_factor, config.quality.speed_disagreement
     mean, plateau = (factor * speed for speed in measured_speed(time_s, displacement_mm))
     if not (0 < plateau < math.inf and mean < math.inf):  # nothing moves: said where strokes are sought
         return None

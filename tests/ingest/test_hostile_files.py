@@ -233,10 +233,9 @@ def test_a_pipe_is_no_config(tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ["rot13", "hex", "no-such", "latin-1\\u0000"])
-def test_codecs_that_are_no_text_are_no_encodings(tmp_path, encoding):
-    campaign(tmp_path, RUNS)
-    with pytest.raises(CampaignError, match="is not an encoding"):
-        channels(tmp_path, f'condition = ["aging_days"]\n[trace]\nencoding = "{encoding}"\n')
+def test_codecs_that_are_no_text_are_no_encodings(encoding):
+    with pytest.raises(ConfigError, match="is not an encoding"):
+        config(f'[trace]\nencoding = "{encoding}"\n')
 
 
 def test_forces_that_are_zero_everywhere_were_not_measured(tmp_path):

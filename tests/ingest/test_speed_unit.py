@@ -1,7 +1,6 @@
 import pytest
 
 from sealfit.errors import ConfigError
-from sealfit.ingest.trace_checks import speed_factor
 from sealfit.units import Units
 
 
@@ -19,11 +18,11 @@ from sealfit.units import Units
 )
 def test_slope_of_displacement_over_time_in_the_speed_s_unit(displacement, time, speed, factor):
     units = Units({"displacement": ("way", displacement), "time": ("time", time), "speed": ("speed", speed)})
-    assert speed_factor(units) == pytest.approx(factor, rel=1e-12)
+    assert units.speed_factor == pytest.approx(factor, rel=1e-12)
 
 
 def test_units_that_do_not_fit_together_are_refused():
     with pytest.raises(
-        ConfigError, match=r"displacement in 'turn' over time in 's' does not give a speed in 'mm/s'"
+        ConfigError, match=r"displacement in 'turn' over time in 's' gives no speed in 'mm/s'"
     ):
-        speed_factor(Units({"displacement": ("angle", "turn")}))
+        _ = Units({"displacement": ("angle", "turn")}).speed_factor
