@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -125,9 +123,9 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         return part
     hashes = [part.marks[file].sha256 for file in asked.refs.files]
     name = _file_name(part_key(asked.refs, hashes, seen_by_parts(config)), asked)
-    with disk(folder.parent), _whole_files(folder) as write:
+    with disk(folder.parent):
         stored = {
-            (file := f"{of}{PARQUET}/{name}"): write(file, table, parquet.write_arrow)
+            (file := f"{of}{PARQUET}/{name}"): _written(folder / file, table, parquet.write_arrow)
             for of, table in part.tables.items()
         }
         about = {
@@ -141,7 +139,8 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         }
         metadata = {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
         file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
-        stored[file] = write(file, part.strokes.replace_schema_metadata(metadata), parquet.write_ipc)
+        strokes = part.strokes.replace_schema_metadata(metadata)
+        stored[file] = _written(folder / file, strokes, parquet.write_ipc)
     # Its strokes are not sent: whoever asked finds them on the disk, and need not hold them while other parts
     # are read.
     return replace(part, strokes=None, tables={}, stored=stored)
@@ -219,28 +218,11 @@ def agrees(part: Part, columns: Columns) -> bool:
     return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())
 
 
-@contextlib.contextmanager
-def _whole_files(folder: Path) -> Iterator[Callable[[str, pa.Table, Callable], int]]:
-    """Give a function that writes a table to a file below `folder` and returns its size.
-
-    All are on the disk and in their places when the block ends, each whole or not there at all; two processes
-    that write the same do not disturb each other.
-    """
-    drafts: dict[Path, Path] = {}
-
-    def write(file: str, table: pa.Table, how: Callable[[pa.Table, Path], None]) -> int:
-        path = folder / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        drafts[path] = draft = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-        how(table, draft)
-        return draft.stat().st_size
-
-    try:
-        yield write
-        with ThreadPoolExecutor() as pool:  # several files reach the disk in hardly more time than one
-            list(pool.map(sync, drafts.values()))
-        for path, draft in drafts.items():
-            os.replace(draft, path)
-    finally:
-        for draft in drafts.values():
-            draft.unlink(missing_ok=True)
+def _written(path: Path, table: pa.Table, write: Callable[[pa.Table, Path], None]) -> int:
+    """Write a table whole or not at all, also where two processes write the same; return its size."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+    write(table, draft)
+    sync(draft)
+    os.replace(draft, path)
+    return path.stat().st_size
