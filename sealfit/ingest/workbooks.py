@@ -6,7 +6,7 @@ The number of a line is that of the sheet's row. Numbers are written without los
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -48,13 +48,12 @@ def read_sheet(
     """
     with _book(raw, file, formulas=True, by_row=merged) as book:
         title = _title(book, sheet, file)
-        lines, formulas = _lines(book[title], decimal, head)
+        lines, formulas = _lines(book[title], decimal, head, file)
         if not merged:
             _refuse_merged(book[title], file)
     if formulas:
         with _book(raw, file, formulas=False) as book:
-            lines, _ = _lines(book[title], decimal, head)
-            _refuse_unsaved(book[title], formulas, file)
+            lines, _ = _lines(book[title], decimal, head, file, formulas)
     return "\n".join(lines).encode("utf-8", "replace")
 
 
@@ -129,20 +128,27 @@ def _has_cell(row: Sequence[object]) -> bool:
     return any(cell is not None for cell in row)
 
 
-def _lines(sheet, decimal: str, head: bool) -> tuple[list[str], list[tuple[int, int]]]:
+def _lines(
+    sheet, decimal: str, head: bool, file: str, saved: Collection[tuple[int, int]] = ()
+) -> tuple[list[str], set[tuple[int, int]]]:
     """Return the rows as lines, and row and column (from 1) of every formula.
 
-    A row is at least as long as the longest above it: what it lacks are empty cells.
+    A row is at least as long as the longest above it: what it lacks are empty cells. `saved` are the places
+    of formulas whose values are read; raises `BadFile` if Excel kept none of one.
     """
-    lines, formulas, width = [], [], 0
-    for number, row in enumerate(
-        sheet.iter_rows(max_row=HEAD_ROWS if head else None, values_only=True), start=1
-    ):
+    lines, formulas, width = [], set(), 0
+    rows = sheet.iter_rows(max_row=HEAD_ROWS if head else None, values_only=True)
+    for number, row in enumerate(rows, start=1):
         cells = []
         for place, value in enumerate(row, start=1):
             # A range of formulas has a `ref`.
             if (isinstance(value, str) and value.startswith("=")) or hasattr(value, "ref"):
-                formulas.append((number, place))
+                formulas.add((number, place))
+            if value is None and (number, place) in saved:
+                reason = "the cell holds a formula whose value was not saved."
+                fix = "Open it in Excel and save it, or paste values over the formulas."
+                column = sheet.cell(number, place).column_letter
+                raise bad_file(file, "formula", reason, fix, line=number, column=column)
             cells.append(_cell(value, decimal))
         while cells and not cells[-1]:
             cells.pop()
@@ -158,20 +164,6 @@ def _cell(value: object, decimal: str) -> str:
     if isinstance(value, int | float | timedelta):
         return text.replace(".", decimal)
     return '"' + text.replace('"', '""') + '"' if '"' in text else text
-
-
-def _refuse_unsaved(sheet, formulas: list[tuple[int, int]], file: str) -> None:
-    """Raise `BadFile` if Excel kept no value of a formula."""
-    from openpyxl.utils import get_column_letter
-
-    places = set(formulas)
-    rows = sheet.iter_rows(max_row=max(row for row, _ in formulas), values_only=True)
-    for number, row in enumerate(rows, start=1):
-        for place, value in enumerate(row, start=1):
-            if value is None and (number, place) in places:
-                reason = "the cell holds a formula whose value was not saved."
-                fix = "Open it in Excel and save it, or paste values over the formulas."
-                raise bad_file(file, "formula", reason, fix, line=number, column=get_column_letter(place))
 
 
 def _refuse_merged(sheet, file: str) -> None:
