@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import regex
 
 from sealfit.config import Config, TraceFormat
-from sealfit.errors import BadFile, ConfigError, Fault, shortened
+from sealfit.errors import BadFile, ConfigError, Fault, did_you_mean, shortened
 from sealfit.store.manifest import Fingerprint, fingerprint_of
 
 # ---------------------------------------------------------------- folder
@@ -122,7 +122,8 @@ def _not_opened(path: Path, file: str, error: OSError) -> BadFile:
         reason = f"is a link to '{path.readlink()}', which does not exist."
         return bad_file(file, "missing_file", reason, "Copy the file itself into the campaign.")
     if isinstance(error, FileNotFoundError):
-        return bad_file(file, "missing_file", "does not exist.", _similar(path))
+        fix = did_you_mean(path, Path.is_file) or "Paths are relative to the folder of runs.csv."
+        return bad_file(file, "missing_file", "does not exist.", fix)
     return _not_readable(file, error)
 
 
@@ -133,18 +134,6 @@ def _not_readable(file: str, error: OSError) -> BadFile:
 def bad_file(file: str, check: str, reason: str, fix: str, **place) -> BadFile:
     """Return the error of a file that is left out."""
     return BadFile(Fault(check, reason, file=file, action="file left out", fix=fix, **place))
-
-
-def _similar(path: Path) -> str:
-    """Return a fix for a missing file: the same name in other case or place, if there is one."""
-    try:
-        for other in path.parent.iterdir():
-            if other.name.lower() == path.name.lower():
-                return f"There is '{other.name}': the case of letters matters."
-    except OSError:
-        above = path.parent.name
-        return f"There is no folder '{above}' either; paths are relative to the folder of runs.csv."
-    return "Paths are relative to the folder of runs.csv."
 
 
 # ---------------------------------------------------------------- text
