@@ -76,11 +76,9 @@ def taken(columns: Columns, files: Sequence[int]) -> Columns:
 
 def in_order(columns: Columns) -> Columns:
     """Return the columns in the order of the first file with a value in each, without those that none has."""
-    first = {}
-    for name, column in columns.items():
-        first[name] = next((i for i, value in enumerate(column) if value is not None), None)
-    filled = [name for name in columns if first[name] is not None]
-    return {name: columns[name] for name in sorted(filled, key=first.__getitem__)}
+    filled = {name: known(column) for name, column in columns.items()}
+    first = {name: int(there.argmax()) for name, there in filled.items() if there.any()}
+    return {name: columns[name] for name in sorted(first, key=first.__getitem__)}
 
 
 # ---------------------------------------------------------------- conditions

@@ -17,8 +17,6 @@ from sealfit.ingest.columns import (
     UNAGED,
     Column,
     Columns,
-    condition_columns,
-    keys_of,
     known,
     mapped,
     over,
@@ -248,21 +246,6 @@ def swapped_columns(entries: list[Entry], columns: Columns) -> list[Fault]:
 SETTING = 0.005
 # Share by which measured speeds of one commanded speed differ at most; rigs repeat within a few percent.
 SAME_SPEED = 0.05
-
-
-def condition_keys(columns: Columns, files: int, config: Config) -> list[str]:
-    """Return the condition of each of so many files in words, as `columns.add_keys` spells it.
-
-    Examples
-    --------
-    >>> campaign = {"temperature_C": [60.0], "compression_ratio_pct": [80.0], "aging_days": [4.0]}
-    >>> condition_keys(campaign, 1, Config())
-    ['temperature_C=60, compression_ratio_pct=80, aging_days=4']
-    >>> condition_keys({"aging_days": [0.0]}, 1, Config())
-    ['unaged']
-    """
-    own = {name: columns.get(name, [None] * files) for name in condition_columns(config)}
-    return keys_of(own, files, config)["condition"]
 
 
 def _text(value: float | str) -> str:

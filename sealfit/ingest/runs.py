@@ -29,6 +29,7 @@ from sealfit.ingest.columns import (
     columns_of,
     condition_columns,
     in_order,
+    keys_of,
     known,
     mapped,
     overlaid,
@@ -42,7 +43,6 @@ from sealfit.ingest.derived_columns import (
     add_runs,
     add_specimens,
     as_set,
-    condition_keys,
     disagreements,
     empty_cells,
     in_our_units,
@@ -237,7 +237,8 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     files = [entry.file for entry in entries]
     _stop_at_errors(faults, campaign, files)
     columns = as_set(columns)
-    conditions = condition_keys(columns, len(entries), config)
+    of_conditions = {name: columns.get(name, [None] * len(entries)) for name in condition_columns(config)}
+    conditions = keys_of(of_conditions, len(entries), config)["condition"]
     columns, found = add_runs(columns, conditions, measured, config.units.unit("speed"))
     faults += found
     columns = add_repeats(add_specimens(columns, conditions))

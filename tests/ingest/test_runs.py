@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 from trace_helpers import DAYS, campaign, channels, config, faults, trace
 
 from sealfit.errors import CampaignError
-from sealfit.ingest.derived_columns import condition_keys
+from sealfit.ingest.columns import keys_of
 from sealfit.ingest.runs import list_traces
 
 FULL = """
@@ -166,7 +166,7 @@ def test_unaged_rows_are_one_condition_whatever_their_other_cells_say(tmp_path):
 def test_unaged_rubbers_are_told_apart():
     rubbers = config(DAYS + 'rubber = ["compound"]')
     columns = {"aging_days": [0.0], "compound": ["NBR"]}
-    assert condition_keys(columns, 1, rubbers) == ["unaged, NBR"]
+    assert keys_of(columns, 1, rubbers)["condition"] == ["unaged, NBR"]
 
 
 @pytest.mark.parametrize(
