@@ -236,11 +236,7 @@ class SealfitError(Exception):
     ):
         self.message, self.line, self.column, self.fix = message, line, column, fix
         self.file = str(file) if file is not None else None
-        place = self.file or ""
-        if line is not None:
-            place += f":{line}"
-        head = ": ".join([p for p in (place, f"column '{column}'" if column else "") if p])
-        super().__init__(" ".join(p for p in (f"{head}: {message}" if head else message, fix) if p))
+        super().__init__(str(Fault("", message, self.file, line=line, column=column, fix=fix)))
 
     def _render_traceback_(self) -> list[str]:
         """Return what a notebook shows, not a traceback: the program is not at fault, and the fix is said."""
