@@ -11,8 +11,7 @@ import numpy as np
 from sealfit.config import Strokes
 from sealfit.draft.dialect import Dialect
 from sealfit.draft.vocabulary import Unit, column_role, name_and_unit, unit_of
-from sealfit.ingest.strokes import displacement_noise_mm, steady_speeds, turning_rows
-from sealfit.ingest.trace_checks import measured_speed
+from sealfit.ingest.strokes import Stroke, find_strokes, turning_rows
 
 SMOOTHED = 7  # samples, as `strokes.smooth_samples`
 MOVING = 0.3  # of the highest smoothed speed: slower samples belong to rests, ramps and turns
@@ -66,15 +65,10 @@ def smoothness(values: np.ndarray) -> float:
     return float((stroke_count(values) * np.ptp(values)) / path) if path else 0.0
 
 
-def ends_of_strokes(values: np.ndarray) -> list[int]:
-    """Return the rows where a displacement begins, turns and ends: a fifth of its range apart or more."""
-    smooth = smoothed(values)
-    return turning_rows(smooth, STROKE * float(np.ptp(smooth)))
-
-
 def stroke_count(values: np.ndarray) -> int:
-    """Return how many strokes a displacement has."""
-    return max(len(ends_of_strokes(values)) - 1, 1)
+    """Return how many strokes a displacement has: it turns where it comes back by a fifth of its range."""
+    smooth = smoothed(values)
+    return max(len(turning_rows(smooth, STROKE * float(np.ptp(smooth)))) - 1, 1)
 
 
 def smoothed(values: np.ndarray) -> np.ndarray:
@@ -134,20 +128,11 @@ def _share(difference: float, scatter: float) -> float:
     return abs(difference) / total if total else 0.0
 
 
-def plateau_speeds(time: np.ndarray, displacement: np.ndarray) -> list[list[float]]:
-    """Return the steady speeds of every stroke, with the sign of the motion; rests and ramps do not count."""
-    strokes, noise = [], displacement_noise_mm(displacement)
-    for first, last in pairwise(ends_of_strokes(displacement)):
-        t, x = time[first : last + 1], displacement[first : last + 1]
-        sign = float(np.sign(x[-1] - x[0]))
-        if len(t) <= SMOOTHED:
-            continue
-        parts = [(slice(len(t)), 0)]
-        if (np.diff(t) > 0).all():  # where the clock stands there is no speed at a row
-            parts = steady_speeds(t, sign * x, noise, Strokes())
-        speeds = [sign * measured_speed(t[at : part.stop], x[at : part.stop])[1] for part, at in parts]
-        strokes.append([speed for speed in speeds if np.isfinite(speed) and speed != 0])
-    return strokes
+def moving_strokes(time: np.ndarray, displacement: np.ndarray) -> list[Stroke]:
+    """Return the strokes of a motion with a steady speed; rows at which the clock stands are left out."""
+    rows = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0
+    found = find_strokes(time[rows], displacement[rows], np.zeros(np.count_nonzero(rows)), Strokes())
+    return [stroke for stroke in found if np.isfinite(stroke.speed_mm_s) and stroke.speed_mm_s != 0]
 
 
 def several_speeds(speeds: list[float]) -> list[float]:

@@ -13,7 +13,7 @@ from sealfit.draft.columns import (
     Column,
     Roles,
     mean_speed,
-    plateau_speeds,
+    moving_strokes,
     rises,
     several_speeds,
     stroke_count,
@@ -401,16 +401,18 @@ def motion_keys(
         return {}
     given = {role: unit.name for role, unit in units.items() if unit is not None}
     in_s, in_mm = conversion(given.get("time", "s"), "s"), conversion(given.get("displacement", "mm"), "mm")
-    strokes: dict[str, list[list[float]]] = {}
+    speeds: dict[str, list[float]] = {}
+    in_steps = set()
     for i, file in enumerate(files):
         if roles.displacement is None:
-            strokes[file] = [[mean_speed(roles.speed.values[i])]]
+            speeds[file] = [mean_speed(roles.speed.values[i])]
             continue
-        time, displacement = in_s(roles.time.values[i]), in_mm(roles.displacement.values[i])
-        strokes[file] = plateau_speeds(time, displacement)
-    speeds = {file: [speed for stroke in found for speed in stroke] for file, found in strokes.items()}
+        found = moving_strokes(in_s(roles.time.values[i]), in_mm(roles.displacement.values[i]))
+        speeds[file] = [stroke.speed_mm_s for stroke in found]
+        if any(stroke.several_speeds for stroke in found):
+            in_steps.add(file)
     several = {file: found for file, all_ in speeds.items() if (found := several_speeds(all_))}
-    steps = {file: found for file, found in several.items() if max(map(len, strokes[file])) > 1}
+    steps = {file: found for file, found in several.items() if file in in_steps}
     if steps:
         evidence = f"several steady speeds in a stroke, {_shown_speeds(steps, files)}: each is a stroke"
         notes.guess("strokes.speed_tolerance", 0.1, evidence)

@@ -8,7 +8,7 @@ import pytest
 
 from sealfit.config import parse_config
 from sealfit.draft import draft
-from sealfit.draft.columns import plateau_speeds, stroke_count
+from sealfit.draft.columns import moving_strokes, stroke_count
 from sealfit.draft.dialect import sniff
 from sealfit.draft.vocabulary import AFTER, UNITS, column_role, name_and_unit, setting
 from sealfit.ingest.file_names import TraceRef
@@ -161,9 +161,9 @@ def test_strokes_are_counted(strokes, sign):
     (one,) = exports.records(days=(1,), speeds=(5.0,), repeats=(1,), strokes=strokes)
     assert stroke_count(sign * one.displacement_mm) == strokes
     expected = [5.0 * sign * (-1) ** i for i in range(strokes)]
-    found = plateau_speeds(one.time_s, sign * one.displacement_mm)
-    assert [len(speeds) for speeds in found] == [1] * strokes
-    assert [speed for (speed,) in found] == pytest.approx(expected, rel=0.05)
+    found = moving_strokes(one.time_s, sign * one.displacement_mm)
+    assert not any(stroke.several_speeds for stroke in found)
+    assert [stroke.speed_mm_s for stroke in found] == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize(
