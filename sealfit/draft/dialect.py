@@ -47,14 +47,9 @@ _RATE = re.compile(rf"{_SAMPLED}.*(?:rate|freq)|(?:rate|freq).*{_SAMPLED}")  # n
 _STEP = re.compile(rf"{_SAMPLED}.*(?:interval|period)|(?:interval|period).*{_SAMPLED}|\bdt\b|\bdelta [tx]\b")
 # The header field that an expression for the rate reads; by its first letter it is no channel.
 RATE = "_rate"
-_ISO = re.compile(r"20\d\d-[01]\d-[0-3]\d[T ][0-2]\d:[0-5]\d(?::[0-5]\d)?(?!\d)")
-_DAYS = (
-    (re.compile(r"[0-3]?\d\.[01]?\d\.20\d\d"), "%d.%m.%Y"),
-    (re.compile(r"20\d\d-[01]\d-[0-3]\d"), "%Y-%m-%d"),
-    (re.compile(r"20\d\d/[01]\d/[0-3]\d"), "%Y/%m/%d"),
-    (re.compile(r"(?<!\d)[01]?\d/[0-3]?\d/20\d\d"), "%m/%d/%Y"),
-    (re.compile(r"[0-3]?\d/[01]?\d/20\d\d"), "%d/%m/%Y"),
-)
+_DATE = re.compile(r"(?<!\d)(?:20\d\d([-/])\d\d?\1\d\d?|\d\d?(?P<mark>[./])\d\d?(?P=mark)20\d\d)(?!\d)")
+_DATES = ("%d.%m.%Y", "%Y-%m-%d", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y")
+_ISO = [f"%Y-%m-%d{mark}%H:%M{seconds}" for mark in " T" for seconds in ("", ":%S")]
 CLOCK = re.compile(
     r"(?P<clock>[0-2]?\d:[0-5]\d(?P<second>:[0-5]\d)?)(?:[.,]\d+)?(?P<half>\s*[AP]M)?", re.IGNORECASE
 )
@@ -338,48 +333,40 @@ def rate_in(headers: Sequence[Sequence[str]], decimal: str) -> tuple[float | str
 
 
 def started_in(headers: Sequence[Sequence[str]]) -> When | None:
-    """Return the date that the header lines of every file give; None if there is none."""
-    for number, line in enumerate(headers[0], start=1):
-        if match := _ISO.search(line):
-            pattern = _leading(line[: match.start()]) + r"(20\d\d-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d)?)"
-            if _everywhere(pattern, headers):
-                return When(pattern, "", number, line.strip())
-    for number, line in enumerate(headers[0], start=1):
-        for days, spelled in _DAYS:
-            match = days.search(line)
-            when = match and _with_clock(headers, number, line, match, spelled)
-            if when and all(_is_day(text, days, spelled) for text in _found(when.pattern, headers)):
-                return when
-    return None
+    """Return the date that the header lines of every file give, ISO 8601 first; None if there is none."""
+    found = [_date_in(headers, number, line) for number, line in enumerate(headers[0], start=1)]
+    return min(filter(None, found), key=lambda when: when.format != "", default=None)
 
 
-def _is_day(text: str, days: re.Pattern, spelled: str) -> bool:
+def _date_in(headers: Sequence[Sequence[str]], number: int, line: str) -> When | None:
+    """Return the date of a line with the time of day after it, or in the next line."""
+    match = _DATE.search(line)
+    if match is None:
+        return None
+    clock, start, end = CLOCK.search(line, match.end()), match.start(), match.end()
+    if clock is not None:
+        end = clock.end() if clock["half"] else clock.end("clock")  # strptime reads no fraction of a second
+    numbers = re.sub(r"\d+", r"\\d+", re.escape(line[start:end]))
+    pattern = f"{_leading(line[:start])}({numbers})"
+    pattern = re.sub(r"[AP]M\)$", "[AP]M)", pattern).replace(r"\ ", " ")
+    texts = _found(pattern, headers)
+    spelled = next((one for one in _DATES if all(_is_day(text, one) for text in texts)), None)
+    if spelled is None:
+        return None
+    following = headers[0][number] if number < len(headers[0]) else ""
+    if clock is not None:
+        spelled += line[match.end() : clock.start()].replace("%", "%%") + _clock_format(clock)
+    elif clock := CLOCK.search(following):
+        own = _leading(following[: clock.start()]) + r"(\d+:\d+(?::\d+)?)"
+        return When(pattern, f"{spelled} {_clock_format(clock)}", number, line.strip(), own)
+    return When(pattern, "" if spelled in _ISO else spelled, number, line.strip())
+
+
+def _is_day(text: str, spelled: str) -> bool:
     try:
-        return bool(datetime.strptime(days.search(text)[0], spelled))
+        return bool(datetime.strptime(_DATE.search(text)[0], spelled))
     except (TypeError, ValueError):  # 14/03/2024 is no date where the month stands first
         return False
-
-
-def _with_clock(headers, number: int, line: str, match: re.Match, spelled: str) -> When | None:
-    """Return the date with the time of day after it in the same line, or in the next line."""
-    start = _leading(line[: match.start()])
-    clock = CLOCK.search(line, match.end())
-    if clock is not None:
-        between = line[match.end() : clock.start()]
-        full = f"{spelled}{between.replace('%', '%%')}{_clock_format(clock)}"
-        end = clock.end() if clock["half"] else clock.end("clock")  # strptime reads no fraction of a second
-        pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(line[match.start() : end])) + ")"
-        pattern = re.sub(r"[AP]M\)$", "[AP]M)", pattern).replace(r"\ ", " ")
-        return When(pattern, full, number, line.strip()) if _everywhere(pattern, headers) else None
-    pattern = start + "(" + re.sub(r"\d+", r"\\d+", re.escape(match.group())) + ")"
-    following = headers[0][number] if number < len(headers[0]) else ""
-    beside = CLOCK.search(following)
-    if not _everywhere(pattern, headers):
-        return None
-    if beside is None:
-        return When(pattern, spelled, number, line.strip())
-    own = _leading(following[: beside.start()]) + r"(\d+:\d+(?::\d+)?)"
-    return When(pattern, f"{spelled} {_clock_format(beside)}", number, line.strip(), own)
 
 
 def _clock_format(clock: re.Match) -> str:
@@ -396,10 +383,6 @@ def _leading(text: str) -> str:
 def _after(key: str, value: str) -> str:
     """Return the pattern of a value behind the key of its line."""
     return rf'^\W*{re.escape(key)}"?[\s:=;,"]*'.replace(r"\ ", " ") + value
-
-
-def _everywhere(pattern: str, headers: Sequence[Sequence[str]]) -> bool:
-    return "" not in _found(pattern, headers)
 
 
 def _found(pattern: str, headers: Sequence[Sequence[str]]) -> list[str]:
