@@ -26,7 +26,7 @@ from sealfit.ingest.quality import (
 )
 from sealfit.ingest.reader import Trace, parse_trace
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
-from sealfit.ingest.trace_checks import displacement_spikes, force_spikes
+from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, speed_fault
 from sealfit.ingest.window import acceleration
 from sealfit.store.manifest import Fingerprint, fingerprint
 
@@ -297,15 +297,19 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
         trace = parse_trace(raw, ref, config)
     except BadFile as error:
         return FileStrokes(ref.file, mark or fingerprint(campaign / ref.file), 0, error.faults)
-    trace, strokes = _with_strokes(trace, config)
+    trace, strokes = with_strokes(trace, config)
     if not strokes:
         return FileStrokes(ref.file, mark, trace.rows_read, (*trace.faults, _unmoved(trace, config)))
+    if fault := speed_fault(trace, strokes, config):
+        trace = replace(trace, faults=(*trace.faults, fault))
+        if fault.action == "file left out":
+            return FileStrokes(ref.file, mark, 0, trace.faults)
     samples = _samples(trace, strokes, config)
     rows, faults = _stroke_rows(trace, strokes, samples, config)
     return FileStrokes(ref.file, mark, trace.rows_read, (*trace.faults, *faults), rows, samples)
 
 
-def _with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
+def with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
     """Return the trace without rows that are spikes, and its strokes."""
     displacement = trace.columns["displacement_mm"]
     keep, faults = displacement_spikes(trace.ref.file, displacement, trace.line, config.quality)

@@ -39,7 +39,6 @@ from sealfit.ingest.files import (
     without_footer,
 )
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays
-from sealfit.ingest.trace_checks import speed_fault
 from sealfit.ingest.workbooks import read_sheet
 
 UNFILLED = ("", "Comment")  # last names without cells: a stray separator, and LabVIEW's column of comments
@@ -79,8 +78,8 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
     Raises
     ------
     BadFile
-        If the file must be left out: missing, empty, binary, a column missing, too many bad rows, a speed
-        that contradicts the commanded one. It carries every fault found, the deciding one last.
+        If the file must be left out: missing, empty, binary, a column missing, too many bad rows. It carries
+        every fault found, the deciding one last.
     """
     return parse_trace(read_bytes(campaign, ref.file), ref, config)
 
@@ -200,10 +199,6 @@ def _trace(rows: Rows, layout: Layout, ref: TraceRef, config: Config) -> Trace:
         reason = f"{len(rows.line)} of {len(read)} data rows are left; a trace needs {MIN_ROWS}."
         fix = "Check drop_first_rows, keep and the export."
         raise BadFile(*faults, bad_file(file, "no_rows", reason, fix).fault)
-    if fault := speed_fault(ref, rows.columns["time_s"], rows.columns["displacement_mm"], config):
-        faults.append(fault)
-        if fault.action == "file left out":
-            raise BadFile(*faults)
     return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(read), tuple(faults))
 
 

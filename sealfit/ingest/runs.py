@@ -21,6 +21,7 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault, nearest
+from sealfit.ingest.averages import with_strokes
 from sealfit.ingest.columns import (
     RESERVED,
     Column,
@@ -58,7 +59,7 @@ from sealfit.ingest.files import as_number, bad_file, cut_files, read_bytes
 from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt
 from sealfit.ingest.reader import read_header, read_trace
-from sealfit.ingest.trace_checks import measured_speed
+from sealfit.ingest.trace_checks import measured_speeds
 from sealfit.units import Conversion, conversion
 
 EXCEL_DAY_0 = datetime(1899, 12, 30)
@@ -342,14 +343,13 @@ def _from_traces(
     for i in np.flatnonzero(np.any([~runs, *lacking.values()], axis=0)).tolist():
         wanted, file = [name for name, lack in lacking.items() if lack[i]], entries[i].file
         try:
-            table = read_trace(campaign, TraceRef(file, {}), config).table
+            trace, strokes = with_strokes(read_trace(campaign, TraceRef(file, {}), config), config)
         except BadFile as error:
             if wanted:  # otherwise it is left out, and said why, when it is read for good
                 left_out.add(i)
                 faults += error.faults
             continue
-        _, plateau = measured_speed(table["time_s"].to_numpy(), table["displacement_mm"].to_numpy())
-        measured[i] = plateau * config.units.speed_factor
+        measured[i], table = measured_speeds(trace, strokes, config.units)[1], trace.table
         sources = {name: beside(name, RESERVED) for name in FROM_TRACES} | {name: name for name in wanted}
         for name, column in sources.items():
             if columns.get(name, none)[i] is not None or column not in table:

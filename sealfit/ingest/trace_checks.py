@@ -10,8 +10,10 @@ from scipy.ndimage import median_filter
 
 from sealfit.config import Config, Quality
 from sealfit.errors import KEPT, Fault
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.reader import Trace
+from sealfit.ingest.segments import weighted_median
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm
+from sealfit.units import Units
 
 # ---------------------------------------------------------------- spikes
 
@@ -115,87 +117,48 @@ def _spike(file: str, stroke: int | None, column: str, value: float, off: float,
 
 # ---------------------------------------------------------------- speed check
 
-# Pieces that one or two strokes are cut into: long enough to average noise out, short beside a stroke.
-BLOCKS = 100
-# Pieces that a noisy trace is cut into at least: a rest at either end, and sliding between.
-FEWEST = 6
-# Noise of a step between the means of two pieces, as a share of the step.
-NOISE_OF_PATH = 0.1
 # Factor beyond which the file contradicts itself and is left out. Below it the commanded speed may be
 # nominal.
 GROSS = 1.5
 
 
-def measured_speed(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
-    """Return the mean speed of a trace, rests included, and its plateau speed; magnitudes, nan for none.
+def measured_speeds(trace: Trace, strokes: Sequence[Stroke], units: Units) -> tuple[float, float]:
+    """Return the mean speed of a trace, rests included, and the usual one of its strokes; magnitudes.
 
-    Rising time and displacement, shape (n,), are in any unit; the speeds are in their quotient.
-
-    Notes
-    -----
-    A trace is cut into 100 pieces, or 50 per stroke. The mean is that of all pieces; the plateau is the
-    median of those faster than half their 90th percentile, so rests, turns and ramps do not count. In
-    stick-slip the speed that was set is the mean, in a stroke with rests it is the plateau; elsewhere the two
-    agree.
-
-    Examples
-    --------
-    >>> t = np.linspace(0.0, 10.0, 201)
-    >>> mean, plateau = measured_speed(t, np.where(t < 5, 3 * t, 15.0))  # slides at 3 mm/s, then rests
-    >>> round(mean, 6), round(plateau, 6)
-    (1.5, 3.0)
+    In stick-slip the speed that was set is the mean, in a stroke with rests it is that of the stroke;
+    elsewhere the two agree. Without steady sliding both are nan.
     """
-    cuts = min(len(time_s), BLOCKS * max(1, _strokes(displacement_mm) // 2) + 1)
-    at = np.linspace(0, len(time_s) - 1, cuts).astype(np.int64)
-    return _of_cuts(time_s[at], displacement_mm[at])
+    speed = np.abs([stroke.speed_mm_s for stroke in strokes])
+    rows = np.array([len(stroke.rows) for stroke in strokes])[np.isfinite(speed)]
+    if not rows.any():
+        return math.nan, math.nan
+    time_s, displacement = trace.columns["time_s"], trace.columns["displacement_mm"]
+    path = sum(np.ptp(displacement[stroke.start : stroke.stop]) for stroke in strokes)
+    mean, usual = path / (time_s[-1] - time_s[0]), weighted_median(speed[np.isfinite(speed)], rows)
+    return units.speed_factor * float(mean), units.speed_factor * usual
 
 
-def _of_cuts(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
-    """Return mean and plateau of a trace of which these rows are given."""
-    with np.errstate(all="ignore"):  # beyond 1e308 there is no speed: nan or inf, and no check
-        path, time = np.abs(np.diff(displacement_mm)), np.diff(time_s)
-        speeds = path / time
-        fast = speeds[speeds > 0.5 * np.quantile(speeds, 0.9)]
-        return float(path.sum() / time.sum()), float(np.median(fast)) if len(fast) else math.nan
-
-
-def _strokes(displacement_mm: np.ndarray) -> int:
-    """Return how often a trace goes from its lowest quarter to its highest or back: roughly, its strokes."""
-    low, high = np.quantile(displacement_mm, 0.01), np.quantile(displacement_mm, 0.99)
-    quarter = 0.25 * (high - low)
-    ends = displacement_mm[(displacement_mm < low + quarter) | (displacement_mm > high - quarter)]
-    return int(np.count_nonzero(np.diff(ends > 0.5 * (low + high))))
-
-
-def speed_fault(
-    ref: TraceRef, time_s: np.ndarray, displacement_mm: np.ndarray, config: Config
-) -> Fault | None:
+def speed_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fault | None:
     """Return a fault if time and displacement of a trace disagree with the commanded speed.
 
     None if they agree or no speed is commanded. They agree if the commanded speed lies between the measured
-    mean and the plateau, or misses them by no more than `quality.speed_disagreement`. Up to a factor of 1.5
-    the file is kept with a warning: every table holds the measured speed. Beyond, the file is left out, and
-    the fix names the mix-up that fits the factor. Arguments as in `measured_speed`.
+    mean and that of the strokes, or misses them by no more than `quality.speed_disagreement`. Up to a factor
+    of 1.5 the file is kept with a warning: every table holds the measured speed. Beyond, the file is left
+    out, and the fix names the mix-up that fits the factor.
     """
-    commanded = ref.channels.get("speed_set_mm_s")
+    commanded = trace.ref.channels.get("speed_set_mm_s")
     if not isinstance(commanded, int | float) or not commanded > 0:
         return None
-    factor, tolerance = config.units.speed_factor, config.quality.speed_disagreement
-    mean, plateau = (factor * speed for speed in measured_speed(time_s, displacement_mm))
-    if not (0 < plateau < math.inf and mean < math.inf):  # nothing moves: said where strokes are sought
+    speeds = measured_speeds(trace, strokes, config.units)
+    if not 0 < min(speeds) <= max(speeds) < math.inf:
         return None
-    measured = sorted((commanded, mean, plateau))[1]  # between the two, nearest to the commanded one
-    if abs(measured / commanded - 1) <= tolerance:
-        return None
-    of_means = [factor * speed for speed in _speeds_of_means(time_s, displacement_mm)]
-    if np.isfinite(of_means).all():
-        measured = sorted((commanded, *of_means))[1]
+    measured = sorted((commanded, *speeds))[1]  # between the two, nearest to the commanded one
     ratio = measured / commanded
-    if abs(ratio - 1) <= tolerance:
+    if abs(ratio - 1) <= config.quality.speed_disagreement:
         return None
     unit = config.units.unit("speed")
     reason = f"displacement over time gives {measured:.4g} {unit}, commanded are {commanded:.4g} {unit}."
-    place = {"file": ref.file, "column": "displacement_mm", "value": measured}
+    place = {"file": trace.ref.file, "column": "displacement_mm", "value": float(measured)}
     if 1 / GROSS <= ratio <= GROSS:
         fix = "Check the commanded speed, or slip in the drive."
         return Fault("speed_disagreement", reason, fix=fix, **place, **KEPT)
@@ -205,26 +168,8 @@ def speed_fault(
         if name in config.trace.columns and config.trace.columns[name].unit
     ]
     first = f"Is the unit in the rig config right ({', '.join(declared)})? " if declared else ""
-    fix = first + _mix_up(ratio, time_s, displacement_mm, config)
+    fix = first + _mix_up(ratio, trace.columns["time_s"], trace.columns["displacement_mm"], config)
     return Fault("speed_disagreement", reason, action="file left out", fix=fix, **place)
-
-
-def _speeds_of_means(time_s: np.ndarray, displacement_mm: np.ndarray) -> tuple[float, float]:
-    """Return mean and plateau speed of a trace from means of pieces, as few as its noise asks for; else nan.
-
-    The mean of a piece of m samples has a noise of sd / sqrt(m), and two make a step; the path of `count`
-    steps is longer by noise that must stay small beside the travel.
-    """
-    n, travel = len(time_s), float(np.ptp(displacement_mm))
-    noise = displacement_noise_mm(displacement_mm)
-    if noise <= 0.0 or n < 2 * FEWEST:
-        return math.nan, math.nan
-    count = int((NOISE_OF_PATH * travel / noise * math.sqrt(n / 2.0)) ** (2.0 / 3.0))
-    if not FEWEST <= count < BLOCKS:
-        return math.nan, math.nan
-    cut = np.linspace(0, n, count + 1).astype(np.int64)
-    means = [np.add.reduceat(values, cut[:-1]) / np.diff(cut) for values in (time_s, displacement_mm)]
-    return _of_cuts(*means)
 
 
 def with_unit(column: str, unit: str, config: Config) -> str:

@@ -10,9 +10,11 @@ from trace_helpers import HEADER, ROWS, changed, config, csv_of, read, refused
 
 from sealfit.config import parse_config
 from sealfit.errors import BadFile, ConfigError
+from sealfit.ingest.averages import with_strokes
 from sealfit.ingest.cells import decimal_fix
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_trace
+from sealfit.ingest.trace_checks import speed_fault
 
 
 def test_plain_file_reads_as_written(tmp_path):
@@ -230,6 +232,14 @@ def test_missing_folders_links_and_paths_outside_are_refused(tmp_path):
         read_trace(tmp_path / "c", TraceRef("x/run.csv", {}), config())
 
 
+def of_speed(folder, content, commanded, text=""):
+    """Return the findings on the speed of a trace of which one is commanded."""
+    made = config(text)
+    trace, strokes = with_strokes(read(folder, content, text, speed_set_mm_s=commanded), made)
+    assert strokes
+    return [fault for fault in [speed_fault(trace, strokes, made)] if fault]
+
+
 @pytest.mark.parametrize(
     ("factor_t", "factor_x", "speed", "words"),
     [
@@ -245,8 +255,8 @@ def test_missing_folders_links_and_paths_outside_are_refused(tmp_path):
 )
 def test_units_mixed_up_are_named_by_speed_times_time(tmp_path, factor_t, factor_x, speed, words):
     rows = [f"{0.1 * i * factor_t!r},{0.5 * i * factor_x!r},2.0" for i in range(100)]
-    fault = refused(tmp_path, csv_of(rows), speed_set_mm_s=speed)
-    assert fault.check == "speed_disagreement"
+    (fault,) = of_speed(tmp_path, csv_of(rows), speed)
+    assert (fault.check, fault.action) == ("speed_disagreement", "file left out")
     assert words in fault.fix
 
 
@@ -256,18 +266,18 @@ def test_the_unit_that_is_told_makes_the_file_readable(tmp_path, factor_t, facto
     content = csv_of([f"{0.1 * i * factor_t!r},{0.5 * i * factor_x!r},2.0" for i in range(100)], names)
     columns = dict(zip(("time_s", "displacement_mm"), names.split(","), strict=False))
     text = "[trace.columns]\n" + "".join(f"{ours} = '{theirs}'\n" for ours, theirs in columns.items())
-    fix = refused(tmp_path, content, text, speed_set_mm_s=5.0).fix
+    fix = of_speed(tmp_path, content, 5.0, text)[0].fix
     line = fix.partition("Set ")[2].partition(" under")[0]
     kept = [old for old in text.splitlines() if old.split()[0] != line.split()[0]]
-    assert read(tmp_path, content, "\n".join([*kept, line]), speed_set_mm_s=5.0).faults == ()
+    assert of_speed(tmp_path, content, 5.0, "\n".join([*kept, line])) == []
 
 
 def test_speed_within_tolerance_or_resting_agrees_and_a_slip_warns(tmp_path):
-    assert read(tmp_path, csv_of(ROWS), speed_set_mm_s=5.9).faults == ()
-    (fault,) = read(tmp_path, csv_of(ROWS), speed_set_mm_s=6.5).faults
+    assert of_speed(tmp_path, csv_of(ROWS), 5.9) == []
+    (fault,) = of_speed(tmp_path, csv_of(ROWS), 6.5)
     assert (fault.severity, fault.action) == ("warning", "kept")
     rests = [f"{0.1 * i:.1f},{0.5 * min(i, 50):.1f},2.0" for i in range(100)]
-    assert read(tmp_path, csv_of(rests), speed_set_mm_s=5.0).faults == ()
+    assert of_speed(tmp_path, csv_of(rests), 5.0) == []
 
 
 def test_units_rows_are_recognised_for_what_they_are(tmp_path):
@@ -306,8 +316,8 @@ def test_many_short_strokes_with_rests_have_the_speed_of_their_plateaus(tmp_path
         0, 2e-4, len(t)
     )
     rows = [f"{a:.2f},{b:.6f},2.0" for a, b in zip(t, x, strict=True)]
-    assert read(tmp_path, csv_of(rows), speed_set_mm_s=0.25).faults == ()
-    assert refused(tmp_path, csv_of(rows), speed_set_mm_s=0.5).check == "speed_disagreement"
+    assert of_speed(tmp_path, csv_of(rows), 0.25) == []
+    assert of_speed(tmp_path, csv_of(rows), 0.5)[0].check == "speed_disagreement"
 
 
 def test_a_pipe_is_not_waited_for(tmp_path):
