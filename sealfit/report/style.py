@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 import matplotlib as mpl
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import to_hex
@@ -21,7 +20,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import ArrayLike
 
-from sealfit.report.notation import count, joined, plain, power_of_ten, short, symbol_math
+from sealfit.report.notation import count, plain, power_of_ten, short, symbol_math
 
 # ---------------------------------------------------------------- excerpts
 # Selection of the panels, rows and legend keys that are shown for a large campaign.
@@ -45,58 +44,16 @@ def spread(things: Sequence[Thing], most: int) -> list[Thing]:
     return [things[k] for k in evenly(len(things), min(most, len(things)))]
 
 
-def telling(
-    things: Sequence[Thing], misfit: Sequence[float], heat: Sequence[float], what: str
-) -> tuple[list[Thing], str]:
-    """Return the things to draw, in their order, and a note on the selection.
-
-    Parameters
-    ----------
-    things : sequence
-        Series, say, in the order of the panels.
-    misfit, heat : sequence of float
-        Misfit to the model and aging temperature of each; NaN where unknown.
-    what : str
-        Plural of the thing, for the note.
-
-    Returns
-    -------
-    list, str
-        All of them and "" where there are few; else those with the largest misfit, the hottest, and an even
-        selection of the others, a third each.
+def panels_of(things: Sequence[Thing], what: str) -> tuple[list[Thing], str]:
+    """Return the things to draw, a panel each, and a note on the selection; `what` is their plural.
 
     Examples
     --------
-    >>> telling(range(40), [0.0] * 39 + [1.0], [20.0] * 40, "series")[1]
-    '12 of 40 series are drawn: the 4 with the largest misfit and 8 of the others, selected evenly.'
+    >>> panels_of(range(40), "series")[1]
+    '12 of 40 series are drawn, selected evenly.'
     """
-    if len(things) <= MOST_PANELS:
-        return list(things), ""
-    third, picked, said = MOST_PANELS // 3, [], []
-    for values, words in ((misfit, "with the largest misfit"), (heat, "hottest")):
-        values = np.asarray(values, float)
-        ranked = np.argsort(-values, kind="stable").tolist()
-        order = [k for k in ranked if np.isfinite(values[k]) and k not in picked]
-        if len(set(values[np.isfinite(values)].tolist())) > 1:
-            picked += order[:third]
-            said.append(f"the {third} {words}")
-    rest = spread([k for k in range(len(things)) if k not in picked], MOST_PANELS - len(picked))
-    said.append(f"{len(rest)} of the others, selected evenly" if picked else "selected evenly")
-    text = f"{MOST_PANELS} of {count(len(things), what, what)} are drawn: {joined(said)}."
-    return [things[k] for k in sorted([*picked, *rest])], text
-
-
-def condition_misfits(tables: Mapping[str, pd.DataFrame]) -> dict[str, float]:
-    """Return every condition's rms misfit to the model after."""
-    residuals = tables["residuals_after"]
-    squares = residuals["residual_N"].astype(float) ** 2
-    return np.sqrt(squares.groupby(residuals["condition"]).mean()).to_dict()
-
-
-def rms(values: Iterable[float]) -> float:
-    """Return the root of the mean square of the known values; NaN where there is none."""
-    known = np.array([value for value in values if np.isfinite(value)], float)
-    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+    text = f"{MOST_PANELS} of {count(len(things), what, what)} are drawn, selected evenly."
+    return spread(things, MOST_PANELS), text if len(things) > MOST_PANELS else ""
 
 
 # ---------------------------------------------------------------- axes

@@ -131,7 +131,7 @@ def test_many_conditions_of_one_kind_get_panels_of_their_own():
     plot = force_speed(tables, Config(condition=["batch"]))
     assert [panel.title for panel in plot.panels][:3] == ["b0", "b1", "b10"]
     assert len(plot.panels) == 12
-    assert plot.note.startswith("12 of 14 panels are drawn: selected evenly.")
+    assert plot.note.startswith("12 of 14 panels are drawn, selected evenly.")
 
 
 # ---------------------------------------------------------------- aging and traces

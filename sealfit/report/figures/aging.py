@@ -33,7 +33,6 @@ from sealfit.report.style import (
     CYCLE,
     FLOOR,
     MOST_KEYS,
-    MOST_PANELS,
     QUIET,
     SKY,
     Key,
@@ -42,11 +41,10 @@ from sealfit.report.style import (
     draw_band,
     evenly,
     padded,
-    rms,
+    panels_of,
     round_ticks,
     shades,
     spread,
-    telling,
 )
 from sealfit.units import Units
 
@@ -109,13 +107,7 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     fits = property_means(values) if of_property else tables["steady_fit"]
     points = aging_points(fits, quantities, names)
     series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural(names(s)))
-    misfit = _law_misfits(points, curves) if len(series) > MOST_PANELS else {}
-    series, note = telling(
-        series,
-        [misfit.get(s, np.nan) for s in series],
-        [names.number(s, "temperature_C") for s in series],
-        "series",
-    )
+    series, note = panels_of(series, "series")
     if note:
         note += " steady_fit.parquet and aging_curves.parquet have all."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
@@ -144,17 +136,6 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     legend += [Key(of_point, FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
     legend += [UNCORRECTED] if len(before) else []
     return Plot("aging", "Aging", tuple(panels), tuple(legend), note)
-
-
-def _law_misfits(points: pd.DataFrame, curves: pd.DataFrame) -> dict[str, float]:
-    """Return the rms deviation of the conditions of every series from its law, over all coefficients."""
-    laws = {place: curve.sort_values("aging_days") for place, curve in curves.groupby(["series", "quantity"])}
-    gaps: dict[str, list[float]] = {}
-    for (name, quantity), own in points.groupby(["series", "quantity"]):
-        if (law := laws.get((name, quantity))) is not None:
-            days, values = own["aging_days"].astype(float), own["value"].astype(float)
-            gaps.setdefault(name, []).extend(values - np.interp(days, law["aging_days"], law["value"]))
-    return {name: rms(values) for name, values in gaps.items()}
 
 
 def property_means(values: pd.DataFrame) -> pd.DataFrame:
@@ -336,9 +317,10 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     celsius = np.sort(table["temperature_C"].dropna().unique())
     colours = dict(zip(celsius.tolist(), shades(len(celsius)), strict=True))
     several = table["rubber"].nunique() > 1
-    panels, groups = [], list(table.groupby(["rubber", "quantity"], sort=False))
+    panels = []
+    groups, note = panels_of(list(table.groupby(["rubber", "quantity"], sort=False)), "curves")
     before = tables.get("master_curve_before", table.iloc[:0])
-    for (rubber, quantity), rows in spread(groups, MOST_PANELS):
+    for (rubber, quantity), rows in groups:
         earlier = before[(before["rubber"] == rubber) & (before["quantity"] == quantity)]
         shown = pd.concat([rows["value"], earlier.loc[earlier["kind"] == "law", "value"]])
         limits = {"ylim": padded(shown.min(), shown.max())}
@@ -352,7 +334,5 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     ]
     legend += [Key("unaged", BLACK, "point"), Key("law, 95 % band", FLOOR, "band")]
     legend += [UNCORRECTED] if len(before) else []
-    note = (
-        "" if len(groups) == len(panels) else f"{len(panels)} of {len(groups)}; master_curve.parquet has all."
-    )
+    note += " master_curve.parquet has all." if note else ""
     return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

@@ -38,14 +38,12 @@ from sealfit.report.style import (
     Key,
     Panel,
     Plot,
-    condition_misfits,
     draw_band,
     log_axis,
     padded,
-    rms,
+    panels_of,
     shades,
     spread,
-    telling,
 )
 from sealfit.units import Units
 
@@ -128,8 +126,13 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     rubber = tables["steady"].drop_duplicates("condition").set_index("condition")["rubber"].to_dict()
     unaged = [c for c in conditions if is_unaged(c)]
     groups = _groups([c for c in conditions if not is_unaged(c)], names, last) or {"": unaged}
-    groups, note = _telling(groups, len(conditions) - len(unaged), tables, names)
+    titles, note = panels_of(list(groups), "panels")
+    groups = {title: groups[title] for title in titles}
     drawn = {*unaged, *chain.from_iterable(groups.values())}
+    if len(drawn) < len(conditions):
+        aged = count(len(conditions) - len(unaged), "condition")
+        note = f"{note} They hold {len(drawn) - len(unaged)} of {aged}. ".lstrip()
+        note += "steady.parquet and curves.parquet have all."
     levels = sorted({names.parts(c).get(last, "") for c in drawn} - {""}, key=by_number)
     numeric = all(is_number(level) for level in levels)
     colour = dict(zip(levels, shades(len(levels)) if numeric else cycle(CYCLE), strict=False))
@@ -242,24 +245,6 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
         # numbers have an order
         return {title: spread(group, MOST_COLOURS) for title, group in groups.items()}
     return {names(c): [c] for group in groups.values() for c in group}
-
-
-def _telling(
-    groups: dict[str, list[str]], aged: int, tables: Mapping[str, pd.DataFrame], names: ConditionNames
-) -> tuple[dict[str, list[str]], str]:
-    """Return the panels that are drawn, and a note on the selection."""
-    misfit = condition_misfits(tables) if len(groups) > MOST_PANELS else {}
-    titles, note = telling(
-        list(groups),
-        [rms(misfit.get(c, np.nan) for c in group) for group in groups.values()],
-        [np.fmax.reduce([names.number(c, "temperature_C") for c in group]) for group in groups.values()],
-        "panels",
-    )
-    groups = {title: groups[title] for title in titles}
-    drawn = sum(len(group) for group in groups.values())
-    if drawn < aged:
-        note = f"{note} They hold {drawn} of {count(aged, 'condition')}.".strip()
-    return groups, f"{note} steady.parquet and curves.parquet have all." if note else ""
 
 
 def _level_label(name: str, level: str, names: ConditionNames) -> str:
