@@ -1,9 +1,10 @@
-"""The loop's results as rows for the page: errors, effects, scatter, tests by channel, runs to do next."""
+"""The loop's results as the page writes them: errors, effects, tests by channel, runs to do next."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 
 import pandas as pd
 from markupsafe import Markup
@@ -15,6 +16,7 @@ from sealfit.report.notation import (
     capital,
     channel_label,
     channel_words,
+    count,
     effect_label,
     given,
     joined,
@@ -27,7 +29,7 @@ from sealfit.report.notation import (
     symbol_html,
     together,
 )
-from sealfit.report.summary import by_gain, level_words
+from sealfit.report.summary import level_words
 from sealfit.report.words import acts, in_words, meaning, target_html, with_symbols
 
 MOST_TESTS = 40
@@ -38,6 +40,23 @@ FREE = {
     "surface": "free smooth surface",
     "slopes": "one slope per category",
 }
+
+
+def vocabulary(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> dict[str, Callable]:
+    """Return the functions by which the template writes values, those of closure.json above all."""
+    plain = (
+        capital, count, given, known, level_words, number, of_unit, p_value, parameter_cells, sized,
+        with_symbols,
+    )  # fmt: skip
+    of_units = (channel_label, effect_label)
+    of_config = (acts, channel_labels, given_as, rivals_of, target_html, wanted)
+    return {
+        **{function.__name__: function for function in plain},
+        **{function.__name__: partial(function, units=config.units) for function in of_units},
+        **{function.__name__: partial(function, config=config) for function in of_config},
+        "curve_of": partial(curve_of, shapes=shapes, closure=closure, config=config),
+        "in_words": partial(in_words, closure=closure, config=config),
+    }
 
 
 def error_rows(closure: Mapping, config: Config) -> list[dict]:
@@ -65,41 +84,9 @@ def _p(value: float | None) -> str:
     return p_value(value).removeprefix("= ") if known(value) else NOTHING
 
 
-def sensitivity_rows(closure: Mapping, config: Config) -> list[dict]:
-    """Return a row per variable and level: label, level and the smallest detectable effect."""
-    unit = config.units.unit("force")
-    return [
-        {
-            "variable": channel_label(entry["variable"], config.units),
-            "level": level_words(entry["level"]),
-            "smallest": _sized(entry["smallest_N"], unit, "none"),
-            "share": _sized(entry["smallest_pct"], "%", NOTHING),
-            "files": given(entry["files_needed"]),
-        }
-        for entry in closure["sensitivity"]
-    ]
-
-
-def _sized(value: float | None, unit: str, unknown: str = "") -> str:
+def sized(value: float | None, unit: str, unknown: str = "") -> str:
+    """Return a value to two digits with its unit, or what is written where it is not known."""
     return of_unit(number(value, 2), unit) if known(value) else unknown
-
-
-def refused_rows(closure: Mapping, config: Config) -> list[dict]:
-    """Return the significant effects that were not accepted: label, p-value and reason."""
-    return [
-        {
-            "label": Markup("{}, acting on {}").format(
-                effect_label(entry, config.units), target_html(entry["acts_on"], config)
-            ),
-            "p": p_value(entry["p_value"]),
-            "reason": in_words(entry["reason"], closure, config),
-        }
-        for entry in closure["refused"]
-    ]
-
-
-def _labels(channels: Sequence[str], config: Config) -> str:
-    return joined([channel_label(name, config.units) for name in channels])
 
 
 def _change(before: float, after: float) -> str:
@@ -110,48 +97,13 @@ def _change(before: float, after: float) -> str:
     return f"{percent:+d}\u00a0%".replace("-", "−") if percent else "0\u00a0%"
 
 
-def effect_cards(closure: Mapping, shapes: pd.DataFrame, config: Config) -> list[dict]:
-    """Return every effect, added or candidate, with the content of its card; the largest gain first.
-
-    A free shape has places of its curve in table `shapes`, and no parameters.
-    """
-    cards, unit = [], config.units.unit("force")
-    for effect in by_gain(closure["effects"]):
-        gain, left = effect["heldout_gain_N"], effect["heldout_rmse_N"]
-        rivals = [_rival(rival, config) for rival in effect["alternatives"]]
-        cards.append(
-            {
-                "index": closure["effects"].index(effect),
-                "title": capital(effect_label(effect, config.units)),
-                "named": effect["named"],
-                "candidate": effect["candidate"],
-                "acts": acts(effect, config),
-                "given": _given(effect, config),
-                "form": with_symbols(effect["form"], formula=True),
-                "reference": effect["reference"],
-                "level": level_words(effect["level"]),
-                "channels": _labels(effect["channels"], config),
-                "parameters": [_parameter(p, effect) for p in effect["parameters"] if effect["named"]],
-                "curve": None if effect["named"] else _curve(effect, shapes, closure, config),
-                "p": p_value(effect["p_value"]),
-                "gain": _sized(gain, unit),
-                "left": of_unit(number(left), unit) if known(left) else "",
-                "rivals": list(dict.fromkeys(rivals)),
-            }
-        )
-    return cards
+def channel_labels(channels: Sequence[str], config: Config) -> str:
+    """Return channels with their units, in words."""
+    return joined([channel_label(name, config.units) for name in channels])
 
 
-def references(closure: Mapping, config: Config) -> list[dict]:
-    """Return every effect of the after-model and the state in which it is zero, in words."""
-    return [
-        {"label": effect_label(effect, config.units), "state": effect["reference"]}
-        for effect in closure["effects"]
-        if not effect["candidate"]
-    ]
-
-
-def _given(effect: Mapping, config: Config) -> str | Markup:
+def given_as(effect: Mapping, config: Config) -> str | Markup:
+    """Return what the form of an effect gives, in words."""
     if effect["operation"] == "multiply":
         return "factor minus one"
     if effect["acts_on"] == "force":
@@ -159,7 +111,8 @@ def _given(effect: Mapping, config: Config) -> str | Markup:
     return Markup("added to {}").format(symbol_html(effect["acts_on"]))
 
 
-def _parameter(p: Mapping, effect: Mapping) -> dict:
+def parameter_cells(p: Mapping, effect: Mapping) -> dict:
+    """Return the cells of a parameter of an effect."""
     value, interval = measured(p["value"], *p["ci95"])
     return {
         "symbol": symbol_html(p["name"]),
@@ -170,7 +123,7 @@ def _parameter(p: Mapping, effect: Mapping) -> dict:
     }
 
 
-def _curve(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Config) -> dict | None:
+def curve_of(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Config) -> dict | None:
     """Return the head and a few places of a free shape along its first channel; None if it is not stored."""
     own = shapes[shapes["effect"] == closure["effects"].index(effect)]
     if own.empty:
@@ -189,6 +142,11 @@ def _curve(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Conf
     }
 
 
+def rivals_of(effect: Mapping, config: Config) -> list[Markup]:
+    """Return the forms that the data do not distinguish from an effect, each once."""
+    return list(dict.fromkeys(_rival(rival, config) for rival in effect["alternatives"]))
+
+
 def _rival(rival: Mapping, config: Config) -> Markup:
     from sealfit.effects import EFFECTS
 
@@ -203,19 +161,6 @@ def _rival(rival: Mapping, config: Config) -> Markup:
     if known(error := rival["heldout_rmse_N"]):
         text += Markup(" (held-out error {})").format(of_unit(number(error), config.units.unit("force")))
     return text
-
-
-def scatter_rows(closure: Mapping) -> list[dict]:
-    """Return the variance components by level."""
-    return [
-        {
-            "level": level_words(entry["level"]),
-            "sd": number(entry["sd_N"], 2),
-            "share": f"{number(100 * entry['sd_rel'], 2)} %" if known(entry["sd_rel"]) else NOTHING,
-            "df": number(entry["df"], 2),
-        }
-        for entry in closure["scatter"]
-    ]
 
 
 def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config: Config) -> list[dict]:
@@ -238,18 +183,7 @@ def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config:
     return [entry for _, entry in listed[:MOST_TESTS]]
 
 
-def next_runs(closure: Mapping, config: Config) -> list[dict]:
-    """Return the recommended runs: the reason and the conditions."""
-    return [
-        {
-            "why": in_words(capital(entry["why"]), closure, config),
-            "conditions": _wanted(entry["conditions"], config),
-        }
-        for entry in closure["next_runs"]
-    ]
-
-
-def _wanted(conditions: Mapping, config: Config) -> str:
+def wanted(conditions: Mapping, config: Config) -> str:
     """Return the conditions to measure at, e.g. "aging temperature 60 °C, sliding speed 5 mm/s"."""
     parts = []
     for name, value in conditions.items():

@@ -20,28 +20,18 @@ from sealfit.progress import timed
 from sealfit.report.drawing import Drawn, draw, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
-from sealfit.report.loop_tables import (
-    channel_tests,
-    effect_cards,
-    error_rows,
-    next_runs,
-    references,
-    refused_rows,
-    scatter_rows,
-    sensitivity_rows,
-)
+from sealfit.report.loop_tables import channel_tests, error_rows, vocabulary
 from sealfit.report.notation import (
     ConditionNames,
     channel_label,
     count,
     given,
-    number,
     symbol_html,
     true_units,
 )
 from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
 from sealfit.report.style import WIDTH, Plot
-from sealfit.report.summary import of_properties
+from sealfit.report.summary import by_gain, of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
 from sealfit.report.words import left_over, undecided, verdict, with_left_channels, with_symbols, without_load
 from sealfit.tables import FITTED, SCHEMAS
@@ -175,7 +165,7 @@ def build_report(
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
     environment = Environment(autoescape=True, undefined=StrictUndefined)
-    environment.globals |= {"count": count, "number": number, "given": given}
+    environment.globals |= vocabulary(closure, tables["shapes"], config)
     html = environment.from_string(_text("template.html")).render(
         style=Markup(_text("style.css")), script=Markup(_text("report.js")), plots=images, runs=Markup(runs),
         script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(), **content
@@ -239,6 +229,7 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
     """Return what the page says of the campaign and its loop."""
     findings, findings_in_all = quality_findings(tables["quality"], config)
     break_aways, break_aways_in_all = break_away_rows(tables["dynamic_fit"], config)
+    added = [effect for effect in closure["effects"] if not effect["candidate"]]
     return {
         "of_properties": False,
         "closure": closure,
@@ -249,15 +240,11 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
         "undecided": undecided(closure, config),
         "facts": campaign_facts(tables, config),
         "errors": error_rows(closure, config),
-        "cards": effect_cards(closure, tables["shapes"], config),
-        "scatter": scatter_rows(closure),
-        "sensitivity": sensitivity_rows(closure, config),
-        "refused": refused_rows(closure, config),
+        "effects": by_gain(closure["effects"]),
         "left": left_over(closure, config),
-        "next_runs": next_runs(closure, config),
         "tests": channel_tests(tables["levels"], tables["channels"]["channel"].dropna(), config),
         "more_channels": max(0, tables["channels"]["channel"].nunique() - MOST_CHANNELS),
-        "references": references(closure, config) if "steady_fit_before" in tables else [],
+        "references": added if "steady_fit_before" in tables else [],
         "break_aways": break_aways,
         "break_aways_in_all": break_aways_in_all,
         "speed_unit": config.units.unit("speed"),

@@ -344,27 +344,20 @@ def test_empty_tables_may_lack_columns(small, unsaved):
     assert "effect_shapes" not in build_report(*made.arguments).figures
 
 
-def test_the_page_states_the_sensitivity_and_the_effects_not_accepted():
-    from sealfit.report.loop_tables import refused_rows, sensitivity_rows
-
+def test_the_page_states_the_sensitivity_and_the_effects_not_accepted(small, unsaved):
     seen = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.123, "smallest_pct": 0.31}
     seen["files_needed"] = 44
-    unseen = {
-        "variable": "speed_mm_s",
-        "level": "run",
-        "smallest_N": None,
-        "smallest_pct": None,
-        "files_needed": None,
-    }
-    rows = sensitivity_rows({"sensitivity": [seen, unseen]}, Config())
-    assert [row["smallest"].replace("\u00a0", " ") for row in rows] == ["0.12 N", "none"]
-    assert [row["level"] for row in rows] == ["along strokes", "between runs"]
-    assert [row["files"] for row in rows] == ["44", "–"]
+    unseen = dict.fromkeys(("smallest_N", "smallest_pct", "files_needed"))
+    unseen |= {"variable": "speed_mm_s", "level": "run"}
     label = "ripple along displacement_mm, factor on mu_s"
     refused = {"label": label, "acts_on": "mu_s", "channels": ["displacement_mm"], "p_value": 1e-6}
-    refused = {**refused, "reason": "it is too small"}
-    (row,) = refused_rows({"refused": [refused], "sensitivity": []}, Config())
-    assert row["label"] == "ripple along displacement, acting on <i>μ</i><sub>s</sub>"
+    refused = {**refused, "reason": "it is too small", "weak": False}
+    sensitivity = [{**one, "cannot_tell": False} for one in (seen, unseen)]
+    closure = {**small.closure, "sensitivity": sensitivity, "refused": [refused]}
+    text = Page(build_report(small.tables, closure, small.provenance, small.config).html).text
+    assert "displacement (mm) along strokes 0.12 N 0.31 % 44" in text
+    assert "sliding speed (mm/s) between runs none – –" in text
+    assert "ripple along displacement, acting on μ s (p < 0.001): it is too small." in text
 
 
 def test_an_earlier_report_is_no_step_of_this_one():

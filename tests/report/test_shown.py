@@ -9,7 +9,7 @@ from sealfit.report import page
 from sealfit.report.drawing import draw
 from sealfit.report.figures.aging import aging
 from sealfit.report.figures.speed import force_speed
-from sealfit.report.loop_tables import effect_cards
+from sealfit.report.loop_tables import curve_of
 from sealfit.report.page import build_report
 from sealfit.report.parameter_tables import break_away_rows, parameter_tables
 from sealfit.report.style import panels_of
@@ -151,10 +151,8 @@ def test_a_free_shape_is_a_table_of_its_curve_and_has_no_coefficients():
         "form": "natural cubic spline", "level": "trace", "reference": "mean", "p_value": 0.001,
         "heldout_gain_N": 0.1, "heldout_rmse_N": 0.4, "alternatives": [],
     }  # fmt: skip
-    (card,) = effect_cards({"effects": [free]}, shapes, Config())
-    assert card["parameters"] == []
-    assert card["curve"]["value"] == "change of <i>μ</i> (%)"
-    assert [row[0] for row in card["curve"]["rows"]] == ["0", "10", "20", "30", "40", "50", "60"]
-    assert card["curve"]["rows"][0][1:] == ("10.0", "[9.0, 11.0]")
-    (candidate,) = effect_cards({"effects": [free | {"candidate": True}]}, shapes.iloc[:0], Config())
-    assert candidate["curve"] is None
+    curve = curve_of(free, shapes, {"effects": [free]}, Config())
+    assert curve["value"] == "change of <i>μ</i> (%)"
+    assert [row[0] for row in curve["rows"]] == ["0", "10", "20", "30", "40", "50", "60"]
+    assert curve["rows"][0][1:] == ("10.0", "[9.0, 11.0]")
+    assert curve_of(free, shapes.iloc[:0], {"effects": [free]}, Config()) is None
