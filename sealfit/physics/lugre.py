@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import accumulate
 
 import numpy as np
@@ -27,11 +26,6 @@ from sealfit.errors import ParameterError
 # Gauss-Legendre nodes and weights. 64 are exact to rounding for all four distributions, up to a decay of
 # about 50.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
-
-# Relative tolerance of the solver, and its absolute tolerance as a multiple of the largest deflection.
-RTOL, ATOL = 1e-9, 1e-12
-# Smallest number of steps of the solver. It has to resolve a reversal of the speed between two output times.
-LEAST_STEPS = 200
 
 
 # ---------------------------------------------------------------- pressure
@@ -342,15 +336,14 @@ class LuGre:
 def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_mm: float = 0.0) -> Bristles:
     """Return the friction force of the dynamic LuGre model along a history of the speed (Eqs. 1 to 7), in N.
 
-    An array of speeds is constant between times, and each step is exact. A function of the time is integrated
-    by a stiff solver (LSODA).
+    The speed is constant between times, and each step is exact.
 
     Parameters
     ----------
     time_s : ndarray, shape (n,)
         Rising times in s.
-    speed_mm_s : ndarray, shape (n,), or callable
-        Signed speed in mm/s: value k from time k - 1 to time k. Or a function of the time.
+    speed_mm_s : ndarray, shape (n,)
+        Signed speed in mm/s: value k from time k - 1 to time k.
     load_N : float
         Normal load in N.
     model : LuGre
@@ -395,19 +388,14 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
             f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative."
         )
     share = model.elements(load_N)[0]
-    limit = partial(model.limit_mm, load_N=load_N)
-    start = np.full(share.size, float(deflection_mm))
-    if callable(speed_mm_s):
-        speed = np.array([float(speed_mm_s(t)) for t in time])
-        z = _solved(time, speed_mm_s, limit, start)
-    else:
-        speed = np.asarray(speed_mm_s, float)
-        if speed.shape != time.shape:
-            raise ParameterError(
-                f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time."
-            )
-        z = _stepped(time, speed, limit(speed), start)
-    rate = speed[:, None] - np.abs(speed)[:, None] * z / limit(speed)
+    speed = np.asarray(speed_mm_s, float)
+    if speed.shape != time.shape:
+        raise ParameterError(
+            f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time."
+        )
+    limit = model.limit_mm(speed, load_N)
+    z = _stepped(time, speed, limit, np.full(share.size, float(deflection_mm)))
+    rate = speed[:, None] - np.abs(speed)[:, None] * z / limit
     force = (model.sigma_0 * z + model.sigma_1 * rate) @ share + model.sigma_2 * speed
     return Bristles(force, z @ share, force * speed - model.sigma_0 * (z * rate) @ share)
 
@@ -425,26 +413,3 @@ def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.n
         )
         paths.append(list(steps)[1:])
     return np.array(paths).T
-
-
-def _solved(time: np.ndarray, speed: Callable, limit: Callable, start: np.ndarray) -> np.ndarray:
-    """Return every element's deflection at the times, shape (n, elements), by a stiff solver."""
-    from scipy.integrate import solve_ivp  # a slow import that only this function needs
-
-    def rate(t: float, z: np.ndarray) -> np.ndarray:
-        v = float(speed(t))
-        return v - abs(v) * z / limit(v)
-
-    if time.size == 1:
-        return start[None, :]
-    scale = max(float(np.max(limit(0.0))), float(np.max(np.abs(start))))
-    span = (float(time[0]), float(time[-1]))
-    found = solve_ivp(
-        rate, span, start, method="LSODA", t_eval=time, rtol=RTOL, atol=ATOL * scale, lband=0, uband=0,
-        max_step=(span[1] - span[0]) / LEAST_STEPS,
-    )  # fmt: skip
-    if not found.success:
-        raise ParameterError(
-            f"the speed cannot be integrated: {found.message}", fix="Give it without jumps, or as an array."
-        )
-    return found.y.T

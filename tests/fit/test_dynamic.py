@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas.testing as pdt
 import pytest
+from bristle_helpers import integrated
 
 from sealfit.config import load_config
 from sealfit.fit import whole_steady_fit
@@ -16,7 +17,7 @@ from sealfit.fit.dynamic.starts import starts_of, strokes_along
 from sealfit.fit.steady import fit_conditions
 from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.physics import LuGre, lugre_force
+from sealfit.physics import LuGre
 from sealfit.pipeline import STEPS, run
 from sealfit.simulation import Spec, simulate
 from sealfit.store import Store
@@ -41,7 +42,7 @@ def start(file, speed, *, ramp=0.1, gain=1.0, deflection=0.0, rows=80, noise=0.0
         return speed * min(max(t / ramp, 0.0), 1.0)
 
     model = {**MODEL, **other}
-    force = gain * lugre_force(time, along, LOAD, LuGre(**model), deflection_mm=deflection).force_N
+    force = gain * integrated(time, along, LOAD, LuGre(**model), deflection=deflection)[0]
     share = np.clip(time / ramp, 0, 1)
     distance = speed * np.where(time < ramp, 0.5 * ramp * share**2, time - 0.5 * ramp)
     force = force + noise * np.random.default_rng([seed, file]).standard_normal(rows)

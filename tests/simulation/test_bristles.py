@@ -1,10 +1,11 @@
 import numpy as np
 import numpy.testing as npt
 import pytest
+from bristle_helpers import integrated
 from simulation_helpers import ONE_CONDITION
 
 from sealfit.errors import ConfigError
-from sealfit.physics import LuGre, lugre_force
+from sealfit.physics import LuGre
 from sealfit.simulation import Spec, simulate
 
 MODEL = {"mu_s": 0.8, "mu_c": 0.5, "v_s": 5.0, "sigma_0": 60.0, "sigma_1": 0.3, "sigma_2": 0.05}
@@ -31,7 +32,7 @@ def test_traces_follow_the_dynamic_model_through_the_ramps(campaign, speed, desi
         size = np.interp(since, [0.0, ramp, ramp + cruise, 2 * ramp + cruise], [0.0, speed, speed, 0.0])
         return size * (-1.0) ** number
 
-    exact = lugre_force(t, along, 49.03, LuGre(**MODEL)).force_N
+    exact, _ = integrated(t, along, 49.03, LuGre(**MODEL))
     npt.assert_allclose(force, exact, atol=0.002 * exact.max())
 
 
