@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from sealfit.config import Config
+from sealfit.report import style
 from sealfit.report.drawing import explain
 from sealfit.report.notation import (
     ConditionNames,
@@ -27,32 +28,14 @@ from sealfit.report.notation import (
     symbol_math,
     symbol_plain,
 )
-from sealfit.report.style import (
-    AFTER,
-    BLACK,
-    CYCLE,
-    FLOOR,
-    MOST_KEYS,
-    QUIET,
-    SKY,
-    Key,
-    Panel,
-    Plot,
-    draw_band,
-    evenly,
-    padded,
-    panels_of,
-    round_ticks,
-    shades,
-    spread,
-)
+from sealfit.report.style import Key, Panel, Plot
 from sealfit.units import Units
 
 TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
 MOST_TRACES = 6
 MOST_REPEATS = 6  # of a run that are drawn behind their mean, thinner than it
 REPEAT_BUCKETS = 120
-UNCORRECTED = Key("before, without the effects", FLOOR, "dotted")
+UNCORRECTED = Key("before, without the effects", style.FLOOR, "dotted")
 
 
 # ---------------------------------------------------------------- aging
@@ -66,9 +49,9 @@ def draw_aging(
     """
     quantities = list(dict.fromkeys([*curves["quantity"], *points["quantity"]]))
     for k, quantity in enumerate(quantities):
-        colour, marker = CYCLE[k % len(CYCLE)], "os^Dv"[k % 5]
+        colour, marker = style.CYCLE[k % len(style.CYCLE)], "os^Dv"[k % 5]
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
-        draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, alpha=0.18)
+        style.draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, alpha=0.18)
         ax.plot(curve["aging_days"], curve["value"], color=colour)
         if before is not None:
             earlier = before[before["quantity"] == quantity].sort_values("aging_days")
@@ -80,7 +63,7 @@ def draw_aging(
             here["aging_days"], here["value"], spread, color=colour, fmt=marker, elinewidth=0.8, capsize=1.5
         )
         explain(markers, [_of_point(row) for row in here.to_dict("records")])
-    ax.xaxis.set_major_locator(round_ticks(integer=True))
+    ax.xaxis.set_major_locator(style.round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
     if "mu_s" in quantities or "mu_c" in quantities:
         ax.set_ylabel("friction coefficient")
@@ -107,7 +90,7 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     fits = property_means(values) if of_property else tables["steady_fit"]
     points = aging_points(fits, quantities, names)
     series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural(names(s)))
-    series, note = panels_of(series, "series")
+    series, note = style.panels_of(series, "series")
     if note:
         note += " steady_fit.parquet and aging_curves.parquet have all."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
@@ -117,7 +100,7 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"], *ends]
     ).dropna()
     out = 0.0 if of_property else 0.002  # share of a campaign's values that may lie outside
-    span = padded(shown.quantile(out), shown.quantile(1 - out))
+    span = style.padded(shown.quantile(out), shown.quantile(1 - out))
     right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
     limits = {"xlim": (-0.03 * right, 1.03 * right), "ylim": span}
     unaged = points["series"].map(is_unaged).astype(bool)
@@ -131,9 +114,9 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         alt = f"Aging, {names(name)}: {joined(symbols)} over {number(right)} d; "
         alt += f"{symbols[0]} starts at {number(first)}."
         panels.append(Panel(short(names(name)), alt, draw, limits=limits))
-    legend = [Key(q, CYCLE[k % len(CYCLE)], symbol=True) for k, q in enumerate(quantities)]
+    legend = [Key(q, style.CYCLE[k % len(style.CYCLE)], symbol=True) for k, q in enumerate(quantities)]
     of_point = "mean of a condition, 95 %" if of_property else "fit per condition, 95 %"
-    legend += [Key(of_point, FLOOR, "point"), Key("aging law, 95 % band", FLOOR, "band")]
+    legend += [Key(of_point, style.FLOOR, "point"), Key("aging law, 95 % band", style.FLOOR, "band")]
     legend += [UNCORRECTED] if len(before) else []
     return Plot("aging", "Aging", tuple(panels), tuple(legend), note)
 
@@ -176,17 +159,17 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units, repeats: pd.DataFram
     if repeats is not None:
         for _, stroke in repeats.groupby(["file", "stroke"]):
             one = envelope(along_motion(stroke), REPEAT_BUCKETS)
-            ax.plot(one["displacement_mm"], one["force_N"], color=QUIET, linewidth=0.5, zorder=1)
+            ax.plot(one["displacement_mm"], one["force_N"], color=style.QUIET, linewidth=0.5, zorder=1)
     thin = envelope(along_motion(trace))
     x, force, error = thin["displacement_mm"], thin["force_N"], thin["force_se_N"].fillna(0)
-    draw_band(ax, x, force - error, force + error, AFTER, alpha=0.25)
+    style.draw_band(ax, x, force - error, force + error, style.AFTER, alpha=0.25)
     whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
-    ax.plot(x, force, color=SKY, linewidth=0.8)
-    ax.plot(x, force.where(whole), color=AFTER, linewidth=0.9)
+    ax.plot(x, force, color=style.SKY, linewidth=0.8)
+    ax.plot(x, force.where(whole), color=style.AFTER, linewidth=0.9)
     trace = trace.sort_values("displacement_mm")
     steady = trace["steady"].astype(bool)
     ax.fill_between(
-        trace["displacement_mm"], 0, 1, where=steady, transform=ax.get_xaxis_transform(), color=QUIET,
+        trace["displacement_mm"], 0, 1, where=steady, transform=ax.get_xaxis_transform(), color=style.QUIET,
         alpha=0.12, linewidth=0, zorder=0,
     )  # fmt: skip
     ax.set_xlabel(plain(units.label("displacement_mm")))
@@ -220,7 +203,7 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     single = tables["traces"]
     ends = along_motion(single)["force_N"].quantile([0.002, 0.998]) if len(single) else None  # but spikes
     shown = pd.concat([along_motion(traces)["force_N"], ends])
-    span = padded(shown.min(), shown.max())
+    span = style.padded(shown.min(), shown.max())
     panels = []
     for run in chosen.itertuples():
         trace = traces[traces["run_id"] == run.run_id]
@@ -232,11 +215,11 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         own = single[single["run_id"] == run.run_id] if len(single) else single
         draw = partial(draw_trace, trace=trace, units=units, repeats=own)
         panels.append(Panel(short(title, 40), alt, draw, limits={"ylim": span}))
-    legend = [Key("mean of all repeats", AFTER)]
+    legend = [Key("mean of all repeats", style.AFTER)]
     if (traces["n"] < traces.groupby("run_id")["n"].transform("max")).any():
-        legend.append(Key("mean of fewer repeats", SKY))
-    legend += [Key(f"single repeats, up to {MOST_REPEATS}", QUIET)] if len(single) else []
-    legend += [Key("± standard error", AFTER, "band"), Key("steady window", QUIET, "band")]
+        legend.append(Key("mean of fewer repeats", style.SKY))
+    legend += [Key(f"single repeats, up to {MOST_REPEATS}", style.QUIET)] if len(single) else []
+    legend += [Key("± standard error", style.AFTER, "band"), Key("steady window", style.QUIET, "band")]
     return Plot("traces_mean", "Averaged traces", tuple(panels), tuple(legend))
 
 
@@ -254,10 +237,10 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
         return known
     groups = [g.sort_values("speed") for _, g in known.groupby("condition", sort=False)]
     picked = []
-    for k, group in enumerate(groups[place] for place in evenly(len(groups), MOST_TRACES)):
+    for k, group in enumerate(groups[place] for place in style.evenly(len(groups), MOST_TRACES)):
         left = group[~group["run_id"].isin([row["run_id"] for row in picked])]
         if len(left):
-            picked.append(left.iloc[evenly(len(left), MOST_TRACES)[k]])
+            picked.append(left.iloc[style.evenly(len(left), MOST_TRACES)[k]])
     return pd.DataFrame(picked)
 
 
@@ -287,17 +270,17 @@ def draw_master_curve(
     aged = values[values["scaled_days"] > 0]
     ax.set_xscale("symlog", linthresh=float(aged["scaled_days"].min()), linscale=0.7)
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], FLOOR)
-    ax.plot(law["scaled_days"], law["value"], color=FLOOR)
+    style.draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], style.FLOOR)
+    ax.plot(law["scaled_days"], law["value"], color=style.FLOOR)
     if before is not None:
         earlier = before[before["kind"] == "law"].sort_values("scaled_days")
-        ax.plot(earlier["scaled_days"], earlier["value"], color=FLOOR, linestyle=":")
+        ax.plot(earlier["scaled_days"], earlier["value"], color=style.FLOOR, linestyle=":")
     fresh = values[values["scaled_days"] == 0]
-    ax.plot(fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=BLACK, clip_on=False)
+    ax.plot(fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=style.BLACK, clip_on=False)
     percents = np.sort(aged["compression_ratio_pct"].dropna().unique())
     for (celsius, percent), own in aged.groupby(["temperature_C", "compression_ratio_pct"], dropna=False):
         rank = int(np.searchsorted(percents, percent)) if np.isfinite(percent) else 0
-        marker, colour = MARKERS[rank % len(MARKERS)], colours.get(celsius, BLACK)
+        marker, colour = MARKERS[rank % len(MARKERS)], colours.get(celsius, style.BLACK)
         (points,) = ax.plot(
             own["scaled_days"], own["value"], linestyle="", marker=marker, markersize=4, color=colour
         )
@@ -315,24 +298,25 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     if table.empty:
         return None
     celsius = np.sort(table["temperature_C"].dropna().unique())
-    colours = dict(zip(celsius.tolist(), shades(len(celsius)), strict=True))
+    colours = dict(zip(celsius.tolist(), style.shades(len(celsius)), strict=True))
     several = table["rubber"].nunique() > 1
     panels = []
-    groups, note = panels_of(list(table.groupby(["rubber", "quantity"], sort=False)), "curves")
+    groups, note = style.panels_of(list(table.groupby(["rubber", "quantity"], sort=False)), "curves")
     before = tables.get("master_curve_before", table.iloc[:0])
     for (rubber, quantity), rows in groups:
         earlier = before[(before["rubber"] == rubber) & (before["quantity"] == quantity)]
         shown = pd.concat([rows["value"], earlier.loc[earlier["kind"] == "law", "value"]])
-        limits = {"ylim": padded(shown.min(), shown.max())}
+        limits = {"ylim": style.padded(shown.min(), shown.max())}
         draw = partial(draw_master_curve, rows=rows, colours=colours, units=config.units, before=earlier)
         words = QUANTITIES.get(quantity, symbol_plain(quantity))
         title = f"{rubber}, {words}" if several else words
         alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
         panels.append(Panel(short(capital(title), 40), alt, draw, limits=limits))
     legend = [
-        Key(f"{given(t)} °C", colour, "point") for t, colour in spread(list(colours.items()), MOST_KEYS)
+        Key(f"{given(t)} °C", colour, "point")
+        for t, colour in style.spread(list(colours.items()), style.MOST_KEYS)
     ]
-    legend += [Key("unaged", BLACK, "point"), Key("law, 95 % band", FLOOR, "band")]
+    legend += [Key("unaged", style.BLACK, "point"), Key("law, 95 % band", style.FLOOR, "band")]
     legend += [UNCORRECTED] if len(before) else []
     note += " master_curve.parquet has all." if note else ""
     return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
+from sealfit.report import style
 from sealfit.report.drawing import explain
 from sealfit.report.figures.speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.notation import (
@@ -28,21 +29,7 @@ from sealfit.report.notation import (
     symbol_plain,
     together,
 )
-from sealfit.report.style import (
-    AFTER,
-    BEFORE,
-    FLOOR,
-    MOST_MARKS,
-    QUIET,
-    Key,
-    Panel,
-    Plot,
-    category_ticks,
-    draw_band,
-    is_logarithmic,
-    log_axis,
-    value_ticks,
-)
+from sealfit.report.style import Key, Panel, Plot
 from sealfit.report.summary import by_gain
 from sealfit.tables import CALENDAR
 from sealfit.units import Units
@@ -53,7 +40,7 @@ MOST_CHANNELS = 18
 MANY_CATEGORIES = 24
 LOG_SPAN = 50.0
 Z95 = 1.959964
-STAGES = (Key("before", BEFORE, "open"), Key("after", AFTER, "point"))
+STAGES = (Key("before", style.BEFORE, "open"), Key("after", style.AFTER, "point"))
 
 
 # ---------------------------------------------------------------- before and after
@@ -69,14 +56,14 @@ def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
         before, after = closure["before"][key], closure["after"][key]
         y = len(rows) - 1 - k
         if known(after) and after != before:
-            ax.plot([before, after], [y, y], color=QUIET, linewidth=1.2, zorder=1)
-            ax.plot(after, y, "o", color=AFTER, markersize=6.5, zorder=3)
-            ax.annotate(texts[2 * k + 1], (after, y), color=AFTER, bbox=box, **above)
-        ax.plot(before, y, "o", color=BEFORE, markersize=6.5, zorder=2)
-        ax.annotate(texts[2 * k], (before, y), color=BEFORE, bbox=box, **above)
+            ax.plot([before, after], [y, y], color=style.QUIET, linewidth=1.2, zorder=1)
+            ax.plot(after, y, "o", color=style.AFTER, markersize=6.5, zorder=3)
+            ax.annotate(texts[2 * k + 1], (after, y), color=style.AFTER, bbox=box, **above)
+        ax.plot(before, y, "o", color=style.BEFORE, markersize=6.5, zorder=2)
+        ax.annotate(texts[2 * k], (before, y), color=style.BEFORE, bbox=box, **above)
     floor = closure["noise_floor_N"]
     if known(floor):
-        ax.axvline(floor, color=FLOOR, linestyle="--", linewidth=1.0, zorder=0)
+        ax.axvline(floor, color=style.FLOOR, linestyle="--", linewidth=1.0, zorder=0)
         largest = max(largest, floor)
     ax.set_yticks(range(len(rows)), [label for _, label in reversed(rows)])
     ax.set_ylim(-0.6, len(rows) - 0.35)
@@ -90,11 +77,11 @@ def draw_histogram(ax: Axes, before: np.ndarray, after: np.ndarray, units: Units
     both = np.concatenate([before, after])
     edge = float(np.max(np.abs(both))) or 1.0
     edges = np.linspace(-edge, edge, 2 * int(np.clip(np.sqrt(len(before)), 4, 15)) + 2)
-    ax.hist(before, edges, histtype="stepfilled", color=BEFORE, alpha=0.25)
-    ax.hist(before, edges, histtype="step", color=BEFORE, linewidth=1.2)
+    ax.hist(before, edges, histtype="stepfilled", color=style.BEFORE, alpha=0.25)
+    ax.hist(before, edges, histtype="step", color=style.BEFORE, linewidth=1.2)
     if not np.array_equal(before, after):
-        ax.hist(after, edges, histtype="step", color=AFTER, linewidth=1.7)
-    ax.axvline(0.0, color=QUIET, linewidth=0.8, zorder=0)
+        ax.hist(after, edges, histtype="step", color=style.AFTER, linewidth=1.7)
+    ax.axvline(0.0, color=style.QUIET, linewidth=0.8, zorder=0)
     ax.yaxis.get_major_locator().set_params(integer=True)
     kind = "held-out error" if held_out else "error"
     ax.set_xlabel(f"{kind} of the run mean ({plain(units.unit('force'))})")
@@ -129,11 +116,11 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: C
             alt += f"{number(float(np.std(a)))} before, {number(float(np.std(b)))} {unit} after."
             draw = partial(draw_histogram, before=a, after=b, units=config.units, held_out=held)
             panels.append(Panel("Errors of run means", alt, draw))
-    legend = [Key("before", BEFORE, "bar"), Key("after", AFTER, "bar")]
+    legend = [Key("before", style.BEFORE, "bar"), Key("after", style.AFTER, "bar")]
     if closure["before"] == closure["after"]:
-        legend = [Key("declared model", BEFORE, "bar")]
+        legend = [Key("declared model", style.BEFORE, "bar")]
     if known(floor):
-        legend.append(Key("noise floor", FLOOR, "dashed"))
+        legend.append(Key("noise floor", style.FLOOR, "dashed"))
     return Plot("before_after", "Errors before and after", tuple(panels), tuple(legend))
 
 
@@ -209,7 +196,7 @@ def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
     largest = max([value**2 for value in sd.values() if known(value)], default=1.0) or 1.0
     single = not any(stage == "after" for stage in whole["stage"])
     for k, name in enumerate(names):
-        for stage, colour, shift in (("before", BEFORE, 0.19), ("after", AFTER, -0.19)):
+        for stage, colour, shift in (("before", style.BEFORE, 0.19), ("after", style.AFTER, -0.19)):
             value = sd.get((stage, name))
             if not known(value):
                 continue
@@ -236,7 +223,7 @@ def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot 
     height = max(0.82 + 0.42 * whole["level"].nunique(), 1.6)
     draw = partial(draw_levels, levels=levels, units=config.units)
     panel = Panel(f"Variance by level (labels: sd in {unit})", alt, draw, height, left=0.86)
-    legend = (Key("before", BEFORE, "bar"), Key("after", AFTER, "bar"))
+    legend = (Key("before", style.BEFORE, "bar"), Key("after", style.AFTER, "bar"))
     return Plot("variance_levels", "Residual variance by level", (panel,), legend)
 
 
@@ -248,16 +235,19 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     """
     numeric = rows["x"].notna().all() and channel != "direction"
     x = rows["x"].to_numpy(float) if numeric else np.arange(len(rows), dtype=float)
-    log = numeric and channel not in CALENDAR and is_logarithmic(x, LOG_SPAN)
+    log = numeric and channel not in CALENDAR and style.is_logarithmic(x, LOG_SPAN)
     if numeric and channel in ("speed_mm_s", "speed_set_mm_s"):  # as force against speed is drawn
         log = bool(x.min() > 0 and x.max() / x.min() > SPEED_SPAN)
     # The two stages are drawn side by side, so that neither hides the other.
     apart = 0.008 * (np.ptp(np.log(x)) if log else np.ptp(x)) if numeric else 0.09
-    ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
+    ax.axhline(0.0, color=style.QUIET, linewidth=0.8, zorder=1)
     size = {"markersize": 3.6, "markeredgewidth": 0.9, "elinewidth": 0.9, "capsize": 1.8}
     if not numeric and len(rows) > MANY_CATEGORIES:  # drawn finer, or they are one blot
         size = {"markersize": 1.8, "markeredgewidth": 0.6, "elinewidth": 0.4, "capsize": 0.0}
-    for stage, colour, marker, shift in (("before", BEFORE, "o", -apart), ("after", AFTER, "s", apart)):
+    for stage, colour, marker, shift in (
+        ("before", style.BEFORE, "o", -apart),
+        ("after", style.AFTER, "s", apart),
+    ):
         spread = Z95 * rows[f"{stage}_se_N"].fillna(0.0).to_numpy(float)
         places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
         points, *_ = ax.errorbar(
@@ -270,10 +260,10 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
             linestyle="-" if numeric else "",
             linewidth=0.8,
             zorder=2 if stage == "before" else 3,
-            rasterized=len(rows) > MOST_MARKS,
+            rasterized=len(rows) > style.MOST_MARKS,
             **size,
         )
-        if len(rows) <= MOST_MARKS:
+        if len(rows) <= style.MOST_MARKS:
             names = [number(value, 4) for value in x] if numeric else categories(rows, channel)
             texts = (f"{number(m, 3)} ± {number(s, 2)}" for m, s in zip(mean, spread, strict=True))
             place, unit = channel_label(channel, units), units.unit("force")
@@ -281,11 +271,11 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
             most = "largest in run"  # a click on the point opens it
             explain(points, [f"{stage}: {v} {unit}\n{place}: {name}\n{most}\n{run}" for v, name, run in said])
     if log:
-        log_axis(ax)
+        style.log_axis(ax)
     elif numeric:
-        value_ticks(ax, x)
+        style.value_ticks(ax, x)
     else:
-        category_ticks(ax, categories(rows, channel))
+        style.category_ticks(ax, categories(rows, channel))
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
     ax.set_ylabel(f"residual ({plain(units.unit('force'))})")
 
@@ -366,28 +356,28 @@ def draw_shape(
     if channel == "direction" and rows["x"].notna().all():
         rows = rows[rows["x"].abs() == 1.0]  # there is nothing between forward and backward
     value, lo, hi, free = (scale * rows[name].to_numpy(float) for name in ("value", "lo95", "hi95", "free"))
-    ax.axhline(0.0, color=QUIET, linewidth=0.8, zorder=1)
+    ax.axhline(0.0, color=style.QUIET, linewidth=0.8, zorder=1)
     if numeric:
         x = rows["x"].to_numpy(float)
-        draw_band(ax, x, lo, hi, AFTER)
-        ax.plot(x, free, color=FLOOR, linestyle="--", linewidth=1.1)
-        ax.plot(x, value, color=AFTER)
+        style.draw_band(ax, x, lo, hi, style.AFTER)
+        ax.plot(x, free, color=style.FLOOR, linestyle="--", linewidth=1.1)
+        ax.plot(x, value, color=style.AFTER)
         ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
-        if channel not in CALENDAR and is_logarithmic(x, LOG_SPAN):
-            log_axis(ax)
+        if channel not in CALENDAR and style.is_logarithmic(x, LOG_SPAN):
+            style.log_axis(ax)
         elif points is not None and len(points):
-            value_ticks(ax, points["x"].to_numpy(float))
+            style.value_ticks(ax, points["x"].to_numpy(float))
     else:
         x = np.arange(len(rows))
         spread = np.nan_to_num(np.abs(np.stack([value - lo, hi - value])))
-        ax.errorbar(x, value, spread, color=AFTER, fmt="o", elinewidth=1.4, capsize=2.0)
-        ax.plot(x, free, color=FLOOR, marker="_", linestyle="", markersize=12)
-        category_ticks(ax, categories(rows, channel))
+        ax.errorbar(x, value, spread, color=style.AFTER, fmt="o", elinewidth=1.4, capsize=2.0)
+        ax.plot(x, free, color=style.FLOOR, marker="_", linestyle="", markersize=12)
+        style.category_ticks(ax, categories(rows, channel))
     if points is not None and len(points):
         places = points["x"] if numeric else np.arange(len(points)) + 0.15
         ax.errorbar(
-            places, scale * points["value"], Z95 * scale * points["se"], color=FLOOR, fmt="o", markersize=2.6,
-            elinewidth=0.8, capsize=1.5, zorder=1.5,
+            places, scale * points["value"], Z95 * scale * points["se"], color=style.FLOOR, fmt="o",
+            markersize=2.6, elinewidth=0.8, capsize=1.5, zorder=1.5,
         )  # fmt: skip
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
     ax.set_ylabel(shape_label(rows, effect, units, symbol_math))
@@ -428,9 +418,9 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: 
         alt += f"{shape_label(rows, effect, config.units)} from {number(scale * rows['value'].min())} to "
         alt += f"{number(scale * rows['value'].max())}."
         panels.append(Panel(short(capital(words), 40), alt, draw, effect=int(index)))
-    legend = [Key("effect, 95 % band", AFTER)]
+    legend = [Key("effect, 95 % band", style.AFTER)]
     if shapes["free"].notna().any():
-        legend.append(Key("free shape", FLOOR, "dashed"))
+        legend.append(Key("free shape", style.FLOOR, "dashed"))
     if len(points):
-        legend.append(Key("partial residual: effect plus mean residual, 95 %", FLOOR, "point"))
+        legend.append(Key("partial residual: effect plus mean residual, 95 %", style.FLOOR, "point"))
     return Plot("effect_shapes", "Shapes of the effects", tuple(panels), tuple(legend))

@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
+from sealfit.report import style
 from sealfit.report.drawing import explain
 from sealfit.report.notation import (
     ConditionNames,
@@ -27,24 +28,7 @@ from sealfit.report.notation import (
     plain,
     short,
 )
-from sealfit.report.style import (
-    BLACK,
-    CYCLE,
-    FLOOR,
-    HEIGHT,
-    MOST_KEYS,
-    MOST_MARKS,
-    MOST_PANELS,
-    Key,
-    Panel,
-    Plot,
-    draw_band,
-    log_axis,
-    padded,
-    panels_of,
-    shades,
-    spread,
-)
+from sealfit.report.style import Key, Panel, Plot
 from sealfit.units import Units
 
 # ---------------------------------------------------------------- force against speed
@@ -75,11 +59,11 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
 
     With `log` the speed axis is logarithmic.
     """
-    dense = sum(len(line.points) for line in lines) > MOST_MARKS
+    dense = sum(len(line.points) for line in lines) > style.MOST_MARKS
     for line in lines:
         for curve in line.curves:
             speed = curve["speed"]
-            draw_band(ax, speed, curve["lo"], curve["hi"], line.colour)
+            style.draw_band(ax, speed, curve["lo"], curve["hi"], line.colour)
             if not curve["before"].equals(curve["after"]):
                 ax.plot(speed, curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
             backward = (curve["direction"] < 0).any()
@@ -101,7 +85,7 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
             if not dense:
                 explain(drawn, [_of_run(row, line.label, units) for row in points.to_dict("records")])
     if log:
-        log_axis(ax)
+        style.log_axis(ax)
     else:
         ax.set_xlim(left=0.0)
     ax.set_xlabel(plain(units.label("speed_mm_s")))
@@ -126,7 +110,7 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     rubber = tables["steady"].drop_duplicates("condition").set_index("condition")["rubber"].to_dict()
     unaged = [c for c in conditions if is_unaged(c)]
     groups = _groups([c for c in conditions if not is_unaged(c)], names, last) or {"": unaged}
-    titles, note = panels_of(list(groups), "panels")
+    titles, note = style.panels_of(list(groups), "panels")
     groups = {title: groups[title] for title in titles}
     drawn = {*unaged, *chain.from_iterable(groups.values())}
     if len(drawn) < len(conditions):
@@ -135,7 +119,7 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         note += "steady.parquet and curves.parquet have all."
     levels = sorted({names.parts(c).get(last, "") for c in drawn} - {""}, key=by_number)
     numeric = all(is_number(level) for level in levels)
-    colour = dict(zip(levels, shades(len(levels)) if numeric else cycle(CYCLE), strict=False))
+    colour = dict(zip(levels, style.shades(len(levels)) if numeric else cycle(style.CYCLE), strict=False))
     speeds = pd.concat([points["speed"], curves["speed"]])
     speeds = speeds[speeds > 0].astype(float)
     log = len(speeds) > 0 and speeds.max() / speeds.min() > LOG_SPAN
@@ -143,11 +127,11 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     force, sd = points["force"], points["sd"].fillna(0)
     shown = pd.concat([force + sd, force - sd, curves["after"], curves["before"]]).dropna()
     x_span = (speeds.min() / 1.2 if log else 0.0, speeds.max() * (1.2 if log else 1.06))
-    limits = {"xlim": x_span, "ylim": padded(shown.min(), shown.max())}
+    limits = {"xlim": x_span, "ylim": style.padded(shown.min(), shown.max())}
     # curves of a condition: directions and loads
     most = max(2, MOST_CURVES // max(len(group) for group in groups.values()))
     own_curves = {
-        c: tuple(spread([part for _, part in own.groupby(["direction", "load"], dropna=False)], most))
+        c: tuple(style.spread([part for _, part in own.groupby(["direction", "load"], dropna=False)], most))
         for c, own in curves[curves["condition"].isin(drawn)].groupby("condition")
     }
     own_points = dict(list(points.groupby("condition", sort=False)))
@@ -157,31 +141,31 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         lines = [
             Line(
                 names(c),
-                BLACK if is_unaged(c) else colour[names.parts(c)[last]],
+                style.BLACK if is_unaged(c) else colour[names.parts(c)[last]],
                 own_curves.get(c, ()),
                 own_points.get(c, points.iloc[:0]),
             )
             for c in [*shared, *group]
         ]
         draw = partial(draw_force_speed, lines=lines, units=config.units, log=log)
-        height = HEIGHT if len(groups) > 2 else TALL
+        height = style.HEIGHT if len(groups) > 2 else TALL
         panels.append(Panel(short(title), _force_alt(title, lines, config), draw, height, limits=limits))
-    legend = [Key(short(names(c)), BLACK) for c in spread(unaged, MOST_KEYS)]
-    for level in spread(levels, MOST_KEYS):
+    legend = [Key(short(names(c)), style.BLACK) for c in style.spread(unaged, style.MOST_KEYS)]
+    for level in style.spread(levels, style.MOST_KEYS):
         legend.append(Key(short(_level_label(last, level, names)), colour[level]))
     both = points["direction"].nunique() > 1
-    legend.append(Key("run means, forward" if both else "run means", FLOOR, "point"))
+    legend.append(Key("run means, forward" if both else "run means", style.FLOOR, "point"))
     if both:
-        legend.append(Key("run means, backward", FLOOR, "left"))
+        legend.append(Key("run means, backward", style.FLOOR, "left"))
     if len(curves):
-        legend.append(Key("model", FLOOR))
+        legend.append(Key("model", style.FLOOR))
     if curves["direction"].nunique() > 1:
-        legend.append(Key("model, backward", FLOOR, "dashed"))
+        legend.append(Key("model, backward", style.FLOOR, "dashed"))
     if curves["lo"].notna().any():
-        legend.append(Key("95 % band", FLOOR, "band"))
+        legend.append(Key("95 % band", style.FLOOR, "band"))
     gap = (curves["after"] - curves["before"]).abs().max()
     if gap > 1e-9 * max(curves["after"].abs().max(), 1e-300):
-        legend.append(Key("declared model", FLOOR, "dotted"))
+        legend.append(Key("declared model", style.FLOOR, "dotted"))
     quantity = config.units.quantity("force")
     title = f"{capital(quantity)} against {config.units.quantity('speed')}"
     return Plot("force_speed", title, tuple(panels), tuple(legend), note)
@@ -205,7 +189,7 @@ def run_points(steady: pd.DataFrame) -> pd.DataFrame:
     files = rows.groupby([*run, "file"], sort=False)[["speed", "force"]].mean().reset_index()
     found = files.groupby(run, sort=False).agg(
         speed=("speed", "mean"), force=("force", "mean"), sd=("force", "std"), n=("force", "size"),
-        files=("file", lambda own: ", ".join(spread(list(own), MOST_FILES))),
+        files=("file", lambda own: ", ".join(style.spread(list(own), MOST_FILES))),
     )  # fmt: skip
     return found.reset_index()
 
@@ -241,9 +225,9 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
     groups = {title: sorted(groups[title], key=lambda c: by_number(level[c])) for title in titles}
     if all(len(group) <= MOST_COLOURS for group in groups.values()):
         return groups
-    if len(conditions) > MOST_PANELS and all(map(is_number, level.values())):
+    if len(conditions) > style.MOST_PANELS and all(map(is_number, level.values())):
         # numbers have an order
-        return {title: spread(group, MOST_COLOURS) for title, group in groups.items()}
+        return {title: style.spread(group, MOST_COLOURS) for title, group in groups.items()}
     return {names(c): [c] for group in groups.values() for c in group}
 
 
@@ -271,10 +255,10 @@ def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], un
     """
     for (speed, direction), curve in curves.groupby(["speed_set_mm_s", "direction"], dropna=False, sort=True):
         curve = curve.sort_values("distance_mm")
-        colour = colours.get(speed, BLACK)
+        colour = colours.get(speed, style.BLACK)
         x, force, error = curve["distance_mm"], curve["force_N"], curve["force_se_N"].fillna(0.0)
         marker, face, line = ("o", colour, "-") if direction > 0 else ("<", "white", "--")
-        draw_band(ax, x, force - error, force + error, colour)
+        style.draw_band(ax, x, force - error, force + error, colour)
         ax.plot(
             x, force, linestyle="", marker=marker, markersize=2.6, color=colour, markerfacecolor=face,
             markeredgewidth=0.7,
@@ -312,12 +296,12 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     if curves.empty:
         return None
     names, units = ConditionNames.of(config), config.units
-    picked = spread(sorted(curves["condition"].unique(), key=names.place), MOST_START_PANELS)
-    speeds = spread(np.sort(curves["speed_set_mm_s"].dropna().unique()).tolist(), MOST_SPEEDS)
-    colours = dict(zip(speeds, shades(len(speeds)), strict=True))
+    picked = style.spread(sorted(curves["condition"].unique(), key=names.place), MOST_START_PANELS)
+    speeds = style.spread(np.sort(curves["speed_set_mm_s"].dropna().unique()).tolist(), MOST_SPEEDS)
+    colours = dict(zip(speeds, style.shades(len(speeds)), strict=True))
     shown = curves[curves["condition"].isin(picked)]
     shown = shown[shown["speed_set_mm_s"].isin(speeds) | shown["speed_set_mm_s"].isna()]
-    span = padded(min(0.0, shown["force_N"].min()), shown["force_N"].max())
+    span = style.padded(min(0.0, shown["force_N"].min()), shown["force_N"].max())
     panels = []
     for condition in picked:
         own = shown[shown["condition"] == condition]
@@ -329,9 +313,9 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         draw = partial(draw_starts, curves=own, colours=colours, units=units)
         panels.append(Panel(short(names(condition)), alt, draw, limits={"ylim": span}))
     legend = [Key(f"{given(speed)} {units.unit('speed')}", colour) for speed, colour in colours.items()]
-    legend.append(Key("mean of the strokes", FLOOR, "point"))
+    legend.append(Key("mean of the strokes", style.FLOOR, "point"))
     if (shown["direction"] < 0).any():
-        legend.append(Key("backward", FLOOR, "left"))
+        legend.append(Key("backward", style.FLOOR, "left"))
     if shown["model_N"].notna().any():
-        legend.append(Key("dynamic model", FLOOR, "line"))
+        legend.append(Key("dynamic model", style.FLOOR, "line"))
     return Plot("starts", "Pre-sliding", tuple(panels), tuple(legend))
