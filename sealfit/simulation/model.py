@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from sealfit.config import Strict
 from sealfit.effects import EFFECTS
@@ -109,6 +110,18 @@ def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) 
 EXPRESSION = "expression"
 
 
+def _safe(text: str) -> str:
+    """Return the text of a formula; ValueError, as pydantic wants it, if it is none."""
+    try:
+        parse(text)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+    return text
+
+
+Formula = Annotated[str, AfterValidator(_safe)]
+
+
 class EffectEntry(Strict):
     """One effect: of the catalogue, `smooth`, `levels` (one value per category), or a formula of channels."""
 
@@ -125,19 +138,12 @@ class EffectEntry(Strict):
         default_factory=dict, description="where it is zero or one, e.g. load_N_ref"
     )
     knots: tuple[float, ...] = Field((), description="of a smooth shape")
-    formula: str | None = Field(None, description="of an expression")
+    formula: Formula | None = Field(None, description="of an expression")
 
     @model_validator(mode="after")
     def _whole(self) -> EffectEntry:
         if (self.id == EXPRESSION) != (self.formula is not None):
             raise ValueError("id = 'expression' and formula belong together")
-        if self.formula is not None:
-            try:
-                unknown = sorted(parse(self.formula).names - {*self.channels, *self.parameters})
-            except ConfigError as error:
-                raise ValueError(str(error)) from None
-            if self.channels and unknown:
-                raise ValueError(f"formula reads {', '.join(unknown)}: list it in channels or parameters")
         if self.id == LEVELS and (len(self.channels) != 1 or not self.parameters):
             raise ValueError("levels needs one channel, and parameters = {category = value, ...}")
         return self
@@ -178,9 +184,8 @@ def _resolve(entry: EffectEntry, place: str) -> BoundEffect:
         acts_on, operation = entry.acts_on or "force", entry.operation or "add"
         return BoundEffect(entry.id, channels, acts_on, operation, form, dict(entry.parameters), shape)
     effect = _catalogued(entry, place)
-    channels = _bound_channels(entry, effect, place)
-    _check_parameters(entry, effect, place)
-    _check_reference(entry, effect, place)
+    channels = entry.channels or effect.reads
+    _check(entry, effect, channels, place)
     acts_on, operation = _target(entry, effect, place)
     values, reference = dict(entry.parameters), {k: np.float64(v) for k, v in entry.reference.items()}
 
@@ -206,33 +211,19 @@ def _catalogued(entry: EffectEntry, place: str) -> Effect:
     return EFFECTS[entry.id]
 
 
-def _check_reference(entry: EffectEntry, effect: Effect, place: str) -> None:
-    known = [f"{name}_ref" for name in effect.reads]
-    for name in entry.reference:
-        if name not in known:
-            raise ConfigError(f"{place}: has no reference '{name}'.", fix=f"It may have {', '.join(known)}.")
-
-
-def _bound_channels(entry: EffectEntry, effect: Effect, place: str) -> tuple[str, ...]:
-    if not entry.channels and CHANNEL in effect.reads:
-        raise ConfigError(f"{place}: reads a channel of your choice.", fix='Add channels = ["<column>"].')
-    channels = entry.channels or effect.reads
-    if len(channels) != len(effect.reads):
-        raise ConfigError(
-            f"{place}: reads {len(effect.reads)} channels, {len(channels)} given.",
-            fix=f"Give channels for {', '.join(effect.reads)}, in this order.",
-        )
-    return channels
-
-
-def _check_parameters(entry: EffectEntry, effect: Effect, place: str) -> None:
-    wanted = {p.name: p for p in effect.parameters}
-    for name in entry.parameters:
-        if name not in wanted:
-            raise ConfigError(
-                f"{place}: has no parameter '{name}'.", fix=f"Its parameters: {', '.join(wanted)}."
-            )
-    for name, parameter in wanted.items():
+def _check(entry: EffectEntry, effect: Effect, channels: tuple[str, ...], place: str) -> None:
+    """Raise ConfigError where channels, parameters or references are not those of the effect."""
+    reads = effect.reads
+    if CHANNEL in channels or len(channels) != len(reads):
+        fix = f"Give channels for {', '.join(reads)}, in this order; x is a channel of your choice."
+        raise ConfigError(f"{place}: reads {len(reads)} channels, {len(entry.channels)} given.", fix=fix)
+    parameters, references = {p.name: p for p in effect.parameters}, [f"{name}_ref" for name in reads]
+    given = (("parameter", entry.parameters, parameters), ("reference", entry.reference, references))
+    for what, names, known in given:
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"{place}: has no {what} '{name}'.", fix=f"Known: {', '.join(known)}.")
+    for name, parameter in parameters.items():
         if name not in entry.parameters:
             raise ConfigError(f"{place}: parameter '{name}' is missing.", fix=f"{name}: {parameter.meaning}.")
         low, high = parameter.bounds
