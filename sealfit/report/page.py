@@ -20,7 +20,6 @@ from sealfit.progress import timed
 from sealfit.report.drawing import Drawn, draw, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
-from sealfit.report.loop_tables import channel_tests, error_rows, vocabulary
 from sealfit.report.notation import (
     ConditionNames,
     channel_label,
@@ -33,7 +32,17 @@ from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter
 from sealfit.report.style import WIDTH, Plot
 from sealfit.report.summary import by_gain, of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
-from sealfit.report.words import left_over, undecided, verdict, with_left_channels, with_symbols, without_load
+from sealfit.report.words import (
+    channel_tests,
+    error_rows,
+    left_over,
+    undecided,
+    verdict,
+    vocabulary,
+    with_left_channels,
+    with_symbols,
+    without_load,
+)
 from sealfit.tables import FITTED, SCHEMAS
 
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all

@@ -9,10 +9,10 @@ from sealfit.report import page
 from sealfit.report.drawing import draw
 from sealfit.report.figures.aging import aging
 from sealfit.report.figures.speed import force_speed
-from sealfit.report.loop_tables import curve_of
 from sealfit.report.page import build_report
 from sealfit.report.parameter_tables import break_away_rows, parameter_tables
 from sealfit.report.style import panels_of
+from sealfit.report.words import curve_of
 
 TEMPERATURES = (20, 30, 40, 50, 60, 70, 80)
 
