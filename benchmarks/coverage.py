@@ -26,7 +26,7 @@ from steady_tables import MU_C, MU_S, steady_rows
 from sealfit.config import Config, load_config
 from sealfit.engine import one_thread
 from sealfit.fit.aging import fit_series
-from sealfit.fit.aging.all_series import aged_values, shared_levels
+from sealfit.fit.aging.all_series import aged_values
 from sealfit.fit.aging.joint_law import GAS_CONSTANT, JointLaw, fit_joint_law, fit_laws, rivals_of
 from sealfit.fit.aging.lifetime import DAYS_PER_YEAR, Goal, lifetime, over_laws, resampled, temperature_for
 from sealfit.fit.dynamic import fit_dynamic
@@ -145,9 +145,9 @@ def laws(settings: dict, seed: int) -> Iterator[Entry]:
     table = steady_rows(
         **{"seed": seed, "days": DAYS, "speeds": FEW, "ways": (1,), "noise": 0.005, "laws": true, **settings}
     )
-    levels = shared_levels(table, fit_conditions(table, Config()))
+    values = aged_values(table, fit_conditions(table, Config()))
     for quantity, law in LAWS.items():
-        aged = aged_values(levels, "rubber", quantity)
+        aged = values["rubber", quantity]
         fitted, chosen = fit_joint_law(aged, "log", "rate"), fit_laws(aged)
         for name, _, low, high, known in fitted.parameters():
             yield Entry(f"{quantity} {name}", (law | varied)[name], low, high, known)

@@ -120,7 +120,8 @@ def test_days_that_do_not_agree_on_the_stribeck_speed_keep_their_free_fits(campa
 def test_a_law_of_the_levels_is_the_law_of_the_forces(campaign, quantity):
     """Against one fit of both laws, v_s and sigma_2 of every series to all run means, by another solver."""
     table = campaign(noise=0.01, series=SERIES, laws=arrhenius(), days=DAYS, ways=(1,))
-    law = fit_joint_law(aged_values(levels(table), "rubber", quantity), "log", "rate")
+    aged = aged_values(table, fit_conditions(table, Config()))
+    law = fit_joint_law(aged["rubber", quantity], "log", "rate")
     runs = run_means(table).merge(
         table[["run_id", "temperature_C", "compression_ratio_pct", "aging_days"]].drop_duplicates(),
         on="run_id",

@@ -224,11 +224,23 @@ class _Curve:
 # Every law with its evidence as a table, compared with separate laws of the series.
 
 
-def aged_values(levels: Levels, rubber: str, quantity: str) -> Aged:
-    """Return the values of one quantity of a rubber at the conditions where the forces determine it."""
-    of = (levels.table["rubber"] == rubber) & (levels.table["quantity"] == quantity)
-    here = of.to_numpy()
-    return aged_of(levels.table[of], levels.covariance[here][:, here])
+# Values of a law for all series, by rubber and quantity.
+AgedValues = Mapping[tuple[str, str], Aged]
+
+
+def aged_values(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> AgedValues:
+    """Return mu_s and mu_c (F_s and F_c) of every rubber at the conditions where the forces determine them.
+
+    The arguments are those of `shared_levels`.
+    """
+    levels = shared_levels(steady, steady_fit)
+    rubber, quantity = levels.table["rubber"], levels.table["quantity"]
+    order, found = [*FORCES, *FORCES.values()], {}
+    for name in sorted(set(rubber)):
+        for one in sorted(set(quantity[rubber == name]), key=order.index):
+            here = ((rubber == name) & (quantity == one)).to_numpy()
+            found[name, one] = aged_of(levels.table[here], levels.covariance[here][:, here])
+    return found
 
 
 def aged_of(rows: pd.DataFrame, *scatter) -> Aged:
@@ -247,38 +259,27 @@ def joint_laws(
 
     They are fitted to the forces in table `steady`, with `steady_fit` and its condition columns.
     """
-    data = {}
-    if config.aging and "aging_days" in steady_fit.columns:
-        levels = shared_levels(steady, steady_fit)
-        for rubber, quantity in _quantities(levels):
-            unit = parameter_units(config.units, quantity in FORCES)["mu_s"]
-            data[rubber, quantity] = (aged_values(levels, rubber, quantity), unit)
-    return law_tables(data)
+    aging = config.aging and "aging_days" in steady_fit.columns
+    aged = aged_values(steady, steady_fit) if aging else {}
+    return law_tables(aged, {q: parameter_units(config.units, q in FORCES)["mu_s"] for _, q in aged})
 
 
-def law_tables(data: Mapping[tuple[str, str], tuple[Aged, str]]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return tables `aging_laws` and `master_curve` of values and their units, by rubber and quantity."""
+def law_tables(values: AgedValues, units: Mapping[str, str]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return tables `aging_laws` and `master_curve`; `units` are those of the quantities."""
     rows, curves = [], []
-    for (rubber, quantity), (aged, unit) in data.items():
+    for (rubber, quantity), aged in values.items():
         try:
             laws = fit_laws(aged)
         except FitError:  # no law can be fitted
             continue
         at = {"rubber": rubber, "quantity": quantity}
-        rows += [{**at, **row} for row in _law_rows(laws, unit)]
+        rows += [{**at, **row} for row in _law_rows(laws, units[quantity])]
         curves.append(_master_curve(laws[0]).assign(**at))
     curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
     return (
         pd.DataFrame(rows).assign(model="before").reindex(columns=AGING_LAWS.names()),
         curves.reindex(columns=MASTER_CURVE.names()),
     )
-
-
-def _quantities(levels: Levels) -> list[tuple[str, str]]:
-    """Return rubber and quantity of all values, in order; mu_s comes before mu_c."""
-    pairs = levels.table[["rubber", "quantity"]].drop_duplicates().itertuples(index=False, name=None)
-    order = [*FORCES, *FORCES.values()]
-    return sorted(pairs, key=lambda pair: (pair[0], order.index(pair[1])))
 
 
 def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
@@ -370,41 +371,20 @@ def law_of(
     """
     if "aging_days" not in steady_fit.columns:
         raise RequestError("this rig ages no rubber.", fix="Name aging_days in the config's condition.")
-    levels = shared_levels(steady, steady_fit)
-    rubber = rubber_of(_quantities(levels), quantity)
-    return laws_of(aged_values(levels, rubber, quantity), name)
+    return laws_of(aged_values(steady, steady_fit), quantity, name)
 
 
-def rubber_of(known: Sequence[tuple[str, str]], quantity: str) -> str:
-    """Return the one rubber of a quantity among the known (rubber, quantity).
-
-    Raises
-    ------
-    RequestError
-        If the quantity is not there, or of several rubbers.
-    """
-    rubbers = [rubber for rubber, own in known if own == quantity]
-    if not rubbers:
-        there = ", ".join(dict.fromkeys(own for _, own in known)) or "none"
+def laws_of(values: AgedValues, quantity: str, name: str | None = None) -> list[JointLaw]:
+    """Return the laws of one quantity in order of BIC, or only a named one; errors as `law_of`."""
+    aged = {rubber: own for (rubber, one), own in values.items() if one == quantity}
+    if not aged:
+        there = ", ".join(dict.fromkeys(one for _, one in values)) or "none"
         raise RequestError(f"there is no '{quantity}' to follow.", fix=f"Choose one of: {there}.")
-    if len(rubbers) > 1:
-        raise RequestError(
-            f"there are several rubbers: {', '.join(rubbers)}.", fix="Analyse them one by one."
-        )
-    return rubbers[0]
-
-
-def laws_of(aged: Aged, name: str | None = None) -> list[JointLaw]:
-    """Return the laws of one quantity in order of BIC, or only a named one.
-
-    Raises
-    ------
-    RequestError
-        If there is no such law, or it cannot be fitted.
-    """
+    if len(aged) > 1:
+        raise RequestError(f"there are several rubbers: {', '.join(aged)}.", fix="Analyse them one by one.")
     if name is not None and name not in LOSSES:
         raise RequestError(f"there is no law '{name}'.", fix=f"Choose one of: {', '.join(LOSSES)}.")
     try:
-        return fit_laws(aged) if name is None else fit_laws(aged, (name,))
+        return fit_laws(*aged.values(), tuple(LOSSES) if name is None else (name,))
     except FitError as error:
         raise RequestError(error.message, fix=error.fix) from error

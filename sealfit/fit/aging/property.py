@@ -22,7 +22,7 @@ from scipy.special import stdtrit
 
 from sealfit.config import Config
 from sealfit.fit.aging import SMALLEST, WITHOUT_LAW, aging_curves, curves_of, numbers_of, rubber_rows
-from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, aged_of, law_tables, laws_of, rubber_of
+from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, aged_of, law_tables, laws_of
 from sealfit.fit.aging.joint_law import Aged, JointLaw
 from sealfit.fit.aging.law import Values
 from sealfit.fit.aging.law_table import without_law
@@ -150,31 +150,26 @@ def fit_properties(specimens: pd.DataFrame, config: Config) -> dict[str, pd.Data
 
     The config names the condition columns.
     """
-    rows, found = [], {}
+    rows, aged, units = [], {}, {}
     for (rubber, quantity), own in specimens.groupby(["rubber", "quantity"], sort=True):
-        means, unit = means_of(own), str(own["unit"].iloc[0])
-        rows += [{"rubber": rubber, **row} for row in _law_per_series(means, quantity, unit)]
-        found[rubber, quantity] = (means.aged(), unit)
+        means, units[quantity] = means_of(own), str(own["unit"].iloc[0])
+        rows += [{"rubber": rubber, **row} for row in _law_per_series(means, quantity, units[quantity])]
+        aged[rubber, quantity] = means.aged()
     open_columns = [name for name in config.series_columns if name in specimens]
     keys = specimens.groupby("series", sort=True)[open_columns].first().reset_index()
     columns = [*AGING_FIT.names(), *open_columns]
     fit = pd.DataFrame(rows).merge(keys, on="series", how="left").reindex(columns=columns)
-    laws, curve = law_tables(found)
+    laws, curve = law_tables(aged, units)
     return {"aging_fit": fit, "aging_curves": aging_curves(fit), "aging_laws": laws, "master_curve": curve}
 
 
 def laws_of_property(specimens: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
     """Return the laws of one property for all series in order of BIC, or only a named one.
 
-    Raises
-    ------
-    RequestError
-        If there is no such property or law, several rubbers, or too few conditions.
+    Errors are those of `sealfit.fit.aging.all_series.law_of`.
     """
-    pairs = specimens[["rubber", "quantity"]].drop_duplicates()
-    rubber = rubber_of(list(pairs.itertuples(index=False, name=None)), quantity)
-    own = specimens[(specimens["rubber"] == rubber) & (specimens["quantity"] == quantity)]
-    return laws_of(means_of(own).aged(), name)
+    groups = specimens.groupby(["rubber", "quantity"], sort=True)
+    return laws_of({pair: means_of(own).aged() for pair, own in groups}, quantity, name)
 
 
 def _law_per_series(means: Means, quantity: str, unit: str) -> list[dict]:
