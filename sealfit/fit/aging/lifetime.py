@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,11 @@ SPAN_C = (-80.0, 300.0)
 STRIDE_C, HALVINGS = 2.0, 12
 # Range of the height in use, in percent of the original height; above 100 the rubber is stretched.
 SPAN_PCT = (1.0, 200.0)
+# Conditions of use: name, range and unit.
+USES = {
+    "temperature_C": ("temperature", SPAN_C, "degC"),
+    "compression_ratio_pct": ("compression", SPAN_PCT, "percent"),
+}
 # Range of lifetimes in days. A law has no meaning beyond it.
 AT_ONCE, FOREVER = 1e-9, 1e9
 
@@ -94,7 +99,7 @@ def lifetime(
         low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
     asked = days * (float(law.rate(place)[0]) if law.acts_on == "rate" else 1.0)
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
-    return Lifetime(days, low, high, threshold, beyond, _outside(law, temperature_C, compression_ratio_pct))
+    return Lifetime(days, low, high, threshold, beyond, _outside(law, place))
 
 
 def over_laws(
@@ -138,40 +143,34 @@ def over_laws(
     return ends[0], ends[1]
 
 
-def _asked(
-    law: JointLaw, temperature_C: float | None, compression_ratio_pct: float | None
-) -> Iterator[tuple]:
-    """Yield per driver of aging: name, option's name and value, tested values, allowed range, and unit."""
-    asked = (temperature_C, compression_ratio_pct)
-    spans = (("temperature", SPAN_C, "degC"), ("compression", SPAN_PCT, "percent"))
-    for (name, column, _), value, (what, span, unit) in zip(DRIVERS, asked, spans, strict=True):
-        yield name, what, value, getattr(law.aged, column), span, unit
-
-
 def _place(law: JointLaw, temperature_C: float | None, compression_ratio_pct: float | None) -> Aged:
     """Return the condition of use after checks; see `lifetime` for the errors raised."""
-    for name, what, value, tested, (least, most), unit in _asked(law, temperature_C, compression_ratio_pct):
+    given = (temperature_C, compression_ratio_pct)
+    for (name, column, _), value in zip(DRIVERS, given, strict=True):
+        what, (least, most), unit = USES[column]
         if name in law.names and value is None:
-            argument = "temperature_C" if what == "temperature" else "compression_ratio_pct"
             raise RequestError(
                 f"the rubber was aged at more than one {what}.",
-                fix=f"Say which: --{what}, in Python {argument}.",
+                fix=f"Say which: --{what}, in Python {column}.",
             )
         if value is not None and not least <= value <= most:
             raise RequestError(
                 f"--{what} {value:g} is no {what} of use.", fix=f"Give {unit} between {least:g} and {most:g}."
             )
-        only = np.unique(tested[law.aged.days > 0]) if tested is not None else np.array([])
+        only = np.unique(_tested(law, column))
         if value is not None and name not in law.names and not (only.size and np.allclose(value, only)):
             where = f"at {only[0]:g} {unit} only" if only.size else f"at one {what}, which is not on record"
             raise RequestError(
                 f"the rubber was aged {where}.", fix=f"Leave --{what} away, or test at another {what}."
             )
-    at = (
-        None if value is None else np.array([float(value)])
-        for value in (temperature_C, compression_ratio_pct)
-    )
+    at = (None if value is None else np.array([float(value)]) for value in given)
     return Aged(np.ones(1), np.zeros(1), *at)
+
+
+def _tested(law: JointLaw, column: str) -> np.ndarray:
+    """Return the temperatures or compressions of the aged specimens; none if they are unknown."""
+    tested = getattr(law.aged, column)
+    return np.array([]) if tested is None else tested[law.aged.days > 0]
 
 
 def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
@@ -186,13 +185,11 @@ def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
     return days if days < FOREVER else np.inf
 
 
-def _outside(
-    law: JointLaw, temperature_C: float | None, compression_ratio_pct: float | None
-) -> tuple[str, ...]:
+def _outside(law: JointLaw, place: Aged) -> tuple[str, ...]:
     found = []
-    for _, what, value, tested, *_ in _asked(law, temperature_C, compression_ratio_pct):
-        aged = np.array([np.nan]) if tested is None else tested[law.aged.days > 0]
-        if value is not None and (value < aged.min() or value > aged.max()):
+    for column, (what, *_) in USES.items():
+        value, tested = getattr(place, column), _tested(law, column)
+        if value is not None and tested.size and (value < tested.min() or value > tested.max()):
             found.append(what)
     return tuple(found)
 
