@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.csv
 
 from sealfit.errors import ConfigError, OutError, RequestError
+from sealfit.simulation import noise
 from sealfit.simulation.model import CONDITIONS
 from sealfit.simulation.motion import (
     Motion,
@@ -28,18 +29,6 @@ from sealfit.simulation.motion import (
     move_at,
     steady_law,
     with_presliding,
-)
-from sealfit.simulation.noise import (
-    TraceChannel,
-    add_channels,
-    displacement_noise_mm,
-    draw_defects,
-    draw_scatter,
-    quantised,
-    sample_noise_N,
-    spoil,
-    stream,
-    trace_channel,
 )
 from sealfit.simulation.spec import Spec, load_spec, plan_files
 
@@ -230,33 +219,33 @@ def _refuse_foreign(out: Path) -> None:
 def _write(spec: Spec, folder: Path) -> dict:
     law, seed = steady_law(spec), spec.seed
     spec = spec.risen()
-    files = add_channels(plan_files(spec.design, stream(seed, "order")), spec.channels, seed)
-    scatter = draw_scatter(spec.noise, files, seed)
-    shifts = stream(seed, "start").standard_normal(len(files))
+    files = noise.add_channels(plan_files(spec.design, noise.stream(seed, "order")), spec.channels, seed)
+    scatter = noise.draw_scatter(spec.noise, files, seed)
+    shifts = noise.stream(seed, "start").standard_normal(len(files))
     starts = spec.design.start_mm + spec.design.start_scatter_mm * shifts
-    defects = draw_defects(spec.noise, len(files), seed)
+    defects = noise.draw_defects(spec.noise, len(files), seed)
     squares, known = np.zeros(len(law.effects)), []
     for number, record in enumerate(files.to_dict("records")):
         speed = record["speed_mm_s"] * scatter.speed[number]
         motion = move(spec.design, speed, record["direction"], starts[number])
         along = {
-            c.name: trace_channel(c, motion.time_s, stream(seed, "channel", c.name, number))
+            c.name: noise.trace_channel(c, motion.time_s, noise.stream(seed, "channel", c.name, number))
             for c in spec.channels
-            if isinstance(c, TraceChannel)
+            if isinstance(c, noise.TraceChannel)
         }
         channels = _channels(record, motion, along)
         friction, added = _forces(spec, law, motion, channels, speed)
         clean = scatter.gain[number] * friction + added + scatter.offset_N[number]
-        force = clean + sample_noise_N(spec.noise, clean, motion.time_s, speed, number, seed)
-        noise = displacement_noise_mm(spec.noise, len(force), number, seed)
+        force = clean + noise.sample_noise_N(spec.noise, clean, motion.time_s, speed, number, seed)
+        wobble = noise.displacement_noise_mm(spec.noise, len(force), number, seed)
         columns = {
             "time_s": motion.time_s,
-            "displacement_mm": np.round(motion.displacement_mm + noise, DISPLACEMENT_DECIMALS),
-            "force_N": np.round(quantised(spec.noise, force), spec.force_decimals),
+            "displacement_mm": np.round(motion.displacement_mm + wobble, DISPLACEMENT_DECIMALS),
+            "force_N": np.round(noise.quantised(spec.noise, force), spec.force_decimals),
             **along,
         }
         if number in defects:
-            columns = spoil(columns, defects[number], stream(seed, "bad_data", number))
+            columns = noise.spoil(columns, defects[number], noise.stream(seed, "bad_data", number))
         _write_trace(columns, folder / record["file"])
         steady = _rows(channels, motion.steady)
         true = np.broadcast_to(law.force_N(steady), steady["direction"].shape)

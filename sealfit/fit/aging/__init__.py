@@ -11,19 +11,9 @@ import pandas as pd
 from scipy.sparse import csr_array, diags_array
 
 from sealfit.config import Config
+from sealfit.fit.aging import law_table
 from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
-from sealfit.fit.aging.law_table import (
-    Curve,
-    Estimate,
-    OneQuantity,
-    covariance_rows,
-    curve_errors,
-    curve_intervals,
-    law_rows,
-    statistics_rows,
-    t_of_95,
-    without_law,
-)
+from sealfit.fit.aging.law_table import Curve, Estimate, OneQuantity
 from sealfit.fit.joint.declared import DAYS_FOR_LAW
 from sealfit.fit.steady.condition import FULL
 from sealfit.physics import aging_law
@@ -93,7 +83,7 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     curves = curves_of(found, list(dict.fromkeys(aged["series"])), quantities, unit)
     fitted = [name for name in quantities if any(c.place >= 0 and c.quantity == name for c in curves)]
     if not fitted:
-        return [row for curve in curves for row in without_law(curve)]
+        return [row for curve in curves for row in law_table.without_law(curve)]
     number = numbers_of(found, curves)
     used, number = found[number > WITHOUT_LAW], number[number > WITHOUT_LAW]
     values = Values(
@@ -229,18 +219,18 @@ def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: n
         quantities[name] = OneQuantity(alone, part, tau, series)
         model[part] = alone.model
     joint = fit_law(_with_specimens(values, [one.tau for one in quantities.values()], model))
-    intervals = curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))
-    covariance, shift = curve_errors(joint, moved)
+    intervals = law_table.curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))
+    covariance, shift = law_table.curve_errors(joint, moved)
     x = joint.x[values.places_of_curve]
     for curve in curves:
         if curve.place < 0:
-            yield from without_law(curve)
+            yield from law_table.without_law(curve)
             continue
         one = quantities[curve.quantity]
         found = Estimate(x[curve.place], covariance[curve.place], shift[curve.place])
-        yield from law_rows(curve, found, intervals[curve.place], one.level_df)
-        yield from statistics_rows(curve, joint, one)
-        yield from covariance_rows(curve, found.covariance)
+        yield from law_table.law_rows(curve, found, intervals[curve.place], one.level_df)
+        yield from law_table.statistics_rows(curve, joint, one)
+        yield from law_table.covariance_rows(curve, found.covariance)
 
 
 # ---------------------------------------------------------------- curves
@@ -275,7 +265,7 @@ def _curve(known: dict[tuple[str, str], float], quantity: str) -> dict[str, np.n
         for j in range(i + 1):
             value = known["covariance", f"{names[j]},{names[i]}"]
             covariance[i, j] = covariance[j, i] = value if np.isfinite(value) else 0.0
-    t = t_of_95(known["statistics", f"{quantity}:error_df"])
+    t = law_table.t_of_95(known["statistics", f"{quantity}:error_df"])
     days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
     ratio = days / b
     slope = np.stack([np.ones_like(days), -np.log1p(ratio), a * ratio / (1 + ratio)], axis=1)
