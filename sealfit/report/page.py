@@ -17,6 +17,7 @@ from markupsafe import Markup, escape
 from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
+from sealfit.report import words
 from sealfit.report.drawing import Drawn, draw, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
@@ -32,17 +33,6 @@ from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter
 from sealfit.report.style import WIDTH, Plot
 from sealfit.report.summary import by_gain, of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
-from sealfit.report.words import (
-    channel_tests,
-    error_rows,
-    left_over,
-    undecided,
-    verdict,
-    vocabulary,
-    with_left_channels,
-    with_symbols,
-    without_load,
-)
 from sealfit.tables import FITTED, SCHEMAS
 
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
@@ -174,7 +164,7 @@ def build_report(
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
     environment = Environment(autoescape=True, undefined=StrictUndefined)
-    environment.globals |= vocabulary(closure, tables["shapes"], config)
+    environment.globals |= words.vocabulary(closure, tables["shapes"], config)
     html = environment.from_string(_text("template.html")).render(
         style=Markup(_text("style.css")), script=Markup(_text("report.js")), plots=images, runs=Markup(runs),
         script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(), **content
@@ -203,7 +193,7 @@ def _of_property(one: Mapping) -> Markup:
     """Return the sentences of a property, with the equations of its laws and the energy as symbols."""
     said = escape(property_sentences(one))
     for law in sorted({PER_SERIES, one["law"]["form"] if one["law"] else PER_SERIES}, key=len, reverse=True):
-        said = said.replace(escape(law), with_symbols(law, formula=True))
+        said = said.replace(escape(law), words.with_symbols(law, formula=True))
     return said.replace(", E ", Markup(", <i>E</i>&nbsp;"))
 
 
@@ -213,9 +203,9 @@ def answered(
     """Return tables and closure.json as the page uses them; see `with_after_fits`."""
     tables = with_after_fits(tables)
     if closure is not None:
-        closure = with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
+        closure = words.with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
         if len(tables["steady"]) and tables["steady"]["load_N"].isna().all():
-            closure = without_load(closure)
+            closure = words.without_load(closure)
     return tables, closure
 
 
@@ -245,13 +235,13 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
         "badge": VERDICTS[closure["verdict"]],
         "tone": closure["verdict"],
         "fit": fit_badge(closure),
-        "verdict": verdict(closure, tables["shapes"], config),
-        "undecided": undecided(closure, config),
+        "verdict": words.verdict(closure, tables["shapes"], config),
+        "undecided": words.undecided(closure, config),
         "facts": campaign_facts(tables, config),
-        "errors": error_rows(closure, config),
+        "errors": words.error_rows(closure, config),
         "effects": by_gain(closure["effects"]),
-        "left": left_over(closure, config),
-        "tests": channel_tests(tables["levels"], tables["channels"]["channel"].dropna(), config),
+        "left": words.left_over(closure, config),
+        "tests": words.channel_tests(tables["levels"], tables["channels"]["channel"].dropna(), config),
         "more_channels": max(0, tables["channels"]["channel"].nunique() - MOST_CHANNELS),
         "references": added if "steady_fit_before" in tables else [],
         "break_aways": break_aways,
@@ -288,14 +278,14 @@ def fit_badge(closure: Mapping) -> tuple[str, str]:
     """Return how well the model fits: the state, and a few words."""
     quality = closure["fit_quality"]
     ratio = quality["ratio"] or 0
-    words = {
+    badges = {
         "unknown": "Fit: not known",
         "within_scatter": "Fit: within the scatter of repeats",
         "above_scatter": f"Fit: {ratio:.2g} times the scatter of repeats"
         if ratio >= 1
         else "Fit: a lack of fit, below the scatter of repeats",
     }
-    return quality["state"], words[quality["state"]]
+    return quality["state"], badges[quality["state"]]
 
 
 def _images(plot: Plot, drawn: Drawn) -> dict:
