@@ -158,8 +158,11 @@ def test_a_cluster_without_workers_is_a_clear_error(dask):
         worker.kill()
         worker.wait()
     time.sleep(1.0)
-    with pytest.raises(RequestError, match=r"has no workers\. Start one: dask worker"):
-        Cluster(str(dask.file))
+    with (
+        pytest.raises(RequestError, match=r"has no workers\. Start one: dask worker"),
+        on_cluster(str(dask.file)),
+    ):
+        pytest.fail("it has none")
 
 
 # ---------------------------------------------------------------- the whole pipeline

@@ -13,7 +13,6 @@ import signal
 import socket
 import sys
 import threading
-import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -65,14 +64,14 @@ def on_cluster(scheduler: str | None, *folders: Path) -> Iterator[None]:
     if scheduler is None:
         yield
         return
-    cluster = Cluster(scheduler)
-    before = _cluster.set(cluster)
-    try:
+    with contextlib.closing(Cluster(scheduler)) as cluster:
+        cluster.require_same_version()
         cluster.require_folders(*folders)
-        yield
-    finally:
-        _cluster.reset(before)
-        cluster.close()
+        before = _cluster.set(cluster)
+        try:
+            yield
+        finally:
+            _cluster.reset(before)
 
 
 def run_map(
@@ -243,19 +242,15 @@ class Cluster:
     Raises
     ------
     RequestError
-        If Dask is not installed here, nobody answers, there is no worker, or a worker has another sealfit.
+        If Dask is not installed here, or nobody answers.
     """
 
     def __init__(self, scheduler: str) -> None:
         self.scheduler = scheduler
         self._client = _connected(scheduler)
-        try:
-            self._check_versions()
-        except BaseException:
-            self.close()
-            raise
 
-    def _check_versions(self) -> None:
+    def require_same_version(self) -> None:
+        """Raise RequestError if there is no worker, or one has another sealfit."""
         try:
             versions = self._client.run(_version)
         except ModuleNotFoundError as error:
@@ -318,8 +313,8 @@ class Cluster:
             # No warning of large chunks, as a fold is large.
             with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
                 for chunk in islice(chunks, max(room, 0)):
-                    key = f"sealfit-{uuid.uuid4().hex}"  # Dask would merge equal chunks of two runs
-                    sent.append(self._client.submit(function, chunk, key=key, pure=False))
+                    # Not pure: Dask would merge equal chunks of two runs.
+                    sent.append(self._client.submit(function, chunk, pure=False))
 
         try:
             send()
