@@ -7,7 +7,7 @@ parameter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -52,26 +52,17 @@ def stored(name: str, fit: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 def _covariances(rows: pd.DataFrame) -> pd.DataFrame:
     """Return covariances with both parameters in columns; a law's "mu_s:mu_0,mu_s:a" is of quantity mu_s."""
-    pairs = [text.split(",") for text in rows["parameter"]]
-    ends = {"parameter": [one for one, _ in pairs], "other": [other for _, other in pairs]}
-    named = {name: [text.split(":")[-1] for text in texts] for name, texts in ends.items()}
+    ends = rows["parameter"].str.split(",")
+    named = {name: ends.str[k].str.split(":").str[-1] for k, name in enumerate(("parameter", "other"))}
     if "condition" not in rows:
-        named["quantity"] = [text.split(":")[0] for text in ends["parameter"]]
-    return _without_intervals(rows).assign(**_texts(named, rows.index))
+        named["quantity"] = ends.str[0].str.split(":").str[0]
+    return _without_intervals(rows).assign(**named)
 
 
 def _shifts(rows: pd.DataFrame) -> pd.DataFrame:
     """Return shifts with what causes them: the sensor, or a direction of the effects' uncertainty, from 1."""
-    parts = [text.partition(":") for text in rows["parameter"]]
-    named = {
-        "source": [number or "sensor" for *_, number in parts],
-        "parameter": [name for name, *_ in parts],
-    }
-    return _without_intervals(rows).assign(**_texts(named, rows.index))
-
-
-def _texts(columns: Mapping[str, list[str]], index: pd.Index) -> dict[str, pd.Series]:
-    return {name: pd.Series(texts, index, dtype=object) for name, texts in columns.items()}
+    parts = (rows["parameter"] + ":sensor").str.split(":")
+    return _without_intervals(rows).assign(source=parts.str[1], parameter=parts.str[0])
 
 
 def _without_intervals(rows: pd.DataFrame) -> pd.DataFrame:
