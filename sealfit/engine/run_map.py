@@ -143,11 +143,7 @@ def in_processes(
     """Yield the list that `apply`, which is at the top level of a module, returns for each chunk.
 
     `workers` processes are used. Their server imports the module `load` once, so that none imports it again.
-
-    Raises
-    ------
-    WorkerError
-        If a process dies before it has answered (killed, or out of memory).
+    WorkerError if a process dies before it has answered (killed, or out of memory).
     """
     context = multiprocessing.get_context(START)
     context.set_forkserver_preload([load])

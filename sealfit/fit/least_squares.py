@@ -294,12 +294,8 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     """Return the global least-squares optimum of each problem on the range of its grid, shape (problems, g).
 
     The grid rises, so closely that no minimum lies between two points. Every local minimum along it is
-    refined. The result is the best of them, or an end of the grid.
-
-    Raises
-    ------
-    FitError
-        If a measured value or weight is not finite, or a weight is negative.
+    refined. The result is the best of them, or an end of the grid. FitError if a measured value or weight is
+    not finite, or a weight is negative.
     """
     y, weight = problems.y, problems.weight
     if not (np.all(np.isfinite(y)) and np.all(np.isfinite(weight)) and np.all(weight >= 0)):

@@ -169,11 +169,8 @@ class BoundEffect:
 def resolve_effects(entries: Sequence[EffectEntry]) -> tuple[BoundEffect, ...]:
     """Return the effects of a SPEC bound to the catalogue, in the SPEC's order.
 
-    Raises
-    ------
-    ConfigError
-        If an id, a parameter or the number of channels is not the catalogue's, or an effect cannot act on a
-        target.
+    ConfigError if an id, a parameter or the number of channels is not the catalogue's, or an effect cannot
+    act on a target.
     """
     return tuple(_resolve(entry, f"effects.{number} ({entry.id})") for number, entry in enumerate(entries))
 

@@ -167,12 +167,8 @@ class SteadyLaw:
         """Return the steady bristle force, viscous part and added forces, in N, broadcast over the channels.
 
         `channels` has `speed_mm_s` (signed), the condition columns and `load_N` of the design, and all that
-        the effects read; shape (n,) or (1,) each.
-
-        Raises
-        ------
-        ParameterError
-            If an effect makes v_s or b zero or negative.
+        the effects read; shape (n,) or (1,) each. ParameterError if an effect makes v_s or b zero or
+        negative.
         """
         given = {name: np.atleast_1d(channels[name]) for name in CONDITIONS if name in channels}
         now = declared_parameters(self.physics, given)
@@ -210,10 +206,7 @@ class SteadyLaw:
 def steady_law(spec: Spec) -> SteadyLaw:
     """Return the truth of a SPEC.
 
-    Raises
-    ------
-    ConfigError
-        If an effect is not in the catalogue.
+    ConfigError if an effect is not in the catalogue.
     """
     return SteadyLaw(spec.physics, resolve_effects(spec.effects))
 

@@ -351,12 +351,7 @@ Channel = Annotated[
 def add_channels(files: pd.DataFrame, channels: tuple[Channel, ...], seed: int) -> pd.DataFrame:
     """Return `files` with every channel that is logged once per file.
 
-    Channels within the trace come from `trace_channel`.
-
-    Raises
-    ------
-    ConfigError
-        If a formula does not give a number.
+    Channels within the trace come from `trace_channel`. ConfigError if a formula does not give a number.
     """
     for channel in channels:
         random = stream(seed, "channel", channel.name)

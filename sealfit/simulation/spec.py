@@ -225,12 +225,7 @@ class Spec(Strict):
     def risen(self) -> Spec:
         """Return the SPEC whose `design.stiffness_mm` is the longest rise that `physics.sigma_0` makes.
 
-        It is unchanged if `physics.sigma_0` is not given.
-
-        Raises
-        ------
-        ConfigError
-            If the stroke is too short for it.
+        It is unchanged if `physics.sigma_0` is not given. ConfigError if the stroke is too short for it.
         """
         if self.physics.sigma_0 is None:
             return self

@@ -71,12 +71,8 @@ class Levels:
 def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     """Return mu_s and mu_c, with their covariance, at every aged condition and the unaged rubber.
 
-    `steady_fit` has the separate fits, of which only identified values are used, with `aging_days`.
-
-    Raises
-    ------
-    FitError
-        If there is no row to fit.
+    `steady_fit` has the separate fits, of which only identified values are used, with `aging_days`. FitError
+    if there is no row to fit.
     """
     rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["aging_days"].notna()]
     of_parameters = [name for name in STEADY_FIT.names() if name not in ("condition", "series", "rubber")]
@@ -363,11 +359,8 @@ def law_of(
 ) -> list[JointLaw]:
     """Return the laws of one quantity, such as "mu_s", in order of BIC, or only a named one.
 
-    Raises
-    ------
-    RequestError
-        If rubber is not aged, the quantity was not fitted, there are several rubbers, or no such law can be
-        fitted.
+    RequestError if rubber is not aged, the quantity was not fitted, there are several rubbers, or no such law
+    can be fitted.
     """
     if "aging_days" not in steady_fit.columns:
         raise RequestError("this rig ages no rubber.", fix="Name aging_days in the config's condition.")

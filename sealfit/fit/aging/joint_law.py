@@ -296,12 +296,8 @@ class JointLaw:
 def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> JointLaw:
     """Fit one law to all series of a quantity, and the scatter between specimens.
 
-    `loss` is a name in `LOSSES`; the law acts on "rate" or "loss".
-
-    Raises
-    ------
-    FitError
-        If there are fewer different conditions than parameters, or no aged specimen.
+    `loss` is a name in `LOSSES`; the law acts on "rate" or "loss". FitError if there are fewer different
+    conditions than parameters, or no aged specimen.
     """
     shape, drivers = LOSSES[loss], aged.drivers()
     names = ("mu_0", "a", *shape.parameters, *drivers)
@@ -336,12 +332,8 @@ def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw
     """Return every law that the values determine, acting on rate and on loss, in order of BIC.
 
     Laws that leave fewer than `SPARE` degrees of freedom are left out if another leaves more: with one, a law
-    often passes through all values, and its scatter, and so its BIC, is far too small.
-
-    Raises
-    ------
-    FitError
-        If they determine none.
+    often passes through all values, and its scatter, and so its BIC, is far too small. FitError if they
+    determine none.
     """
     found, first = [], None
     for loss in losses:

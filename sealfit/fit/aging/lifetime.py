@@ -279,10 +279,8 @@ def _last(contains: Callable[[float], bool], inside: float, limit: float) -> flo
 def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
     """Return the goal of a request.
 
-    Raises
-    ------
-    RequestError
-        If not exactly one of both is given, the threshold is no number, or the loss is no share of the start.
+    RequestError if not exactly one of both is given, the threshold is no number, or the loss is no share of
+    the start.
     """
     if (threshold is None) == (loss_pct is None):
         raise RequestError(
@@ -310,12 +308,7 @@ def answer(
     """Return a law's answer as plain values: the lifetime with its interval, or temperature for a lifetime.
 
     With `years` it is the temperature for this lifetime. With `resample` the interval is checked by
-    `resampled`.
-
-    Raises
-    ------
-    RequestError
-        If the request cannot be answered: see `lifetime` and `temperature_for`.
+    `resampled`. RequestError if the request cannot be answered: see `lifetime` and `temperature_for`.
     """
     if years is not None and temperature_C is not None:
         raise RequestError(

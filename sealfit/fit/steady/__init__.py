@@ -101,12 +101,7 @@ def solve_conditions(
 
     A Stribeck curve that does not differ significantly from a straight line is dropped. With repeats, which
     determine the weights, the estimates of `fitted`, the table `steady_fit` of these rows, are used, and
-    nothing is fitted again.
-
-    Raises
-    ------
-    FitError
-        If there is no row to fit.
+    nothing is fitted again. FitError if there is no row to fit.
     """
     runs = run_means(steady)
     scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
