@@ -14,7 +14,7 @@ from sealfit.config import Config
 from sealfit.physics import aging_law, stribeck_force
 from sealfit.report.figures.aging import aging_points, draw_aging
 from sealfit.report.figures.speed import Line, draw_force_speed, run_points
-from sealfit.report.notation import ConditionNames, symbol_math
+from sealfit.report.notation import symbol_math
 from sealfit.report.style import BLACK, CYCLE, FLOOR, QUIET, Key, Panel, Plot, shades
 
 TEMPERATURES, COMPRESSIONS, DAYS = (20, 40, 60, 80), (80, 90, 100), (1, 2, 4, 8, 12, 16)
@@ -179,7 +179,7 @@ def _predicted(found: Found, name: str, title: str, at: At) -> Plot:
 def _law(found: Found, name: str, title: str) -> Plot:
     curves = found.tables["aging_curves"]
     curves = curves[curves["series"] == SERIES]
-    points = aging_points(found.tables["steady_fit"], ["mu_s", "mu_c"], ConditionNames.of(found.config))
+    points = aging_points(found.tables["steady_fit"], ["mu_s", "mu_c"])
     points = points[points["series"].isin([SERIES, UNAGED])]
     days, needed = np.linspace(0, 16, 200), printed_errors()["start"]
 

@@ -387,13 +387,6 @@ class ConditionNames:
             return {}
         return dict(zip(pieces[1::2], pieces[2::2], strict=True))
 
-    def number(self, text: object, column: str) -> float:
-        """Return a condition's value of a column as a number; NaN where it has none."""
-        try:
-            return float(self.parts(text).get(column, "nan"))
-        except ValueError:
-            return float("nan")
-
     def place(self, text: object) -> tuple[bool, list]:
         """Return a sort key of conditions and series: unaged first, then by the numbers of their names."""
         return not is_unaged(text), natural(self(text))

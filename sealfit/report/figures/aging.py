@@ -88,7 +88,7 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
     values = tables.get("property_values", ())
     of_property = len(values) > 0
     fits = property_means(values) if of_property else tables["steady_fit"]
-    points = aging_points(fits, quantities, names)
+    points = aging_points(fits, quantities)
     series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural(names(s)))
     series, note = style.panels_of(series, "series")
     if note:
@@ -129,7 +129,7 @@ def property_means(values: pd.DataFrame) -> pd.DataFrame:
     for (rubber, quantity), own in values.groupby(["rubber", "quantity"]):
         means = means_of(own)
         half, value = means.half_width(), means.table["value"]
-        kept = means.table[["condition", "series", "value"]]
+        kept = means.table[["condition", "series", "aging_days", "value"]]
         parts.append(
             kept.assign(
                 rubber=rubber, quantity="steady", parameter=quantity, identified=True,
@@ -139,14 +139,13 @@ def property_means(values: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str], names: ConditionNames) -> pd.DataFrame:
+def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str]) -> pd.DataFrame:
     """Return the identified coefficients of every condition with its aging days."""
     rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["identified"].astype(bool)]
     rows = rows[rows["parameter"].isin(list(quantities))]
-    of = {c: 0.0 if is_unaged(c) else names.number(c, "aging_days") for c in rows["condition"].unique()}
-    days = rows["condition"].map(of).astype(float)
-    columns = ["series", "rubber", "value", "lo95", "hi95"]
-    return rows[columns].assign(quantity=rows["parameter"], aging_days=days)
+    columns = ["series", "rubber", "aging_days", "value", "lo95", "hi95"]
+    rows = rows.reindex(columns=[*columns, "parameter"]).astype({"aging_days": float})
+    return rows.rename(columns={"parameter": "quantity"})
 
 
 # ---------------------------------------------------------------- averaged traces
