@@ -11,15 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
+from sealfit.fit.joint import prior
 from sealfit.fit.joint.model import Model, evaluate, friction_of, term_slope
-from sealfit.fit.joint.prior import (
-    centre_of,
-    covariance_of,
-    free_of_others,
-    penalised,
-    precision_of,
-    smoothed,
-)
 from sealfit.fit.joint.rows import Cache, Rows, cached
 from sealfit.fit.joint.search import descend, search_nonlinear, start_model
 from sealfit.fit.joint.tangent import Tangent
@@ -124,7 +117,7 @@ class Fitted:
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance of all fitted numbers (v_s and b as logarithms), shape (p, p)."""
-        return covariance_of(self.white_jacobian.gram(), precision_of(self.model))
+        return prior.covariance_of(self.white_jacobian.gram(), prior.precision_of(self.model))
 
 
 def fit_declared(rows: Rows) -> Fitted:
@@ -150,7 +143,7 @@ def fit(
     often the scatter is re-estimated and the model refitted. If it is 0, the scatter is fixed, and so is the
     friction, shape (n,), to which gains and noise are proportional; fits to be compared must share it.
     """
-    centre = centre_of(model)
+    centre = prior.centre_of(model)
     if scatter is None:
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
         model = descend(model, rows, scatter, centre, tolerance=ROUGH)
@@ -209,7 +202,7 @@ def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
     rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
     scatter = estimate(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
     model = with_reml_smoothness(fitted.model, rows, scatter, fitted.friction)
-    model = descend(model, rows, scatter, centre_of(model), fitted.friction, tolerance=COMPARED)
+    model = descend(model, rows, scatter, prior.centre_of(model), fitted.friction, tolerance=COMPARED)
     return fitted_at(model, rows, scatter, fitted.friction)
 
 
@@ -217,8 +210,8 @@ def effective_df(fitted: Fitted, number: int) -> float:
     """Return the effective degrees of freedom of a term's free shape at its smoothness."""
     model, white = fitted.model, fitted.white_jacobian
     place = model.term_slice(number)
-    own, pull = free_of_others(model, white.gram(), white.against(fitted.white_residual), place)
-    return penalised(own, pull, precision_of(model)[place, place])[1]
+    own, pull = prior.free_of_others(model, white.gram(), white.against(fitted.white_residual), place)
+    return prior.penalised(own, pull, prior.precision_of(model)[place, place])[1]
 
 
 def with_reml_smoothness(
@@ -228,4 +221,4 @@ def with_reml_smoothness(
     if all(term.smoothness is None for term in model.terms):
         return model
     at = fitted_at(model, rows, scatter, friction)
-    return smoothed(model, at.white_jacobian.gram(), at.white_jacobian.against(at.white_residual))
+    return prior.smoothed(model, at.white_jacobian.gram(), at.white_jacobian.against(at.white_residual))

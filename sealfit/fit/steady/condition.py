@@ -10,16 +10,8 @@ import pandas as pd
 
 from sealfit.fit.joint.declared import speed_clusters
 from sealfit.fit.least_squares import project
-from sealfit.fit.steady.stribeck import (
-    NAMES,
-    StribeckFit,
-    constrained_ends,
-    flat_p_value,
-    search_limits,
-    solve_stribeck,
-    stribeck_intervals,
-    tangent,
-)
+from sealfit.fit.steady import stribeck
+from sealfit.fit.steady.stribeck import NAMES, StribeckFit
 from sealfit.fit.steady.uncertainty import shifts_of, speed_levels
 from sealfit.physics import stribeck_force
 
@@ -88,7 +80,7 @@ class Condition:
     def jacobian(self) -> np.ndarray:
         """Derivative of F sgn v with respect to the parameters, shape (n, p)."""
         speed, load, _, _ = self.arrays
-        return tangent(speed, load, self.values) if self.model == FULL else self.columns()
+        return stribeck.tangent(speed, load, self.values) if self.model == FULL else self.columns()
 
     def model_force(self) -> np.ndarray:
         """F sgn v of the fitted model at every run, shape (n,)."""
@@ -195,7 +187,7 @@ def solve(conditions: list[Condition]) -> None:
     """Fit every condition's model, those with a Stribeck curve all at once."""
     full = [c for c in conditions if c.model == FULL]
     if full:
-        fit = solve_stribeck(*stacked(full))
+        fit = stribeck.solve_stribeck(*stacked(full))
         for condition, values, rss, grid in zip(full, fit.values, fit.rss, fit.grid, strict=True):
             condition.values, condition.chi2, condition.grid = values, float(rss), grid
     for condition in conditions:
@@ -220,7 +212,7 @@ def drop_flat_curve(condition: Condition, unit: float, df: float) -> None:
     if np.isfinite(unit) and unit > 0:
         columns = condition.columns()[:, : 2 if condition.values[1] > 0 else 1]
         gain = (condition.chi2 - chi2) / unit
-        condition.flat_p = flat_p_value(speed, columns, weight, condition.grid, gain, df)
+        condition.flat_p = stribeck.flat_p_value(speed, columns, weight, condition.grid, gain, df)
     if not condition.flat_p >= SIGNIFICANT:
         condition.model, condition.values, condition.chi2 = FULL, full, chi2
 
@@ -231,15 +223,15 @@ def bound(conditions: list[Condition], rise: np.ndarray) -> None:
     if full:
         arrays = stacked([conditions[k] for k in full])
         values, chi2 = (np.array([getattr(conditions[k], name) for k in full]) for name in ("values", "chi2"))
-        fit = StribeckFit(values, chi2, search_limits(arrays[0], arrays[3]))
-        lows, highs = stribeck_intervals(*arrays, fit, rise[full])
+        fit = StribeckFit(values, chi2, stribeck.search_limits(arrays[0], arrays[3]))
+        lows, highs = stribeck.stribeck_intervals(*arrays, fit, rise[full])
         for k, low, high in zip(full, lows, highs, strict=True):
             conditions[k].low, conditions[k].high = low, high
     for condition, allowed in zip(conditions, rise, strict=True):
         if condition.model != FULL and np.isfinite(allowed):
             _, _, force, weight = condition.arrays
             root = np.sqrt(weight)
-            low, high = constrained_ends(
+            low, high = stribeck.constrained_ends(
                 (condition.columns() * root[:, None])[None, None],
                 (force * root)[None, None],
                 np.array([condition.chi2 + allowed]),
