@@ -37,14 +37,6 @@ BESIDE = tuple(table.name for table in schemas.BESIDE)
 UNREPORTED = (  # of many rows, and the report needs nothing of them but a few traces
     "traces", "traces_mean", "bins", "steady_after", *BESIDE, *(f"{name}_after" for name in BESIDE),
 )  # fmt: skip
-TRACE = ["run_id", "condition", "direction", "displacement_mm", "force_N", "force_se_N", "n", "steady"]
-REPORTED = {  # of tables with a row per bin, what the report looks at
-    f"residuals_{stage}": [
-        "condition", "run_id", "file", "stroke", "bin", "speed_mm_s", "displacement_mm", "force_N", "model_N",
-        "residual_N", "heldout_residual_N",
-    ]
-    for stage in ("before", "after")
-}  # fmt: skip
 FAULTY = ("warning", "error")  # severities that count as a fault
 
 # How many rows a step worked on, and what they are.
@@ -326,8 +318,7 @@ def reported(store: Store) -> tuple[dict[str, pd.DataFrame], dict | None]:
     """
     if store.state.properties is not None:
         return {name: store.read(name) for name in OF_PROPERTIES}, None
-    names = [name for name in TABLES if name not in UNREPORTED]
-    tables = {name: store.read(name, REPORTED.get(name)) for name in names}
+    tables = {name: store.read(name) for name in TABLES if name not in UNREPORTED}
     tables |= _example_traces(store, tables["runs"])
     closure = store.read_json("closure")
     if tables["shapes"]["effect"].nunique() > len(closure["effects"]):
@@ -342,7 +333,7 @@ def _example_traces(store: Store, runs: pd.DataFrame) -> dict[str, pd.DataFrame]
     names = ["run_id", "condition"]
     places = store.read("traces_mean", names, coded=names).drop_duplicates("run_id").astype(object)
     chosen = example_runs(places, runs)["run_id"].tolist()
-    means = store.read("traces_mean", TRACE, where={"run_id": chosen})
+    means = store.read("traces_mean", where={"run_id": chosen})
     means = means.sort_values("run_id", key=lambda names: names.map(chosen.index), kind="stable")
     used = runs.loc[runs["used"].astype(bool) & runs["run_id"].isin(chosen)]
     strokes = used.groupby("run_id").head(MOST_REPEATS)[["file", "stroke", "run_id", "direction"]]
