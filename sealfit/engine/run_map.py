@@ -230,15 +230,8 @@ def _end_with_parent() -> None:
 class Cluster:
     """A connection to a running Dask scheduler.
 
-    Parameters
-    ----------
-    scheduler : str
-        Its address ("tcp://host:8786"), or the path of the scheduler file that it wrote.
-
-    Raises
-    ------
-    RequestError
-        If Dask is not installed here, or nobody answers.
+    `scheduler` is its address ("tcp://host:8786"), or the path of the scheduler file that it wrote.
+    RequestError if Dask is not installed here, or nobody answers.
     """
 
     def __init__(self, scheduler: str) -> None:

@@ -125,13 +125,8 @@ def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
 def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], config: Config) -> pd.DataFrame:
     """Return a row per condition and parameter of Eqs. 1 to 14; unaged rubber has them in each of its series.
 
-    Parameters
-    ----------
-    fits, before : sequence of DataFrame
-        Tables `steady_fit` and `dynamic_fit` of the answer, and the same without effects, for column
-        `before`.
-    config : Config
-        Names the condition columns.
+    `fits` are tables `steady_fit` and `dynamic_fit` of the answer, and `before` the same without effects, for
+    the column of that name. The config names the condition columns.
     """
     rows = _with_before(_of(fits, OF_CONDITIONS), _of(before, OF_CONDITIONS), ["condition", "parameter"])
     if config.aging and "aging_days" in rows:
@@ -147,12 +142,8 @@ def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], con
 def laws(fit: pd.DataFrame, before: pd.DataFrame, config: Config) -> pd.DataFrame:
     """Return a row per series, quantity and parameter of Eq. 15: mu_0, a, b, c of mu_s, mu_c or a property.
 
-    Parameters
-    ----------
-    fit, before : DataFrame
-        Table `aging_fit` of the answer, and the same without effects, for column `before`.
-    config : Config
-        Names the columns that tell series apart.
+    `fit` is table `aging_fit` of the answer, and `before` the same without effects, for the column of that
+    name. The config names the columns that tell series apart.
     """
     rows, earlier = (own[own["quantity"] != STATISTICS] for own in (fit, before))
     rows = _with_before(rows, earlier, ["series", "quantity", "parameter"])

@@ -40,19 +40,11 @@ NEEDED = (
 def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     """Return one row per condition, run and direction: mean of its files, each the mean of its strokes.
 
-    Rows of table `steady` with `used` false are left out. The two directions of a file are merged.
-
-    Returns
-    -------
-    DataFrame
-        `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown), `load`
-        (NaN where unknown), `force` (F sgn v), `half` (half of the difference between the directions in a
-        merged row) and `files`, sorted by the first three; and the columns of `SHIFT`.
-
-    Raises
-    ------
-    FitError
-        If a column is missing, no row is used, or a run has speed 0.
+    Rows of table `steady` with `used` false are left out. The two directions of a file are merged. The
+    columns are `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown),
+    `load` (NaN where unknown), `force` (F sgn v), `half` (half of the difference between the directions in a
+    merged row) and `files`, sorted by the first three; and the columns of `SHIFT`. FitError if a column is
+    missing, no row is used, or a run has speed 0.
     """
     missing = [name for name in NEEDED if name not in steady.columns]
     if missing:

@@ -23,14 +23,8 @@ from sealfit.report.style import Plot
 def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> dict[str, Plot]:
     """Return every plot that these tables give, by name; one without data is not there.
 
-    Parameters
-    ----------
-    tables : mapping of str to DataFrame
-        The report's tables, all of them present, some perhaps empty.
-    closure : mapping or None
-        closure.json, or None of properties.
-    config : Config
-        Gives the labels their true units.
+    `tables` are those of the report, all of them present, some perhaps empty; `closure` is closure.json, None
+    of properties. The config gives the labels their true units.
     """
     of_tables = (
         variance_levels, residual_channels, force_speed, aging, master_curve, starts, traces_mean,
