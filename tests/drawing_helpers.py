@@ -15,7 +15,7 @@ page.draw = drawing_helpers.undrawn
 from sealfit.__main__ import main
 main()
 """
-SAVED = drawing._saved
+SAVED = drawing.saved
 
 
 def undrawn(plot: Plot) -> Drawn:
@@ -24,7 +24,7 @@ def undrawn(plot: Plot) -> Drawn:
 
 
 def only_svg(figure, form, metadata, **options) -> bytes:
-    """Stand for `_saved` in tests of what the page holds: the files for print are empty."""
+    """Stand for `saved` in tests of what the page holds: the files for print are empty."""
     return SAVED(figure, form, metadata, **options) if form == "svg" else b""
 
 

@@ -96,7 +96,7 @@ def test_emps_as_it_is(tmp_path):
 
 
 def test_kidney_has_a_slope_along_the_stroke_that_follows_the_pressure(tmp_path, monkeypatch):
-    monkeypatch.setattr("sealfit.report.drawing._saved", only_svg)
+    monkeypatch.setattr("sealfit.report.drawing.saved", only_svg)
     config = kidney_plain(measured(), tmp_path / "campaign")
     run(tmp_path / "campaign", tmp_path / "out", config)
     loop = json.loads((tmp_path / "out" / "closure.json").read_text())

@@ -38,7 +38,7 @@ def test_the_simulated_hardness_comes_back(table, tmp_path, monkeypatch):
     life = commands.lifetime(tmp_path / "out", TO_80)
     assert life["ci95"][0] < 168.0 < life["ci95"][1]  # as docs/how-to/properties.md says
     assert life["model"] is None
-    monkeypatch.setattr("sealfit.report.drawing._saved", only_svg)
+    monkeypatch.setattr("sealfit.report.drawing.saved", only_svg)
     pipeline.single("report", tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "hardness.csv: aging report" in page
@@ -150,7 +150,7 @@ def test_the_page_says_at_its_top_that_a_law_does_not_fit(tmp_path, monkeypatch)
     table.write_text("\n".join(["temperature_C,aging_days,hardness", *rows]) + "\n", "utf-8")
     (one,) = pipeline.fit_properties(table, tmp_path / "out")["fit_aging"]["properties"]
     assert one["lack_of_fit_p"] < 1e-6
-    monkeypatch.setattr("sealfit.report.drawing._saved", only_svg)
+    monkeypatch.setattr("sealfit.report.drawing.saved", only_svg)
     pipeline.single("report", tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert '<span class="badge above_scatter">The law does not fit<' in page

@@ -145,26 +145,22 @@ class Results:
     @property
     def verdict(self) -> pd.DataFrame:
         """One row: the verdict, its sentence, how good the fit is, and what is left."""
-        closure, units = self._closure()
-        return frames.with_units(frames.verdict(closure, units), units)
+        return frames.verdict(*self._closure())
 
     @property
     def errors(self) -> pd.DataFrame:
         """A row per error: before and after the effects were added, and the noise floor."""
-        closure, units = self._closure()
-        return frames.with_units(frames.errors(closure, units), units)
+        return frames.errors(*self._closure())
 
     @property
     def effects(self) -> pd.DataFrame:
         """A row per effect that the loop found; one that is only a candidate is not in the model."""
-        closure, units = self._closure()
-        return frames.with_units(frames.effects(closure), units)
+        return frames.effects(*self._closure())
 
     @property
     def effect_parameters(self) -> pd.DataFrame:
         """A row per effect and parameter, with its 95 % interval and unit."""
-        closure, units = self._closure()
-        return frames.with_units(frames.effect_parameters(closure), units)
+        return frames.effect_parameters(*self._closure())
 
     @property
     def effect_curves(self) -> pd.DataFrame:
@@ -174,14 +170,12 @@ class Results:
     @property
     def scatter(self) -> pd.DataFrame:
         """A row per level: how much specimens, runs and files scatter."""
-        closure, units = self._closure()
-        return frames.with_units(frames.scatter(closure), units)
+        return frames.scatter(*self._closure())
 
     @property
     def sensitivity(self) -> pd.DataFrame:
         """A row per variable, level and target: the smallest effect to be found with 80 % chance."""
-        closure, units = self._closure()
-        return frames.with_units(frames.sensitivity(closure), units)
+        return frames.sensitivity(*self._closure())
 
     # ------------------------------------------------------------ fits
     @property
@@ -343,8 +337,8 @@ class Results:
         sentence = html.escape(summary.verdict_sentence(closure, units))
         tables = [frames.errors(closure, units)[["meaning", "before", "after", "noise_floor", "unit"]]]
         if closure["effects"]:
-            tables.append(frames.effects(closure)[list(SHOWN)])
-            tables.append(frames.effect_parameters(closure).drop(columns="effect"))
+            tables.append(frames.effects(closure, units)[list(SHOWN)])
+            tables.append(frames.effect_parameters(closure, units).drop(columns="effect"))
         verdict = f"<p><b>{html.escape(closure['verdict'])}</b>: {sentence}.</p>"
         return "\n".join([verdict, *map(_table_html, tables)])
 

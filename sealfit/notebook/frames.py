@@ -65,7 +65,7 @@ def verdict(closure: Mapping, units: Units) -> pd.DataFrame:
         "left_channel": left["channel"],
         "left_p": left["p_value"],
     }
-    return pd.DataFrame([row])
+    return with_units(pd.DataFrame([row]), units)
 
 
 def errors(closure: Mapping, units: Units) -> pd.DataFrame:
@@ -82,19 +82,19 @@ def errors(closure: Mapping, units: Units) -> pd.DataFrame:
         }
         for name, meaning in ERRORS.items()
     ]
-    return _numbers(pd.DataFrame(rows), ("before", "after", "noise_floor"))
+    return _frame(rows, None, ("before", "after", "noise_floor"), units)
 
 
-def effects(closure: Mapping) -> pd.DataFrame:
+def effects(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per effect, added or candidate; `effect` is its number, from 0."""
     rows = [
         {**effect, "effect": k, "channels": " ".join(effect["channels"])}
         for k, effect in enumerate(closure["effects"])
     ]
-    return _numbers(pd.DataFrame(rows, columns=EFFECT), ("p_value", "heldout_gain_N", "heldout_rmse_N"))
+    return _frame(rows, EFFECT, ("p_value", "heldout_gain_N", "heldout_rmse_N"), units)
 
 
-def effect_parameters(closure: Mapping) -> pd.DataFrame:
+def effect_parameters(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per effect and parameter, with the ends of its 95 % interval."""
     columns = ["effect", "id", "parameter", "value", "lo95", "hi95", "unit"]
     rows = [
@@ -102,23 +102,25 @@ def effect_parameters(closure: Mapping) -> pd.DataFrame:
         for k, effect in enumerate(closure["effects"])
         for own in effect["parameters"]
     ]
-    return _numbers(pd.DataFrame(rows, columns=columns), ("value", "lo95", "hi95"))
+    return _frame(rows, columns, ("value", "lo95", "hi95"), units)
 
 
-def scatter(closure: Mapping) -> pd.DataFrame:
+def scatter(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per level of scatter: file, run, specimen."""
-    return _numbers(pd.DataFrame(closure["scatter"], columns=SCATTER), SCATTER[1:])
+    return _frame(closure["scatter"], SCATTER, SCATTER[1:], units)
 
 
-def sensitivity(closure: Mapping) -> pd.DataFrame:
+def sensitivity(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return a row per variable, level and target: the smallest effect to be found with 80 % chance."""
-    frame = pd.DataFrame(closure["sensitivity"], columns=SENSITIVITY)
-    return _numbers(frame, ("smallest_N", "smallest_pct", "files_needed"))
+    numbers = ("smallest_N", "smallest_pct", "files_needed")
+    return _frame(closure["sensitivity"], SENSITIVITY, numbers, units)
 
 
-def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Return the frame with these columns as numbers: an unavailable value (null) is NaN."""
-    return frame.assign(**{name: pd.to_numeric(frame[name]).astype(float) for name in names})
+def _frame(rows: list, columns: list[str] | None, numbers: Sequence[str], units: Units) -> pd.DataFrame:
+    """Return rows as a frame with units; of columns of numbers an unavailable value (null) is NaN."""
+    frame = pd.DataFrame(rows, columns=columns)
+    frame = frame.assign(**{name: pd.to_numeric(frame[name]).astype(float) for name in numbers})
+    return with_units(frame, units)
 
 
 # ---------------------------------------------------------------- fits

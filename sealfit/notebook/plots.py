@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from collections.abc import Callable
 
 from matplotlib.figure import Figure
 
 from sealfit.errors import RequestError
 from sealfit.pipeline import reported
+from sealfit.report.drawing import saved
 from sealfit.report.figures import draw_all
 from sealfit.report.page import answered
-from sealfit.report.style import compose, look
+from sealfit.report.style import compose
 from sealfit.store import Store
 
 
@@ -20,11 +19,7 @@ class ShownFigure(Figure):
     """A figure that a notebook shows as it is, without pyplot; its axes are there to be changed."""
 
     def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
-        with look(), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Glyph .* missing from font")  # drawn as a box
-            self.savefig(buffer, format="png")
-        return buffer.getvalue()
+        return saved(self, "png")
 
 
 class Plots:

@@ -43,8 +43,8 @@ def draw(plot: Plot) -> Drawn:
     """Return a plot, drawn; equal plots give equal bytes."""
     whole = compose(plot)
     panels = tuple(_svg(panel_figure(panel)) for panel in plot.panels)
-    png = _saved(whole, "png", {"Software": None}, dpi=PRINT)
-    pdf = _saved(whole, "pdf", {"CreationDate": None, "Creator": None, "Producer": None})
+    png = saved(whole, "png", {"Software": None}, dpi=PRINT)
+    pdf = saved(whole, "pdf", {"CreationDate": None, "Creator": None, "Producer": None})
     return Drawn(_svg(whole), png, pdf, panels)
 
 
@@ -88,7 +88,7 @@ def _svg(figure: Figure) -> str:
     explained = figure.findobj(lambda artist: hasattr(artist, "explained"))
     for number, artist in enumerate(explained):
         artist.set_gid(f"points{number}")
-    svg = _saved(figure, "svg", {"Date": None, "Creator": None}).decode()
+    svg = saved(figure, "svg", {"Date": None, "Creator": None}).decode()
     for artist in explained:
         svg = _with_titles(svg, artist.get_gid(), artist.explained)
     return svg
@@ -108,7 +108,8 @@ def _with_titles(svg: str, name: str, texts: Sequence[str]) -> str:
     return svg[:start] + group + svg[end:]
 
 
-def _saved(figure: Figure, form: str, metadata: dict, **options) -> bytes:
+def saved(figure: Figure, form: str, metadata: dict | None = None, **options) -> bytes:
+    """Return a figure as a file of a format, drawn in the report's style."""
     buffer = io.BytesIO()
     with look(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # the SVG has it as text

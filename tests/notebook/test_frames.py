@@ -109,8 +109,8 @@ def closure(**changed):
 
 
 def test_where_nothing_was_found_tables_have_their_columns():
-    assert frames.effects(closure())["id"].tolist() == []
-    assert list(frames.effect_parameters(closure())) == [
+    assert frames.effects(closure(), Config().units)["id"].tolist() == []
+    assert list(frames.effect_parameters(closure(), Config().units)) == [
         "effect",
         "id",
         "parameter",
@@ -119,7 +119,7 @@ def test_where_nothing_was_found_tables_have_their_columns():
         "hi95",
         "unit",
     ]
-    assert list(frames.scatter(closure())) == ["level", "sd_rel", "sd_N", "df"]
+    assert list(frames.scatter(closure(), Config().units)) == ["level", "sd_rel", "sd_N", "df"]
     assert frames.verdict(closure(), Config().units)["effects"].tolist() == [0]
 
 

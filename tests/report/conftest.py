@@ -9,7 +9,7 @@ from sealfit.report import drawing
 def unsaved(monkeypatch):
     """Draw panels and save none, for tests of what the page says: saving is most of a report's time."""
     monkeypatch.setattr(drawing, "compose", lambda plot: Figure())
-    monkeypatch.setattr(drawing, "_saved", lambda figure, form, metadata, **options: b"<svg/>")
+    monkeypatch.setattr(drawing, "saved", lambda figure, form, metadata, **options: b"<svg/>")
 
 
 @pytest.fixture(scope="module")
@@ -17,5 +17,5 @@ def only_panels():
     """Draw the panels, which are what the page shows, and not the plots composed of them, which OUT keeps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drawing, "compose", lambda plot: Figure())
-        patch.setattr(drawing, "_saved", only_svg)
+        patch.setattr(drawing, "saved", only_svg)
         yield

@@ -266,7 +266,7 @@ def hostile(tmp_path_factory):
     command = ["sealfit", "run", home / "campaign", "--out", home / "out", "--config", home / "rig.toml"]
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(said):
         patch.setattr(sys, "argv", [str(word) for word in command])
-        patch.setattr("sealfit.report.drawing._saved", only_svg)
+        patch.setattr("sealfit.report.drawing.saved", only_svg)
         code = cli.exit_code(cli.app)
     os.umask(old)
     assert code == 0, said.getvalue()
