@@ -16,12 +16,7 @@ if TYPE_CHECKING:
     from sealfit.store import Store
 
 STATISTICS = "statistics"  # `quantity` of rows about the fit itself
-OF_INGEST = {  # columns that its summary counts
-    "inputs": ["file", "status"],
-    "runs": ["used", "run_id"],
-    "quality": ["file", "action", "severity", "check", "column", "value", "reason"],
-    "steady": ["condition"],
-}
+OF_INGEST = ("inputs", "runs", "quality", "steady")  # tables that its summary counts
 CLOSURE_KEYS = (
     "verdict", "fit_quality", "sensitivity", "refused", "units", "noise_floor_N", "before", "after",
     "heldout_unit", "left", "next_runs", "outlier_files",
@@ -35,7 +30,7 @@ EFFECT_KEYS = (
 def of_steps(store: Store, steps: Iterable[str]) -> dict:
     """Return the summaries of `steps`, all of them current."""
     make = {
-        "ingest": lambda: of_ingest({name: store.read(name, columns) for name, columns in OF_INGEST.items()}),
+        "ingest": lambda: of_ingest({name: store.read(name) for name in OF_INGEST}),
         "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
         "fit-aging": lambda: of_aging(store),
         "fit-dynamic": lambda: of_dynamic(store.read("dynamic_fit")),
