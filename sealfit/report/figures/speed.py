@@ -18,7 +18,6 @@ from sealfit.report.notation import (
     ConditionNames,
     by_number,
     capital,
-    channel_words,
     count,
     given,
     is_number,
@@ -152,7 +151,7 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         panels.append(Panel(short(title), _force_alt(title, lines, config), draw, height, limits=limits))
     legend = [Key(short(names(c)), style.BLACK) for c in style.spread(unaged, style.MOST_KEYS)]
     for level in style.spread(levels, style.MOST_KEYS):
-        legend.append(Key(short(_level_label(last, level, names)), colour[level]))
+        legend.append(Key(short(names(f"{last}={level}")), colour[level]))
     both = points["direction"].nunique() > 1
     legend.append(Key("run means, forward" if both else "run means", style.FLOOR, "point"))
     if both:
@@ -229,12 +228,6 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
         # numbers have an order
         return {title: style.spread(group, MOST_COLOURS) for title, group in groups.items()}
     return {names(c): [c] for group in groups.values() for c in group}
-
-
-def _level_label(name: str, level: str, names: ConditionNames) -> str:
-    if name == "aging_days":
-        return f"{level} d"
-    return names(f"{name}={level}") if names.units.of(name) else f"{channel_words(name, names.units)} {level}"
 
 
 # ---------------------------------------------------------------- the pre-sliding rise
