@@ -31,17 +31,12 @@ MOST_LEFT_OUT = 50
 SPARE = 2
 
 
-def _inverse(celsius):
-    return 1 / (GAS_CONSTANT * (np.asarray(celsius, float) + aging_laws.ZERO_C))
-
-
-def _plain(percent):
-    return np.asarray(percent, float)
-
-
 # Variables that change the rate of aging: coefficient in ln k (kJ/mol, 1/%), attribute, and the function of
 # the attribute that the coefficient multiplies.
-DRIVERS = (("E", "temperature_C", _inverse), ("kappa", "compression_ratio_pct", _plain))
+DRIVERS = (
+    ("E", "temperature_C", lambda celsius: 1 / (GAS_CONSTANT * (celsius + aging_laws.ZERO_C))),
+    ("kappa", "compression_ratio_pct", lambda percent: percent),
+)
 
 
 @dataclass(frozen=True)
