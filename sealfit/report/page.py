@@ -23,6 +23,7 @@ from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
 from sealfit.report.notation import (
     ConditionNames,
+    capital,
     channel_label,
     count,
     given,
@@ -126,13 +127,6 @@ def provenance_facts(provenance: Mapping, config: Config) -> dict:
 
 # ---------------------------------------------------------------- page
 
-VERDICTS = {
-    "closed": "Closed",
-    "nothing_missing": "Nothing missing",
-    "unexplained": "Unexplained",
-    "cannot_tell": "Cannot tell",
-}
-
 
 @dataclass(frozen=True)
 class Report:
@@ -232,7 +226,7 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
     return {
         "of_properties": False,
         "closure": closure,
-        "badge": VERDICTS[closure["verdict"]],
+        "badge": capital(closure["verdict"].replace("_", " ")),
         "tone": closure["verdict"],
         "fit": fit_badge(closure),
         "verdict": words.verdict(closure, tables["shapes"], config),
