@@ -47,16 +47,11 @@ Counted = tuple[int, str]
 class Options:
     """How steps are done."""
 
-    workers: int = 1
-    """Processes of this computer that read trace files, fit and repeat the search."""
-    scheduler: str | None = None
-    """Address or scheduler file of a Dask cluster to do that instead; it has to see both folders."""
-    force: bool = False
-    """Do current steps too."""
-    strict: bool = False
-    """Stop at any fault of the campaign, after the first step."""
-    effects_folder: Path | None = None
-    """Folder of the user's own effects, which is run; it comes before the one that the config names."""
+    workers: int = 1  # processes of this computer that read trace files, fit and repeat the search
+    scheduler: str | None = None  # address or file of a Dask cluster instead; it has to see both folders
+    force: bool = False  # do current steps too
+    strict: bool = False  # stop at any fault of the campaign, after the first step
+    effects_folder: Path | None = None  # of the user's own effects, which is run; before that of the config
 
 
 def run(

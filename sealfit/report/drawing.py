@@ -19,14 +19,9 @@ from sealfit.config import Config
 from sealfit.report.notation import ConditionNames, given, plain
 from sealfit.report.style import Plot, compose, look, panel_figure
 
-PRINT = 300
-"""Pixels of a PNG file in an inch."""
-
-MOST_BINS = 30_000
-"""Bins of all runs that a page carries, about 1 MB; of more, every second, third ... is left."""
-
-LARGEST_STEP = 5
-"""Traces of which fewer than every fifth bin would be left are not in the page."""
+PRINT = 300  # pixels of a PNG file in an inch
+MOST_BINS = 30_000  # of all runs that a page has, about 1 MB; of more, every second, third ... is left
+LARGEST_STEP = 5  # traces of which fewer than every fifth bin would be left are not in the page
 
 
 @dataclass(frozen=True)

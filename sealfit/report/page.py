@@ -39,8 +39,7 @@ from sealfit.tables import FITTED, SCHEMAS
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
 MOST_INPUTS = 2000  # listed with their hashes; inputs.parquet has all
 RANK = {"error": 0, "warning": 1, "info": 2}  # of a severity, in the order of the page
-CSS = 96
-"""Pixels of a page in an inch."""
+CSS = 96  # pixels of a page in an inch
 
 
 def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[str]:

@@ -239,15 +239,13 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
 
 # ---------------------------------------------------------------- clauses that the report shares
 
+# Words for the levels of closure.json and of table `levels`.
 LEVEL_WORDS = {
     "trace": "along strokes", "sample": "along strokes", "stroke": "between strokes",
     "repeat": "between repeats", "file": "between repeats", "run": "between runs",
     "condition": "between specimens", "specimen": "between specimens",
 }  # fmt: skip
-"""Words for the levels of closure.json and of table `levels`."""
-
-NAMED = 3
-"""Variables whose smallest effect a sentence gives."""
+NAMED = 3  # variables whose smallest effect a sentence gives
 
 
 def outlier_clause(closure: Mapping) -> str:

@@ -104,8 +104,7 @@ def values_clause(one: Mapping) -> str:
     return f"{_count(one['values'], 'value')} in {_count(one['conditions'], 'condition')}; {scatter}"
 
 
-PER_SERIES = "mu_0 - a ln(1 + t/b)"
-"""The aging law of a series, in the words of an equation."""
+PER_SERIES = "mu_0 - a ln(1 + t/b)"  # the aging law of a series
 
 
 def property_sentences(one: Mapping) -> str:
