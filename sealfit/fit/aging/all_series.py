@@ -126,7 +126,8 @@ def _shared(
     """
     is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]
-    df = _usual_df(variance)
+    usual = variance.df[np.isfinite(variance.value) & ~variance.own]
+    df = float(usual[0]) if usual.size else np.nan
     if is_full.sum() < 2 or not curved & {c.name for c in own} or len({c.has_load for c in own}) > 1:
         return None
     if not np.isfinite(widened).all() or not np.isfinite(df):
@@ -154,12 +155,6 @@ def _shared(
 def _worse(rise: float, more: int, df: float) -> bool:
     """Return whether an F test finds a sum of squares' rise significant, for `more` degrees of freedom."""
     return more > 0 and bool(fdtrc(more, df, rise / more) < SHARED_P)
-
-
-def _usual_df(variance: UnitVariance) -> float:
-    """Return the degrees of freedom of conditions without a variance factor of their own."""
-    usual = variance.df[np.isfinite(variance.value) & ~variance.own]
-    return float(usual[0]) if usual.size else np.nan
 
 
 class _Curve:

@@ -106,14 +106,14 @@ def solve_conditions(
     runs = run_means(steady)
     scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
     runs = runs.assign(weight=run_weights(runs, scatter))
+    conditions = [make_condition(name, own) for name, own in runs.groupby("condition", sort=True)]
     if fitted is not None and scatter.df > 0:
         rows = fitted[(fitted["quantity"] == "steady") & fitted["value"].notna()]
         known = rows.groupby("condition")["value"].agg(np.array)  # in the order of NAMES
-        conditions = [make_condition(name, own) for name, own in runs.groupby("condition", sort=True)]
         for condition in conditions:
             condition.take(known[condition.name])
         return conditions, scatter, _unit_variance(conditions, scatter)
-    conditions = _solved(runs)
+    solve(conditions)
     if not scatter.df > 0:
         conditions = _more_likely_weights(conditions)
     first = _unit_variance(conditions, scatter)
@@ -121,12 +121,6 @@ def solve_conditions(
         if condition.model == FULL:
             drop_flat_curve(condition, value, df)
     return conditions, scatter, _unit_variance(conditions, scatter)
-
-
-def _solved(runs: pd.DataFrame) -> list[Condition]:
-    conditions = [make_condition(name, rows) for name, rows in runs.groupby("condition", sort=True)]
-    solve(conditions)
-    return conditions
 
 
 def _more_likely_weights(even: list[Condition]) -> list[Condition]:
