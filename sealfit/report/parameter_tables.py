@@ -124,11 +124,6 @@ class ParameterTable:
     compared: bool = False  # whether cells have the value before
     remarks: tuple[Markup, ...] = ()  # notes that several rows share, below the table
 
-    @property
-    def width(self) -> int:
-        """Number of columns of a parameter: the value above that before, the interval above u_sys."""
-        return 1 if self.single else 2
-
 
 def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
     """Return the break-away forces above the sliding force, as rows for the page, and their number."""

@@ -139,13 +139,11 @@ DPI = 150  # of a figure on a screen
 _EDGE, _BOTTOM, _TOP = 0.14, 0.5, 0.32  # inches around the axes
 
 RC = {
-    "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8.5,
     "axes.titlesize": 8.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    "axes.titlepad": 6,
     "axes.labelsize": 8.5,
     "axes.labelcolor": "#333333",
     "axes.edgecolor": "#8a9099",
@@ -169,7 +167,6 @@ RC = {
     "lines.linewidth": 1.4,
     "lines.markersize": 4,
     "legend.frameon": False,
-    "text.parse_math": True,
     "svg.fonttype": "none",
     "pdf.fonttype": 42,  # TrueType: many publishers refuse Type 3
     "svg.hashsalt": "sealfit",
