@@ -108,7 +108,7 @@ def _ranges(rows: Rows) -> dict:
     """Return the tested range of each numeric channel and the tested values of each category."""
     ranges: dict = {}
     for name in rows.channels:
-        values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
+        values = np.abs(rows.values(name)) if name == "speed_mm_s" else rows.values(name)
         if values.dtype.kind == "f":
             known = values[np.isfinite(values)]
             if known.size:
