@@ -14,8 +14,10 @@ import pytest
 
 pytest.importorskip("distributed")
 
+from dask import config as dask_config
 from dask_here import DaskHere
 
+from sealfit.cli import app, exit_code
 from sealfit.closure import loop
 from sealfit.engine.run_map import Cluster, on_cluster, run_map
 from sealfit.errors import RequestError, WorkerError
@@ -29,30 +31,20 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 
 
-def started(folder):
+@pytest.fixture(scope="module")
+def one_cluster(tmp_path_factory):
     """A scheduler and two workers, stopped in the end."""
-    made = DaskHere(folder, workers=2, paths=(HERE, ROOT / "benchmarks"))
+    made = DaskHere(tmp_path_factory.mktemp("dask"), workers=2, paths=(HERE, ROOT / "benchmarks"))
     try:
         yield made.wait()
     finally:
         made.stop()
 
 
-@pytest.fixture(scope="module")
-def one_cluster(tmp_path_factory):
-    yield from started(tmp_path_factory.mktemp("dask"))
-
-
 @pytest.fixture
 def dask(one_cluster):
     """A cluster whose workers a test may kill."""
     return one_cluster.mend()
-
-
-@pytest.fixture
-def own_cluster(tmp_path):
-    """A cluster whose scheduler a test may kill."""
-    yield from started(tmp_path)
 
 
 def square(number):
@@ -111,23 +103,13 @@ def test_a_map_survives_a_killed_worker(dask):
         assert first + list(made) == [n * n for n in range(30)]
 
 
-def test_a_lost_scheduler_is_a_clear_error_wherever_it_is_missed(own_cluster):
-    with on_cluster(str(own_cluster.file)):
-        made = run_map(slow_square, range(30), together=1)
-        next(made)
-        own_cluster.scheduler.kill()
-        own_cluster.scheduler.wait()
-        for missed in (lambda: list(made), lambda: list(run_map(square, range(3)))):
-            with pytest.raises(
-                WorkerError, match=r"went away\. Look at the scheduler, and run the command again"
-            ):
-                missed()
-
-
-def test_work_that_kills_every_worker_is_a_clear_error(dask, monkeypatch):
+def test_work_that_kills_every_worker_and_a_cluster_without_workers_are_clear_errors(dask, monkeypatch):
     monkeypatch.setattr("sealfit.engine.run_map.ALONE_S", 3.0)
     with on_cluster(str(dask.file)), pytest.raises(WorkerError, match=r"no workers left.*start them again"):
         list(run_map(fatal, range(1)))
+    no_workers = pytest.raises(RequestError, match=r"has no workers\. Start one: dask worker")
+    with no_workers, on_cluster(str(dask.file)):
+        pytest.fail("it has none")
 
 
 def test_a_folder_that_workers_do_not_see_is_refused(dask, tmp_path):
@@ -151,18 +133,6 @@ def test_what_is_no_scheduler_is_said_at_once(tmp_path):
         (tmp_path / "scheduler.json").write_text(text)
         with pytest.raises(RequestError, match=r"scheduler\.json is not a scheduler file"):
             Cluster(str(tmp_path / "scheduler.json"))
-
-
-def test_a_cluster_without_workers_is_a_clear_error(dask):
-    for worker in dask.workers:
-        worker.kill()
-        worker.wait()
-    time.sleep(1.0)
-    with (
-        pytest.raises(RequestError, match=r"has no workers\. Start one: dask worker"),
-        on_cluster(str(dask.file)),
-    ):
-        pytest.fail("it has none")
 
 
 # ---------------------------------------------------------------- the whole pipeline
@@ -224,36 +194,40 @@ OPENSSL = shutil.which("openssl")
 
 
 @pytest.mark.skipif(OPENSSL is None, reason="no openssl on PATH to make a certificate")
-def test_over_tls_only_who_has_the_certificate_connects(campaign, tmp_path, monkeypatch):
+def test_over_tls_only_who_has_the_certificate_connects(campaign, tmp_path, monkeypatch, capsys):
     key, cert = tmp_path / "key.pem", tmp_path / "cert.pem"
     make = f"req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=here -keyout {key} -out {cert}"
     subprocess.run([OPENSSL, *make.split()], check=True, capture_output=True)
-    ours = {"REQUIRE_ENCRYPTION": "true", "TLS__CA_FILE": cert}
-    for role in ("SCHEDULER", "WORKER", "CLIENT"):
-        ours |= {f"TLS__{role}__CERT": cert, f"TLS__{role}__KEY": key}
+    ours = {"require-encryption": True, "tls.ca-file": str(cert)}
+    for role in ("scheduler", "worker", "client"):
+        ours |= {f"tls.{role}.cert": str(cert), f"tls.{role}.key": str(key)}
+    ours = {f"distributed.comm.{name}": value for name, value in ours.items()}
     with monkeypatch.context() as patch:
         for name, value in ours.items():
-            patch.setenv(f"DASK_DISTRIBUTED__COMM__{name}", str(value))
+            spelled = name.upper().replace("-", "_").replace(".", "__")
+            patch.setenv(f"DASK_{spelled}", str(value))
         made = DaskHere(tmp_path, workers=1, protocol="tls")
-        own = dict(os.environ)
-    others = {name: value for name, value in own.items() if not name.startswith("DASK_")}
+
+    def checked(scheduler):
+        monkeypatch.setattr(sys, "argv", ["sealfit", "check", str(campaign[0]), "--scheduler", scheduler])
+        return exit_code(app), capsys.readouterr().err
+
     try:
         until = time.monotonic() + 60
         while not made.file.exists() and time.monotonic() < until:
             time.sleep(0.2)
-        assert json.loads(made.file.read_text("utf-8"))["address"].startswith("tls://")
-        command = [sys.executable, "-m", "sealfit", "check", str(campaign[0]), "--scheduler", str(made.file)]
-        plain = [*command[:-1], json.loads(made.file.read_text("utf-8"))["address"].replace("tls", "tcp")]
-        inside, outside, bare = (
-            subprocess.run(asked, env=environment, capture_output=True, text=True, timeout=120)
-            for asked, environment in ((command, own), (command, others), (plain, own))
-        )
+        address = json.loads(made.file.read_text("utf-8"))["address"]
+        assert address.startswith("tls://")
+        with dask_config.set(ours):
+            inside = checked(str(made.file))
+            bare = checked(address.replace("tls", "tcp"))
+        outside = checked(str(made.file))
     finally:
         made.stop()
-    assert inside.returncode == 0, inside.stderr
-    assert outside.returncode == bare.returncode == 1
-    assert "asks for a certificate, and none is set here" in outside.stderr
-    assert "is not encrypted" in bare.stderr
+    assert inside[0] == 0, inside[1]
+    assert outside[0] == bare[0] == 1
+    assert "asks for a certificate, and none is set here" in outside[1]
+    assert "is not encrypted" in bare[1]
 
 
 def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(
@@ -279,3 +253,18 @@ def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
     run(folder, tmp_path / "there", rig, steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
     assert kills.killed
     assert_same_results(tmp_path / "there", here, closure)
+
+
+# ---------------------------------------------------------------- the end of the scheduler
+def test_a_lost_scheduler_is_a_clear_error_wherever_it_is_missed(dask):
+    """The last test of this file, as it leaves no scheduler."""
+    with on_cluster(str(dask.file)):
+        made = run_map(slow_square, range(30), together=1)
+        next(made)
+        dask.scheduler.kill()
+        dask.scheduler.wait()
+        for missed in (lambda: list(made), lambda: list(run_map(square, range(3)))):
+            with pytest.raises(
+                WorkerError, match=r"went away\. Look at the scheduler, and run the command again"
+            ):
+                missed()
