@@ -1,7 +1,8 @@
 """Tables of campaigns of known truth, as reports get them; laws are Eq. 14 and 15, scatter is drawn."""
 
+import copy
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, wraps
 
 import numpy as np
 import pandas as pd
@@ -95,6 +96,18 @@ class Made:
         return self.tables, self.closure, self.provenance, self.config
 
 
+def made_once(make):
+    """Make each campaign once in a process, and return a copy, for tests that change it."""
+    kept = cache(make)
+
+    @wraps(make)
+    def made(**options):
+        return copy.deepcopy(kept(**options))
+
+    return made
+
+
+@made_once
 def aging_campaign(
     *,
     temperatures=(60,),
@@ -226,7 +239,6 @@ def _laws(steady, fits, config):
     return {"aging_laws": table("aging_laws", laws), "master_curve": table("master_curve", curve)}
 
 
-@cache
 def paper_sized():
     """Return 73 conditions at 8 speeds, 1752 files."""
     return aging_campaign(

@@ -43,7 +43,7 @@ def test_the_page_is_of_the_after_model_and_says_its_reference(made, unsaved):
 
 
 def test_without_effects_nothing_is_doubled(unsaved):
-    made = aging_campaign(verdict="nothing_missing")
+    made = aging_campaign(verdict="nothing_missing", speeds=(1, 10), days=(4,))
     tables = with_after_fits(made.tables)
     assert not any(name.endswith("_before") and name != "residuals_before" for name in tables)
     page = Page(build_report(*made.arguments).html)

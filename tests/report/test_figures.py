@@ -1,4 +1,3 @@
-import io
 import re
 import warnings
 from xml.etree import ElementTree
@@ -7,8 +6,8 @@ import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 from report.made_campaigns import Made, aging_campaign, torque_campaign
 from report.made_tables import DROP, empty, shape_points, shapes, table
 
@@ -425,10 +424,9 @@ def test_every_panel_has_a_white_edge(made):
 
 
 def white_of(figure):
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    buffer.seek(0)
-    return imread(buffer).min(axis=2) == 1.0
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba()).min(axis=2) == 255
 
 
 def edge(image):
