@@ -80,7 +80,7 @@ def _rounded(values: pd.Series) -> list[float | None]:
 
 
 def _svg(figure: Figure) -> str:
-    explained = figure.findobj(lambda artist: hasattr(artist, "explained"))
+    explained = [line for ax in figure.axes for line in ax.lines if hasattr(line, "explained")]
     for number, artist in enumerate(explained):
         artist.set_gid(f"points{number}")
     svg = saved(figure, "svg", {"Date": None, "Creator": None}).decode()

@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import PurePath
 
 import pandas as pd
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from sealfit.config import Config
@@ -40,6 +40,7 @@ MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
 MOST_INPUTS = 2000  # listed with their hashes; inputs.parquet has all
 RANK = {"error": 0, "warning": 1, "info": 2}  # of a severity, in the order of the page
 CSS = 96  # pixels of a page in an inch
+TEMPLATES = Environment(autoescape=True, undefined=StrictUndefined, loader=PackageLoader("sealfit", "report"))
 
 
 def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[str]:
@@ -156,11 +157,10 @@ def build_report(
     images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
-    environment = Environment(autoescape=True, undefined=StrictUndefined)
-    environment.globals |= words.vocabulary(closure, tables["shapes"], config)
-    html = environment.from_string(_text("template.html")).render(
+    vocabulary = words.vocabulary(closure, tables["shapes"], config)
+    html = TEMPLATES.get_template("template.html").render(
         style=Markup(_text("style.css")), script=Markup(_text("report.js")), plots=images, runs=Markup(runs),
-        script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(), **content
+        script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(), **vocabulary, **content
     )  # fmt: skip
     return Report(html, figures)
 
