@@ -8,7 +8,7 @@ from trace_helpers import config
 
 from sealfit.errors import ConfigError
 from sealfit.fit.dynamic.starts import strokes_along
-from sealfit.fit.joint.rows import merge_directions, nesting_run
+from sealfit.fit.joint.rows import merge_directions, nesting_run, records
 from sealfit.fit.steady.uncertainty import run_means
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.window import acceleration
@@ -67,7 +67,7 @@ def test_a_run_with_several_speeds_is_a_run_for_each(tmp_path):
     npt.assert_allclose(steady["force_N"], expected, atol=0.05)
     assert set(tables["bins"]["run_id"]) == set(tables["traces_mean"]["run_id"]) == set(steady["run_id"])
     # All speeds and both directions of a file share its set-up: one run, in which the directions are merged.
-    assert set(nesting_run(steady)) == {"A"}
+    assert set(nesting_run(steady, records(steady))) == {"A"}
     means = run_means(merge_directions(steady).assign(direction=1))
     npt.assert_allclose(means["speed"], [20.0, 40.0, 80.0], rtol=0.01)
     assert means["files"].tolist() == [3, 3, 3]

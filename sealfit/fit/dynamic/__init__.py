@@ -14,7 +14,7 @@ from sealfit.engine.run_map import run_map
 from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke, mean_over
 from sealfit.fit.dynamic.presliding import Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
 from sealfit.fit.dynamic.starts import Along, Part, Start, starts_of, strokes_along, whole_strokes
-from sealfit.fit.joint.rows import nesting_run
+from sealfit.fit.joint.rows import nesting_run, records
 from sealfit.fit.steady import condition_keys, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
@@ -201,7 +201,7 @@ def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
     starts = {start.row: start for start in starts_of(along)}
     wholes = {whole.row: whole for whole in whole_strokes(along)}
     begun = steady.iloc[list(starts)]
-    table.loc[list(starts), "run_number"] = pd.factorize(nesting_run(begun))[0]
+    table.loc[list(starts), "run_number"] = pd.factorize(nesting_run(begun, records(begun)))[0]
     fitted = _fitted(steady_fit)
     tables = [[], [], [], []]
     for name, own in table.sort_values("group", kind="stable").groupby("condition", sort=True):

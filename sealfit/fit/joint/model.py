@@ -213,7 +213,7 @@ class Model:
     def vector(self) -> np.ndarray:
         """Return all fitted numbers, declared ones first, shape (size,)."""
         tail = [v[p.name] for t, v in zip(self.terms, self.values, strict=True) for p in t.effect.parameters]
-        return np.r_[self.theta, tail]
+        return np.concatenate([self.theta, tail])
 
     def at(self, vector: np.ndarray) -> Model:
         """Return the model with other fitted numbers, shape (size,)."""

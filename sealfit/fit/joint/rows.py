@@ -46,9 +46,10 @@ class Groups:
 
     def at(self, level: str) -> Groups:
         """Return the groups of a table with one row per group of `level`."""
-        first = self.starts[level]
-        levels = list(self.codes)
-        return Groups.of({name: self.codes[name][first] for name in levels[levels.index(level) :]})
+        first, levels = self.starts[level], list(self.codes)
+        levels = levels[levels.index(level) :]
+        starts = {name: np.searchsorted(first, self.starts[name]) for name in levels}
+        return Groups(starts, {name: self.codes[name][first] for name in levels})
 
     def repeated(self, count: int) -> Groups:
         """Return the groups of a table that repeats each row `count` times."""
@@ -83,7 +84,7 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     """
     rows = steady.assign(half_N=np.nan)
     record = records(rows)
-    run = rows["run_id"].where(nesting_run(rows) == rows["run_id"], rows["run_id"].str.rstrip("+-"))
+    run = rows["run_id"].where(nesting_run(rows, record) == rows["run_id"], rows["run_id"].str.rstrip("+-"))
     pace = rows["speed_mm_s"].abs()
     if "speed_set_mm_s" in rows.columns:
         pace = rows["speed_set_mm_s"].abs().fillna(pace)
@@ -246,7 +247,7 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     which these bins are a part, so that its model applies to them.
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
-    keys = [table["record"], nesting_run(table), table["specimen_id"]]
+    keys = [table["record"], nesting_run(table, table["record"]), table["specimen_id"]]
     codes = [table["stroke"].to_numpy(), *(pd.factorize(key, sort=True)[0] for key in keys)]
     order = np.lexsort(codes)
     table = table.iloc[order].reset_index(drop=True)
@@ -380,9 +381,9 @@ def records(table: pd.DataFrame) -> pd.Series:
     return table["file"].astype(str).map(dict(zip(file, file.where(whole, first), strict=True)))
 
 
-def nesting_run(table: pd.DataFrame) -> pd.Series:
+def nesting_run(table: pd.DataFrame, record: pd.Series) -> pd.Series:
     """Return each row's run, without speed and sign if the record has several speeds or both directions."""
-    both = table.groupby(records(table))["run_id"].transform("nunique") > 1
+    both = table.groupby(record)["run_id"].transform("nunique") > 1
     return table["run_id"].where(~both, _unsigned(table["run_id"]))
 
 
