@@ -6,7 +6,7 @@ import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
-from bins_helpers import LOAD_N, THREE_FOLDS, TRUE, TWO_FOLDS, make_bins, make_traces, warm
+from bins_helpers import LOAD_N, MANY_SPEEDS, THREE_FOLDS, TRUE, TWO_FOLDS, make_bins, make_traces, warm
 
 from sealfit.closure.confirm import TOO_SMALL
 from sealfit.closure.loop import close_loop
@@ -37,7 +37,7 @@ def null():
 
 @pytest.fixture(scope="module")
 def warming():
-    bins = make_bins(3, temperatures=(60.0,), bins=8, effect=warm, **SCATTER)
+    bins = make_bins(3, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4, setup=0.005, effect=warm)
     return bins, close(bins, THREE_FOLDS)
 
 
@@ -68,7 +68,8 @@ def test_an_effect_too_small_to_matter_is_refused_and_leaves_nothing_missing():
     def climb(table, force):
         return force + 0.001 * table["bin"]
 
-    document = close(make_bins(3, bins=8, noise_N=0.003, gain=1e-6, effect=climb)).document
+    bins = make_bins(3, temperatures=(60.0,), bins=8, noise_N=0.003, gain=1e-6, effect=climb)
+    document = close(bins).document
     assert document["refused"][0]["id"] == "linear"
     reasons = {refused["reason"] for refused in document["refused"]}
     assert reasons == {TOO_SMALL}
@@ -124,6 +125,25 @@ def test_a_repeat_of_the_loop_gives_the_same_to_the_last_digit(null):
     bins, closure = null
     again = close(bins)
     assert json.dumps(again.document) == json.dumps(closure.document)
+
+
+def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(warming, monkeypatch):
+    bins, whole = warming
+    monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)
+    monkeypatch.setattr("sealfit.closure.subsampling.STROKES", 120)
+    said = []
+    part = close_loop(bins, make_traces(bins), THREE_FOLDS, on_progress=said.append)
+    assert not any("show more" in text for text in said)
+    (one,), (other,) = part.document["effects"], whole.document["effects"]
+    assert (one["id"], one["channels"]) == (other["id"], other["channels"])
+    for own, full in zip(one["parameters"], other["parameters"], strict=True):
+        assert own["value"] == pytest.approx(full["value"], rel=1e-4)
+        assert own["ci95"] == pytest.approx(full["ci95"], rel=1e-3)
+    for name in ("before", "after"):
+        own, full = part.document[name], whole.document[name]
+        assert own["rmse_N"] == pytest.approx(full["rmse_N"], rel=1e-4)
+        assert own["heldout_rmse_N"] == pytest.approx(full["heldout_rmse_N"], rel=5e-3)
+    assert not part.tables["residuals_after"]["heldout_model_N"].isna().any()
 
 
 def points_of(bins):
@@ -265,7 +285,7 @@ def of_two_loads(**options):
 
 
 def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load():
-    bins = of_two_loads(temperatures=(60.0,), days=(4.0,), bins=3, **SCATTER)
+    bins = of_two_loads(temperatures=(60.0,), days=(4.0,), bins=3, repeats=2, **SCATTER)
     (found,) = close(bins).document["effects"]
     assert (found["id"], found["channels"][-1]) == ("power_viscous", "speed_mm_s")
     values = {p["name"]: p["value"] for p in found["parameters"]}

@@ -9,7 +9,7 @@ from sealfit.closure.predict import predict
 @pytest.fixture(scope="module")
 def of_three_speeds():
     """Bins at three speeds, and the model of them."""
-    bins = make_bins(speeds=(1.0, 8.0, 64.0), bins=6)
+    bins = make_bins(temperatures=(60.0,), speeds=(1.0, 8.0, 64.0), bins=4)
     return bins, close_loop(bins, make_traces(bins), TWO_FOLDS).model
 
 
@@ -37,7 +37,7 @@ def test_a_point_with_an_infinite_number_has_no_answer(of_three_speeds):
 
 
 def test_unaged_rubber_may_be_named_as_in_a_runs_table():
-    bins = make_bins(bins=6)
+    bins = make_bins(temperatures=(60.0,), repeats=2, bins=4)
     model = close_loop(bins, make_traces(bins), TWO_FOLDS).model
     points = bins[bins["aging_days"] == 0].head(2)
     answer = predict(model, points)
@@ -60,7 +60,9 @@ def test_a_point_outside_the_tests_says_which_of_its_numbers_is(of_three_speeds)
 
 
 def test_the_direction_of_a_point_is_that_of_its_speed():
-    bins = make_bins(directions=(1, -1), bins=6, repeats=2, effect=lambda table, force: force + 1.5)
+    bins = make_bins(
+        temperatures=(60.0,), directions=(1, -1), bins=4, repeats=2, effect=lambda table, force: force + 1.5
+    )
     model = close_loop(bins, make_traces(bins), TWO_FOLDS).model
     points = bins.groupby("direction").head(1).drop(columns="direction")
     own = np.sign(points["speed_mm_s"])

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.testing as npt
 import pytest
-from bins_helpers import THREE_FOLDS, TRUE, make_bins, make_traces, warm
+from bins_helpers import MANY_SPEEDS, THREE_FOLDS, TRUE, make_bins, make_traces
 
 from sealfit.closure.confirm import Context
 from sealfit.closure.loop import close_loop
@@ -59,9 +59,6 @@ def test_of_very_many_strokes_a_few_files_all_over_the_campaign_keep_several_bin
         assert merged_bins(table, seed).equals(left) == (seed == 1)
 
 
-MANY_SPEEDS = (1.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 60.0)
-
-
 @pytest.fixture
 def few(monkeypatch):
     """A search that begins with 40 strokes, whatever the model."""
@@ -104,26 +101,6 @@ def test_few_runs_of_very_many_strokes_are_all_searched(few, monkeypatch):
     monkeypatch.setattr("sealfit.closure.subsampling.RUNS", rows.groups.starts["run"].size)
     (part,) = subsamples(rows, 1)
     assert part.whole
-
-
-def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(monkeypatch):
-    bins = make_bins(3, effect=warm, setup=0.005, temperatures=(60.0,), speeds=MANY_SPEEDS, bins=4)
-    monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)
-    found, said = [], []
-    for strokes in (120, 10_000):
-        monkeypatch.setattr("sealfit.closure.subsampling.STROKES", strokes)
-        found.append(close_loop(bins, make_traces(bins), THREE_FOLDS, on_progress=said.append))
-    assert not any("show more" in text for text in said)
-    part, whole = (closed.document for closed in found)
-    (one,), (other,) = part["effects"], whole["effects"]
-    assert (one["id"], one["channels"]) == (other["id"], other["channels"])
-    for own, full in zip(one["parameters"], other["parameters"], strict=True):
-        assert own["value"] == pytest.approx(full["value"], rel=1e-4)
-        assert own["ci95"] == pytest.approx(full["ci95"], rel=1e-3)
-    for name in ("before", "after"):
-        assert part[name]["rmse_N"] == pytest.approx(whole[name]["rmse_N"], rel=1e-4)
-        assert part[name]["heldout_rmse_N"] == pytest.approx(whole[name]["heldout_rmse_N"], rel=5e-3)
-    assert not found[0].tables["residuals_after"]["heldout_model_N"].isna().any()
 
 
 @pytest.mark.parametrize(("acts_on", "other", "seed"), [("mu", "force", 2), ("force", "mu", 6)])
