@@ -16,6 +16,7 @@ import hashlib
 import io
 import json
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import pyarrow as pa
@@ -57,27 +58,31 @@ def changed(value: object) -> Iterator[object]:
         yield from (value + "x", "<b>{{x}}$\\int")
 
 
-def forgeries(document: dict) -> Iterator[tuple[str, object]]:
-    """Yield what was changed, and the changed document."""
+def forgeries(document: dict) -> Iterator[tuple[tuple, object]]:
+    """Yield the path of a value and what it is replaced by."""
     for at in places(document):
-        value = document
-        for key in at:
-            value = value[key]
-        for other in changed(value):
-            if not at:
-                if other is not DELETED:
-                    yield "the whole", other
-                continue
-            forgery = copy.deepcopy(document)
-            holder = forgery
-            for key in at[:-1]:
-                holder = holder[key]
-            if other is DELETED:
-                del holder[at[-1]]
-            else:
-                holder[at[-1]] = other
-            how = "deleted" if other is DELETED else f"is {json.dumps(other)[:40]}"
-            yield f"{'.'.join(map(str, at))} {how}", forgery
+        yield from ((at, other) for other in changed(at_path(document, at)) if at or other is not DELETED)
+
+
+def at_path(value: object, at: tuple) -> object:
+    """Return the value at a path of a document."""
+    for key in at:
+        value = value[key]
+    return value
+
+
+def forgery(document: dict, at: tuple, other: object) -> tuple[str, object]:
+    """Return what was changed, and the changed document."""
+    if not at:
+        return "the whole", other
+    made = copy.deepcopy(document)
+    holder = at_path(made, at[:-1])
+    if other is DELETED:
+        del holder[at[-1]]
+    else:
+        holder[at[-1]] = other
+    how = "deleted" if other is DELETED else f"is {json.dumps(other)[:40]}"
+    return f"{'.'.join(map(str, at))} {how}", made
 
 
 def put(folder: Folder, name: str, raw: bytes) -> None:
@@ -97,8 +102,9 @@ def forged(work: Path, seed: int, step: int = 1) -> list[Found]:
     folder, found = results_folder(work, seed), []
     for name, readers in READERS.items():
         document = json.loads(folder.files[f"{name}.json"])
-        for what, forgery in list(forgeries(document))[seed % step :: step]:
-            put(folder, f"{name}.json", json.dumps(forgery).encode())
+        for at, other in islice(forgeries(document), seed % step, None, step):
+            what, made = forgery(document, at, other)
+            put(folder, f"{name}.json", json.dumps(made).encode())
             found += [Found(f"forged {name}.json", what, *_asked(folder, reader)) for reader in readers]
     folder.restore()
     return found
