@@ -177,7 +177,7 @@ def aging_campaign(
                     "before": mean * (1 - 0.6 * drop),
                     "after": mean * warm,
                 }
-                bins.append(pd.DataFrame(own))
+                bins.append(own)
                 files.append(
                     {
                         **key,
@@ -195,7 +195,8 @@ def aging_campaign(
                     }
                 )
             traces.append(trace(run, (temperature, compression, day), mean, speed, drop, trace_points, rng))
-    bins = add_keys(pd.concat(bins, ignore_index=True), config)
+    columns = {name: [np.broadcast_to(own[name], bins_per_file) for own in bins] for name in bins[0]}
+    bins = add_keys(pd.DataFrame({name: np.concatenate(own) for name, own in columns.items()}), config)
     steady = add_keys(pd.DataFrame(files), config)
     fits = add_keys(pd.DataFrame(fits), config)
     traces = add_keys(pd.concat(traces, ignore_index=True), config)
