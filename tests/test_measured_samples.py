@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from bins_helpers import THREE_FOLDS
 from page_helpers import DOCS, ROOT, as_in_a_clone, assert_as_shown, ran
 
 from sealfit.closure.loop import close_loop
@@ -26,6 +27,7 @@ def tutorial(tmp_path_factory):
 @pytest.fixture(scope="module")
 def pneuseal():
     config = load_config(ROOT / "configs" / "pneuseal.toml")
+    config = config.model_copy(update={"loop": THREE_FOLDS.loop})
     tables = ingest_campaign(ROOT / "sample_data" / "measured" / "pneuseal-repeats", config).tables
     return close_loop(tables["bins"], tables["traces"], config)
 
