@@ -15,6 +15,7 @@ from sealfit.store import Store
 pytestmark = pytest.mark.skipif(
     measured() is None, reason="SEALFIT_MEASURED names no folder of measured data"
 )
+FOLDS = "\n[loop]\nfolds = 3\n"  # each is a search of its own
 PRESSURE = '- pressure_bar * 1e5 * pi * (bore_m / 2) ** 2"'
 
 
@@ -42,6 +43,7 @@ def test_kidney_friction_does_not_hang_on_the_piston_area(tmp_path, part):
 
 def test_emps_plateaus_go_through(tmp_path):
     config = emps_plateaus(measured(), tmp_path / "campaign")
+    config.write_text(config.read_text() + FOLDS)
     run(tmp_path / "campaign", tmp_path / "out", config, steps=STEPS[:-1])
     steady = Store.open(tmp_path / "out").read("steady")
     at = steady["speed_set_mm_s"] == 125
@@ -73,7 +75,7 @@ def test_emps_as_it_is(tmp_path):
     (text,) = re.findall(
         r"^```toml\n(name = \"emps\".*?)^```$", page.read_text("utf-8"), re.DOTALL | re.MULTILINE
     )
-    (tmp_path / "emps.toml").write_text(text)
+    (tmp_path / "emps.toml").write_text(text + FOLDS)
     out = tmp_path / "out"
     run(measured() / "emps" / "csv", out, tmp_path / "emps.toml", steps=STEPS[:-1])
     steady = Store.open(out).read("steady")
@@ -98,6 +100,7 @@ def test_emps_as_it_is(tmp_path):
 def test_kidney_has_a_slope_along_the_stroke_that_follows_the_pressure(tmp_path, monkeypatch):
     monkeypatch.setattr("sealfit.report.drawing.saved", only_svg)
     config = kidney_plain(measured(), tmp_path / "campaign")
+    config.write_text(config.read_text() + FOLDS)
     run(tmp_path / "campaign", tmp_path / "out", config)
     loop = json.loads((tmp_path / "out" / "closure.json").read_text())
     (slope,) = [e for e in loop["effects"] if e["id"] != "ripple"]
