@@ -142,8 +142,8 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
     """Return the few best proposals to refit, the best free shape among them.
 
     Each effect is kept at most once per target and on at most two. A grid is coarse, so physical effects get
-    a margin. Every further quantity and set of variables that explains nearly as much has a named form among
-    them: the missing effect biases the model it is tested on.
+    a margin. Every further physical effect, quantity and set of variables that explains nearly as much has a
+    named form among them: the missing effect biases the model it is tested on.
     """
     kept: list[Proposal] = []
     ranked = sorted(found, key=lambda p: p.bic - EQUAL_BIC * p.term.effect.physical)
@@ -156,6 +156,8 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
             kept.append(proposal)
     most = max((p.chi2 for p in found), default=0.0)
     near = [p for p in ranked if p.chi2 >= CONTENDER_SHARE * most and p.named]
+    mechanisms = {p.term.effect.id: p for p in reversed(near) if p.term.effect.physical}
+    kept += [p for p in mechanisms.values() if all(p.term.effect.id != own.term.effect.id for own in kept)]
     for part in (attrgetter("term.target"), attrgetter("term.channels")):
         known = {part(p) for p in kept if p.named}
         for own in dict.fromkeys(map(part, near)):

@@ -286,6 +286,18 @@ def test_every_set_of_variables_that_explains_nearly_as_much_has_named_forms_amo
     assert [p.term.effect.id for p in further] == ["power"]
 
 
+def test_a_mechanism_that_explains_nearly_as_much_is_among_those_refitted():
+    names, along = (
+        ("linear", "log", "quadratic", "power", "saturation", "hyperbolic", "bump", "step"),
+        ("distance_mm",),
+    )
+    first = [proposal(name, behind=k, channels=along) for k, name in enumerate(names)]
+    first = [replace(p, chi2=100.0) for p in first]
+    warming, weak = (replace(proposal("warming_distance", behind=30.0), chi2=chi2) for chi2 in (90.0, 50.0))
+    assert warming in naming._best_few([warming, *first])
+    assert weak not in naming._best_few([weak, *first])
+
+
 def test_a_free_shape_of_a_quantity_leaves_its_named_forms_among_those_refitted():
     names = ("linear", "log", "quadratic", "power", "saturation", "hyperbolic", "bump", "step")
     first = [proposal(name, "force", behind=k) for k, name in enumerate(names)]
