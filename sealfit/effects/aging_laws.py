@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, Effect, Parameter, not_negative, positive, reference
+from sealfit.effects.contract import Effect, Parameter, amplitude, factors, not_negative, positive, reference
 
 # Gas constant in J/(mol K), CODATA 2018.
 GAS_CONSTANT = 8.314462618
@@ -45,11 +45,9 @@ ARRHENIUS_AGING = Effect(
     form="A (exp(E / R (1 / T_ref - 1 / T)) - 1)",
     reference="{temperature_C} = {temperature_C_ref}",
     reads=("temperature_C",),
-    acts_on=(("a", "multiply"), ("b", "multiply")),
+    acts_on=factors("a", "b"),
     parameters=(
-        Parameter(
-            "A", "{y}", 1.0, (-10.0, 10.0), "share of the aging that is thermally activated", linear=True
-        ),
+        amplitude("A", "{y}", 1.0, "share of the aging that is thermally activated", (-10.0, 10.0)),
         Parameter(
             "E",
             "J/mol",
@@ -93,16 +91,8 @@ COMPRESSION_FACTOR = Effect(
     form="A (100 - c) / 100",
     reference="not compressed (100 %)",
     reads=("compression_ratio_pct",),
-    acts_on=(
-        ("a", "multiply"),
-        ("b", "multiply"),
-        ("mu", "multiply"),
-        ("mu_s", "multiply"),
-        ("mu_c", "multiply"),
-    ),
-    parameters=(
-        Parameter("A", "{y}", 0.5, AMPLITUDE, "relative change per whole height taken away", linear=True),
-    ),
+    acts_on=factors("a", "b", "mu", "mu_s", "mu_c"),
+    parameters=(amplitude("A", "{y}", 0.5, "relative change per whole height taken away"),),
     shape=compression_factor_shape,
     source=f"Friction after aging at 80, 90 and 100 % of the height: {WU}. First order: ours.",
     # By hand: a fifth of the height taken away.
@@ -129,7 +119,7 @@ AGING_FLOOR = Effect(
     reads=("aging_days",),
     acts_on=ON_COEFFICIENTS,
     parameters=(
-        Parameter("A", "{y}", 0.03, (-10.0, 10.0), "fall given back per factor e of the time", linear=True),
+        amplitude("A", "{y}", 0.03, "fall given back per factor e of the time", (-10.0, 10.0)),
         Parameter("t_f", "{x}", 8.0, (1e-3, 1e5), "day from which it is given back", search="inside"),
     ),
     shape=aging_floor_shape,
@@ -158,7 +148,7 @@ AGING_INDUCTION = Effect(
     reads=("aging_days",),
     acts_on=ON_COEFFICIENTS,
     parameters=(
-        Parameter("A", "{y}", 0.05, (-10.0, 10.0), "largest lag behind the logarithmic law", linear=True),
+        amplitude("A", "{y}", 0.05, "largest lag behind the logarithmic law", (-10.0, 10.0)),
         Parameter("t_i", "{x}", 2.0, (1e-3, 1e5), "day of the largest lag", search="inside"),
     ),
     shape=aging_induction_shape,
@@ -188,7 +178,7 @@ AGING_DELAY = Effect(
     reads=("aging_days",),
     acts_on=ON_COEFFICIENTS,
     parameters=(
-        Parameter("A", "{y}", 0.05, (-10.0, 10.0), "loss for each unit of the logarithm", linear=True),
+        amplitude("A", "{y}", 0.05, "loss for each unit of the logarithm", (-10.0, 10.0)),
         Parameter("t_i", "{x}", 2.0, (1e-3, 1e5), "day on which aging starts", search="inside"),
         Parameter("b", "{x}", 0.1, (1e-3, 1e3), "time constant of the law", search=(0.03, 0.1, 0.3, 1.0)),
     ),
@@ -230,14 +220,7 @@ STRIBECK_SPEED_AGING = Effect(
     reads=("aging_days",),
     acts_on=(("v_s", "multiply"),),
     parameters=(
-        Parameter(
-            "A",
-            "{y}",
-            0.1,
-            (-5.0, 20.0),
-            "relative change of v_s per factor e of the aging time",
-            linear=True,
-        ),
+        amplitude("A", "{y}", 0.1, "relative change of v_s per factor e of the aging time", (-5.0, 20.0)),
         ONSET,
     ),
     shape=logarithmic_aging_shape,
@@ -256,9 +239,7 @@ VISCOSITY_AGING = Effect(
     reads=("aging_days",),
     acts_on=(("sigma_2", "add"), ("sigma_2", "multiply")),
     parameters=(
-        Parameter(
-            "A", "{y}", 0.01, AMPLITUDE, "change of sigma_2 per factor e of the aging time", linear=True
-        ),
+        amplitude("A", "{y}", 0.01, "change of sigma_2 per factor e of the aging time"),
         ONSET,
     ),
     shape=logarithmic_aging_shape,

@@ -9,24 +9,21 @@ from typing import NamedTuple
 import numpy as np
 
 from sealfit.effects.contract import (
-    AMPLITUDE,
-    ANYWHERE,
     CHANNEL,
     PHASE,
     PHASES,
     SECOND,
     Effect,
     Parameter,
+    amplitude,
+    closed_form,
     deviation,
+    factors,
     log_ratio,
     log_ratio_from_zero,
     not_negative,
     sine_attenuation,
 )
-
-# A closed form is of any one channel, acts anywhere and names no mechanism, unless it says otherwise.
-closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, physical=False)
-
 
 # ---------------------------------------------------------------- one channel
 
@@ -45,7 +42,7 @@ LINEAR = closed_form(
     equation=r"h = A (x - x_{ref})",
     form="A (x - x_ref)",
     reference="{x} = {x_ref}",
-    parameters=(Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "slope", linear=True),),
+    parameters=(amplitude("A", "{y}/{x}", 0.01, "slope"),),
     shape=linear_shape,
     source="Form: ours. First order of any smooth dependence.",
     # By hand: 0.5 * (7 - 3).
@@ -69,10 +66,10 @@ LINEAR_EACH_WAY = closed_form(
     form="A_f (x - x_ref) forward, A_b (x - x_ref) backward",
     reference="{x} = {x_ref}",
     reads=(CHANNEL, "direction"),
-    acts_on=(("mu", "multiply"), ("force", "multiply")),
+    acts_on=factors("mu", "force"),
     parameters=(
-        Parameter("A_f", "{y}/{x}", 0.01, AMPLITUDE, "slope forward", linear=True),
-        Parameter("A_b", "{y}/{x}", 0.0, AMPLITUDE, "slope backward", linear=True),
+        amplitude("A_f", "{y}/{x}", 0.01, "slope forward"),
+        amplitude("A_b", "{y}/{x}", 0.0, "slope backward"),
     ),
     shape=linear_each_way_shape,
     source="Form: ours. First order of any smooth dependence, in each direction by itself.",
@@ -94,8 +91,8 @@ QUADRATIC = closed_form(
     form="A (x - x_ref) + B (x - x_ref)^2",
     reference="{x} = {x_ref}",
     parameters=(
-        Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "slope at the reference", linear=True),
-        Parameter("B", "{y}/{x}^2", 0.001, AMPLITUDE, "curvature, halved", linear=True),
+        amplitude("A", "{y}/{x}", 0.01, "slope at the reference"),
+        amplitude("B", "{y}/{x}^2", 0.001, "curvature, halved"),
     ),
     shape=quadratic_shape,
     source="Form: ours. Second order of any smooth dependence.",
@@ -119,7 +116,7 @@ LOG = closed_form(
     equation=r"h = A \ln(x / x_{ref})",
     form="A ln(x / x_ref)",
     reference="{x} = {x_ref}",
-    parameters=(Parameter("A", "{y}", 0.05, AMPLITUDE, "change per factor e of the channel", linear=True),),
+    parameters=(amplitude("A", "{y}", 0.05, "change per factor e of the channel"),),
     shape=log_shape,
     source="Form: ours. The dependence that is the same in every decade.",
     # By hand: ten times the reference, ln 10 = 2.302585092994046.
@@ -142,9 +139,7 @@ LOG_GROWTH = closed_form(
     form="A ln(1 + x / x_0)",
     reference="{x} = 0",
     parameters=(
-        Parameter(
-            "A", "{y}", 0.05, AMPLITUDE, "change per factor e of the channel, well beyond x_0", linear=True
-        ),
+        amplitude("A", "{y}", 0.05, "change per factor e of the channel, well beyond x_0"),
         Parameter("x_0", "{x}", 1.0, (1e-6, 1e9), "where the logarithm sets in", search="span"),
     ),
     shape=log_growth_shape,
@@ -171,7 +166,7 @@ POWER = closed_form(
     form="A ((x / x_ref)^n - 1)",
     reference="{x} = {x_ref}",
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "size at the reference", linear=True),
+        amplitude("A", "{y}", 0.1, "size at the reference"),
         Parameter("n", "", 0.5, (-6.0, 6.0), "exponent", search=(-3.0, -2.0, -1.0, -0.5, 0.5, 1.5, 2.0, 3.0)),
     ),
     shape=power_shape,
@@ -196,7 +191,7 @@ EXPONENTIAL_APPROACH = closed_form(
     form="A (1 - exp(-x / tau))",
     reference="{x} = 0",
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "limit", linear=True),
+        amplitude("A", "{y}", 0.1, "limit"),
         Parameter("tau", "{x}", 1.0, (1e-6, 1e9), "scale of the approach", search="span"),
     ),
     shape=exponential_approach_shape,
@@ -223,7 +218,7 @@ SATURATION = closed_form(
     form="A x / (x + x_half)",
     reference="{x} = 0",
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "limit", linear=True),
+        amplitude("A", "{y}", 0.1, "limit"),
         Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where half of the limit is reached", search="span"),
     ),
     shape=saturation_shape,
@@ -255,7 +250,7 @@ HYPERBOLIC = closed_form(
     reference="limit of large {x}",
     acts_on=(("force", "add"),),
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "size at 0", linear=True),
+        amplitude("A", "{y}", 0.1, "size at 0"),
         Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where it has fallen to one half", search="span"),
     ),
     shape=hyperbolic_shape,
@@ -281,7 +276,7 @@ STEP = closed_form(
     form="A if x >= x_0, else 0",
     reference="{x} below {x_0}",
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "height of the step", linear=True),
+        amplitude("A", "{y}", 0.1, "height of the step"),
         Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "where it steps", search="between"),
     ),
     shape=step_shape,
@@ -303,7 +298,7 @@ BUMP = closed_form(
     form="A exp(-((x - x_0) / w)^2)",
     reference="away from {x} = {x_0}",
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "height", linear=True),
+        amplitude("A", "{y}", 0.1, "height"),
         Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "middle", search="inside"),
         Parameter("w", "{x}", 1.0, (1e-6, 1e12), "half-width at 1/e", search="span"),
     ),
@@ -334,7 +329,7 @@ SINUSOID = closed_form(
     reference="mean over a wavelength",
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude", linear=True),
+        amplitude("A", "{y}", 0.1, "amplitude"),
         Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
         Parameter("phi", "rad", 0.0, PHASE, "phase at 0, or x_ref", search=PHASES),
     ),
@@ -364,8 +359,8 @@ SINUSOID_CHANGING = closed_form(
     reads=(CHANNEL, SECOND),
     acts_on=SINUSOID.acts_on,
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude at z = z_ref", linear=True),
-        Parameter("B", "{y}/{z}", 0.0, AMPLITUDE, "its change with z", linear=True),
+        amplitude("A", "{y}", 0.1, "amplitude at z = z_ref"),
+        amplitude("B", "{y}/{z}", 0.0, "its change with z"),
         *SINUSOID.parameters[1:],
     ),
     shape=sinusoid_changing_shape,
@@ -400,8 +395,8 @@ SINUSOID_HARMONICS = closed_form(
     reference="mean over a wavelength",
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude once per period", linear=True),
-        Parameter("B", "{y}", 0.05, AMPLITUDE, "amplitude twice per period", linear=True),
+        amplitude("A", "{y}", 0.1, "amplitude once per period"),
+        amplitude("B", "{y}", 0.05, "amplitude twice per period"),
         Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
         Parameter("phi", "rad", 0.0, PHASE, "phase at 0", search=PHASES),
         Parameter("phi_2", "rad", 0.0, PHASE, "phase of the harmonic at 0", search=PHASES),
@@ -493,23 +488,21 @@ def _closed_form(scales: Scales, kind: str, *, alone: bool) -> Effect:
         "slope in the second channel",
     )
     names = ("A", "B", "C")[: 3 if alone else 1]
-    return Effect(
+    return closed_form(
         id=kind + s.suffix,
         label=f"product of {s.label}" + ", and each alone" * alone,
         equation=rf"h = A u w + B u + C w, \quad u = {s.u}, \; w = {s.w}" if alone else f"h = A {product}",
         form=f"A u w + B u + C w, u = {_plain(s.u)}, w = {_plain(s.w)}" if alone else f"A {_plain(product)}",
         reference=f"{{x}} = {{x_ref}} {'and' if alone else 'or'} {{z}} = {{z_ref}}",
         reads=(CHANNEL, SECOND),
-        acts_on=ANYWHERE,
         parameters=tuple(
-            Parameter(name, unit, 0.01 if name == "A" else 0.0, AMPLITUDE, meaning, linear=True)
+            amplitude(name, unit, 0.01 if name == "A" else 0.0, meaning)
             for name, unit, meaning in zip(names, s.units, meanings, strict=False)
         ),
         shape=partial(bilinear_shape, s.first, s.second),
         source=f"Form: ours, the first {'terms' if alone else 'mixed term'} of a Taylor series "
         f"in {s.variables}.",
         worked=(s.inputs, {name: values[name] for name in names}, s.worked[alone]),
-        physical=False,
     )
 
 

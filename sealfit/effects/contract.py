@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -86,6 +87,18 @@ class Parameter:
         return self.name.rstrip("_")
 
 
+def amplitude(
+    name: str, unit: str, start: float, meaning: str, bounds: tuple[float, float] = AMPLITUDE
+) -> Parameter:
+    """Return an amplitude: a parameter in which the shape is linear."""
+    return Parameter(name, unit, start, bounds, meaning, linear=True)
+
+
+def factors(*targets: Target) -> tuple[tuple[Target, Operation], ...]:
+    """Return the `acts_on` of an effect that is a factor on each of some targets, most likely first."""
+    return tuple((target, "multiply") for target in targets)
+
+
 @dataclass(frozen=True, slots=True)
 class Effect:
     """One physical effect, or one closed form of any channel.
@@ -140,6 +153,10 @@ class Effect:
     def start(self) -> dict[str, float]:
         """Return the start value of every parameter."""
         return {p.name: p.start for p in self.parameters}
+
+
+# A closed form is of any one channel, acts anywhere and names no mechanism, unless it says otherwise.
+closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, physical=False)
 
 
 def reference(inputs: Mapping[str, object], name: str, default: float) -> float:

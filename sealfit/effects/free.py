@@ -8,7 +8,7 @@ from inspect import signature
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ANYWHERE, CHANNEL, SECOND, Effect, Parameter, deviation
+from sealfit.effects.contract import CHANNEL, SECOND, Effect, amplitude, closed_form, deviation
 from sealfit.errors import ParameterError
 
 # ---------------------------------------------------------------- categories
@@ -40,16 +40,14 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
     """
     names = _different(LEVELS, categories)
     mean = shares(means, len(names))
-    return Effect(
+    return closed_form(
         id=LEVELS,
         label="levels of {x}",
         equation=r"h = \sum_k d_k [x = k]",
         form=f"d_k for category k of {listed(names)}; 0 for {names[0]}" + LESS_MEAN * (means is not None),
         reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {names[0]}",
-        reads=(CHANNEL,),
-        acts_on=ANYWHERE,
         parameters=tuple(
-            Parameter(f"d_{k}", "{y}", 0.0, AMPLITUDE, f"{name} less {names[0]}", linear=True)
+            amplitude(f"d_{k}", "{y}", 0.0, f"{name} less {names[0]}")
             for k, name in enumerate(names[1:], start=1)
         ),
         shape=partial(_levels, names, mean),
@@ -60,7 +58,6 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
             {f"d_{k}": k / 10 for k in range(1, len(names))},
             (len(names) - 1) / 10 - sum(k / 10 * m for k, m in enumerate(mean)),
         ),
-        physical=False,
     )
 
 
@@ -94,17 +91,15 @@ def slopes_effect(categories: Sequence[str]) -> Effect:
         If there are fewer than two categories, or one stands twice.
     """
     names = _different(SLOPES, categories)
-    return Effect(
+    return closed_form(
         id=SLOPES,
         label="linear in {x}, by {z}",
         equation=r"h = \sum_k e_k [z = k] (x - x_{ref})",
         form=f"e_k (x - x_ref) for category k of {listed(names)}",
         reference="{x} = {x_ref}",
         reads=(CHANNEL, SECOND),
-        acts_on=ANYWHERE,
         parameters=tuple(
-            Parameter(f"e_{k}", "{y}/{x}", 0.0, AMPLITUDE, f"slope for {name}", linear=True)
-            for k, name in enumerate(names, start=1)
+            amplitude(f"e_{k}", "{y}/{x}", 0.0, f"slope for {name}") for k, name in enumerate(names, start=1)
         ),
         shape=partial(_slopes, names),
         source="Form: ours. One slope per category, as in any analysis of covariance.",
@@ -114,7 +109,6 @@ def slopes_effect(categories: Sequence[str]) -> Effect:
             {f"e_{k}": k / 10 for k in range(1, len(names) + 1)},
             0.3 * len(names),
         ),
-        physical=False,
     )
 
 
@@ -179,24 +173,15 @@ def smooth_effect(
     mean = shares(means, len(places))
     free = [j for j in range(len(places)) if j != zero]
     x = places[free[-1]]
-    return Effect(
+    return closed_form(
         id=SMOOTH,
         label="smooth in {x}",
         equation=r"h = \sum_j c_j B_j(x)",
         form=f"natural cubic spline through (x_j, c_j), knots {listed(places)}, zero at {places[zero]:.6g}"
         + LESS_MEAN * (means is not None),
         reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {places[zero]:.6g}",
-        reads=(CHANNEL,),
-        acts_on=ANYWHERE,
         parameters=tuple(
-            Parameter(
-                f"c_{j + 1}",
-                "{y}",
-                0.0,
-                AMPLITUDE,
-                f"value at {places[j]:.6g} less that at {places[zero]:.6g}",
-                linear=True,
-            )
+            amplitude(f"c_{j + 1}", "{y}", 0.0, f"value at {places[j]:.6g} less that at {places[zero]:.6g}")
             for j in free
         ),
         shape=partial(_spline, places, zero, mean),
@@ -207,7 +192,6 @@ def smooth_effect(
             {f"c_{j + 1}": float(j + 1) for j in free},
             float(free[-1] + 1) - sum((j + 1) * mean[j] for j in free),
         ),
-        physical=False,
     )
 
 
@@ -283,7 +267,7 @@ def surface_effect(
         raise ParameterError(f"surface: knots {knots} must be two or more rising numbers.", fix="Sort them.")
     places = list(np.ndindex(len(knots[0]), len(knots[1])))
     mean = shares(means, len(places))
-    return Effect(
+    return closed_form(
         id=SURFACE,
         label="smooth in {x} and {z}",
         equation=r"h = \sum_{jk} c_{jk} B_j(x) B_k(z)",
@@ -295,15 +279,12 @@ def surface_effect(
         if means is not None
         else f"{{x}} = {knots[0][0]:.6g} and {{z}} = {knots[1][0]:.6g}",
         reads=(CHANNEL, SECOND),
-        acts_on=ANYWHERE,
         parameters=tuple(
-            Parameter(
+            amplitude(
                 f"c_{j + 1}{k + 1}",
                 "{y}",
                 0.0,
-                AMPLITUDE,
                 f"value at {knots[0][j]:.6g} and {knots[1][k]:.6g} less that at the first knots",
-                linear=True,
             )
             for j, k in places[1:]
         ),
@@ -317,7 +298,6 @@ def surface_effect(
             + places[-1][1]
             - sum((10.0 * j + k) * m for (j, k), m in zip(places, mean, strict=True)),
         ),
-        physical=False,
     )
 
 

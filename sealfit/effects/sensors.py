@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from sealfit.effects.contract import (
-    AMPLITUDE,
     CHANNEL,
     PHASE,
     PHASES,
     Effect,
     Parameter,
+    amplitude,
     deviation,
+    factors,
     reference,
     sine_attenuation,
 )
@@ -40,7 +41,7 @@ RIPPLE = Effect(
     reads=("displacement_mm",),
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(
-        Parameter("A", "{y}", 0.1, AMPLITUDE, "amplitude", linear=True),
+        amplitude("A", "{y}", 0.1, "amplitude"),
         Parameter(
             "lambda_",
             "{x}",
@@ -77,7 +78,7 @@ DRIFT = Effect(
     reference="time 0 of the file",
     reads=("time_s",),
     acts_on=(("force", "add"),),
-    parameters=(Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "drift of the force per time", linear=True),),
+    parameters=(amplitude("A", "{y}/{x}", 0.01, "drift of the force per time"),),
     shape=drift_shape,
     source="Form: ours. First order in time of a slow change of the zero.",
     # By hand: 20 s at 0.02 N/s.
@@ -103,7 +104,7 @@ ZERO_OFFSET = Effect(
     reference="zero offset removed",
     reads=("direction",),
     acts_on=(("force", "add"),),
-    parameters=(Parameter("A", "{y}", 0.1, AMPLITUDE, "force shown when none acts", linear=True),),
+    parameters=(amplitude("A", "{y}", 0.1, "force shown when none acts"),),
     shape=zero_offset_shape,
     source="Form: ours. Definition of a zero offset.",
     # By hand: the offset itself, in both directions.
@@ -130,8 +131,8 @@ OFFSET_SLOPE = Effect(
     reads=(CHANNEL, "direction"),
     acts_on=(("force", "add"),),
     parameters=(
-        Parameter("A", "{y}/{x}", 0.01, AMPLITUDE, "slope of the offset", linear=True),
-        Parameter("B", "{y}", 0.0, AMPLITUDE, "offset at the reference", linear=True),
+        amplitude("A", "{y}/{x}", 0.01, "slope of the offset"),
+        amplitude("B", "{y}", 0.0, "offset at the reference"),
     ),
     shape=offset_slope_shape,
     source="Form: ours. Force on a piston, F = p A, and definition of a zero offset.",
@@ -159,18 +160,11 @@ ASYMMETRY = Effect(
     reference="mean of the two directions",
     reads=("direction",),
     acts_on=(
-        ("mu", "multiply"),
-        ("force", "multiply"),
-        ("mu_c", "multiply"),
-        ("mu_s", "multiply"),
-        ("v_s", "multiply"),
+        *factors("mu", "force", "mu_c", "mu_s", "v_s"),
         ("sigma_2", "add"),
-        ("sigma_2", "multiply"),
-        ("a", "multiply"),
-        ("b", "multiply"),
-        ("mu_0", "multiply"),
+        *factors("sigma_2", "a", "b", "mu_0"),
     ),
-    parameters=(Parameter("A", "{y}", 0.05, AMPLITUDE, "forward minus backward", linear=True),),
+    parameters=(amplitude("A", "{y}", 0.05, "forward minus backward"),),
     shape=asymmetry_shape,
     source="Form: ours. The odd part in direction of any two values, halved so that A is their difference.",
     # By hand: backward, half of the difference below the mean.
@@ -197,7 +191,7 @@ CAMPAIGN_DRIFT = Effect(
     reference="start of the campaign",
     reads=("elapsed_h",),
     acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
-    parameters=(Parameter("A", "{y}/{x}", 1e-4, AMPLITUDE, "change per time of the campaign", linear=True),),
+    parameters=(amplitude("A", "{y}/{x}", 1e-4, "change per time of the campaign"),),
     shape=campaign_drift_shape,
     source="Form: ours. First order in time of a slow change.",
     # By hand: 200 h at 0.05 % per hour.
@@ -238,7 +232,7 @@ DAY_AND_NIGHT = Effect(
     reads=("elapsed_h",),
     acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
     parameters=(
-        Parameter("A", "{y}", 0.02, AMPLITUDE, "amplitude", linear=True),
+        amplitude("A", "{y}", 0.02, "amplitude"),
         Parameter(
             "t_0",
             "{x}",

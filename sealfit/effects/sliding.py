@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ROOM, Effect, Parameter, not_negative, positive, reference
+from sealfit.effects.contract import (
+    ROOM,
+    Effect,
+    Parameter,
+    amplitude,
+    factors,
+    not_negative,
+    positive,
+    reference,
+)
 
 # Search grids: repeats, strokes and rests over which a contact changes, and Stribeck exponents.
 REPEATS = (0.3, 0.6, 1.0, 2.0, 4.0, 8.0)
@@ -36,9 +45,9 @@ CONDITIONING = Effect(
     form="A (1 - exp(-(n - 1) / n_0))",
     reference="first repeat",
     reads=("repeat",),
-    acts_on=(("mu", "multiply"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
+    acts_on=factors("mu", "force", "mu_s", "mu_c"),
     parameters=(
-        Parameter("A", "{y}", -0.05, (-0.95, 10.0), "relative change once conditioned", linear=True),
+        amplitude("A", "{y}", -0.05, "relative change once conditioned", (-0.95, 10.0)),
         Parameter("n_0", "", 1.0, (0.1, 1e3), "repeats that conditioning takes", search=REPEATS),
     ),
     shape=conditioning_shape,
@@ -69,9 +78,9 @@ RUN_IN = Effect(
     form="A (1 - exp(-(n - 1) / n_0))",
     reference="first stroke",
     reads=("stroke",),
-    acts_on=(("mu", "multiply"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply")),
+    acts_on=factors("mu", "force", "mu_s", "mu_c"),
     parameters=(
-        Parameter("A", "{y}", -0.05, (-0.95, 10.0), "relative change once run in", linear=True),
+        amplitude("A", "{y}", -0.05, "relative change once run in", (-0.95, 10.0)),
         Parameter("n_0", "", 3.0, (0.1, 1e5), "strokes that run-in takes", search=STROKES),
     ),
     shape=run_in_shape,
@@ -98,9 +107,9 @@ REST_STRENGTHENING = Effect(
     form="A ln(1 + t / t_0)",
     reference="no rest before the stroke",
     reads=("rest_s",),
-    acts_on=(("mu_s", "multiply"), ("mu", "multiply"), ("mu_c", "multiply")),
+    acts_on=factors("mu_s", "mu", "mu_c"),
     parameters=(
-        Parameter("A", "{y}", 0.02, (-0.5, 5.0), "relative growth per factor e of the rest", linear=True),
+        amplitude("A", "{y}", 0.02, "relative growth per factor e of the rest", (-0.5, 5.0)),
         Parameter("t_0", "{x}", 1.0, (1e-4, 1e6), "rest below which nothing shows", search=RESTS),
     ),
     shape=rest_strengthening_shape,
@@ -135,10 +144,8 @@ LOAD_EXPONENT = Effect(
     form="A ln(N / N_ref), A = n - 1 to first order in mu ~ N^(n-1)",
     reference="{load_N} = {load_N_ref}",
     reads=("load_N",),
-    acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply")),
-    parameters=(
-        Parameter("A", "{y}", -0.1, (-2.0, 2.0), "load exponent of friction minus one", linear=True),
-    ),
+    acts_on=factors("mu", "mu_c", "mu_s"),
+    parameters=(amplitude("A", "{y}", -0.1, "load exponent of friction minus one", (-2.0, 2.0)),),
     shape=load_exponent_shape,
     source="Schallamach 1952, The load dependence of rubber friction, Proc. Phys. Soc. B 65, 657-661. "
     "First order: ours.",
@@ -174,7 +181,7 @@ STRIBECK_EXPONENT = Effect(
     reads=("speed_mm_s",),
     acts_on=(("mu", "add"), ("mu", "multiply")),
     parameters=(
-        Parameter("A", "{y}", 0.3, (-10.0, 10.0), "drop of friction across the Stribeck curve", linear=True),
+        amplitude("A", "{y}", 0.3, "drop of friction across the Stribeck curve", (-10.0, 10.0)),
         Parameter("v_s", "{x}", 5.0, (1e-6, 1e6), "Stribeck speed", search="ratio"),
         Parameter("n", "", 1.0, (0.2, 10.0), "Stribeck exponent", search=EXPONENTS, vanishes_at=2.0),
     ),
@@ -209,7 +216,7 @@ LOG_RATE = Effect(
     reference="{speed_mm_s} = {speed_mm_s_ref}",
     reads=("speed_mm_s",),
     acts_on=(("mu", "multiply"), ("mu_c", "multiply"), ("mu", "add"), ("mu_c", "add")),
-    parameters=(Parameter("A", "{y}", 0.02, (-2.0, 2.0), "change per factor e of the speed", linear=True),),
+    parameters=(amplitude("A", "{y}", 0.02, "change per factor e of the speed", (-2.0, 2.0)),),
     shape=log_rate_shape,
     source="Rate term of rate-and-state friction; review: Baumberger & Caroli 2006, Adv. Phys. 55, 279-348.",
     # By hand: ten times the reference speed, backward: ln 10 = 2.302585092994046.
@@ -239,7 +246,7 @@ POWER_VISCOUS = Effect(
     reads=("speed_mm_s",),
     acts_on=(("force", "add"),),
     parameters=(
-        Parameter("A", "{y}", 1.0, AMPLITUDE, "force at the reference speed", linear=True),
+        amplitude("A", "{y}", 1.0, "force at the reference speed"),
         Parameter(
             "n", "", 0.5, (0.05, 4.0), "exponent of the speed", search=(0.2, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0)
         ),
@@ -274,7 +281,7 @@ GROSCH_PEAK = Effect(
     reads=("speed_mm_s",),
     acts_on=(("mu", "multiply"), ("mu", "add"), ("mu_c", "multiply"), ("mu_c", "add")),
     parameters=(
-        Parameter("A", "{y}", 0.1, (-0.95, 10.0), "height of the peak", linear=True),
+        amplitude("A", "{y}", 0.1, "height of the peak", (-0.95, 10.0)),
         Parameter("v_p", "{x}", 10.0, (1e-6, 1e6), "speed at the peak", search="ratio"),
         Parameter(
             "w", "decade", 1.0, (0.05, 10.0), "half-width at 1/e", search=(0.2, 0.4, 0.7, 1.0, 1.5, 2.5)
@@ -306,9 +313,7 @@ HUMIDITY = Effect(
     reference="{humidity_pct} = {humidity_pct_ref}",
     reads=("humidity_pct",),
     acts_on=ROOM,
-    parameters=(
-        Parameter("A", "{y}/{x}", -0.001, AMPLITUDE, "change per per cent of relative humidity", linear=True),
-    ),
+    parameters=(amplitude("A", "{y}/{x}", -0.001, "change per per cent of relative humidity"),),
     shape=humidity_shape,
     source="Form: ours. First order in the humidity about its mean.",
     # By hand: 20 % below the reference at -0.1 % of friction per per cent.

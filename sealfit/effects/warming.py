@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealfit.effects.contract import AMPLITUDE, ROOM, Effect, Parameter, deviation, reference
+from sealfit.effects.contract import ROOM, Effect, Parameter, amplitude, deviation, factors, reference
 
-FRICTION = (("mu", "multiply"), ("mu_c", "multiply"), ("mu_s", "multiply"), ("force", "multiply"))
+FRICTION = factors("mu", "mu_c", "mu_s", "force")
+# Bounds of the share of friction that is lost.
+LOST = (-5.0, 0.95)
 FALL = "Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112."
 LUMPED = "Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford."
 
@@ -33,7 +35,7 @@ WARMING_TIME = Effect(
     reads=("time_s",),
     acts_on=FRICTION,
     parameters=(
-        Parameter("A", "{y}", 0.1, (-5.0, 0.95), "share of friction lost when warm", linear=True),
+        amplitude("A", "{y}", 0.1, "share of friction lost when warm", LOST),
         Parameter("tau", "{x}", 5.0, (1e-4, 1e7), "time constant of warming", search="span"),
     ),
     shape=warming_time_shape,
@@ -64,7 +66,7 @@ WARMING_DISTANCE = Effect(
     reads=("distance_mm",),
     acts_on=FRICTION,
     parameters=(
-        Parameter("A", "{y}", 0.1, (-5.0, 0.95), "share of friction lost when warm", linear=True),
+        amplitude("A", "{y}", 0.1, "share of friction lost when warm", LOST),
         Parameter("s_0", "{x}", 20.0, (1e-4, 1e7), "distance over which the contact warms", search="span"),
     ),
     shape=warming_distance_shape,
@@ -103,13 +105,12 @@ WARMING_POWER = Effect(
     reads=("time_s", "speed_mm_s", "load_N"),
     acts_on=FRICTION,
     parameters=(
-        Parameter(
+        amplitude(
             "A",
             "{y}",
             0.05,
-            (-5.0, 0.95),
             "share of friction lost when warm at reference load and speed",
-            linear=True,
+            bounds=LOST,
         ),
         Parameter("tau", "{x}", 5.0, (1e-4, 1e7), "time constant of warming", search="span"),
     ),
@@ -151,16 +152,7 @@ WARMING_CONDUCTION = Effect(
     reference="cold contact (distance 0)",
     reads=("distance_mm", "speed_mm_s"),
     acts_on=FRICTION,
-    parameters=(
-        Parameter(
-            "A",
-            "{y}",
-            0.05,
-            (-5.0, 0.95),
-            "share of friction lost at reference speed and distance",
-            linear=True,
-        ),
-    ),
+    parameters=(amplitude("A", "{y}", 0.05, "share of friction lost at reference speed and distance", LOST),),
     shape=warming_conduction_shape,
     source="Half-space under a steady flux: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford; "
     "sliding contacts: Jaeger 1942, J. Proc. R. Soc. New South Wales 76, 203-224. "
@@ -192,13 +184,12 @@ WARMING_CONDUCTION_LOAD = Effect(
     reads=("distance_mm", "speed_mm_s", "load_N"),
     acts_on=FRICTION,
     parameters=(
-        Parameter(
+        amplitude(
             "A",
             "{y}",
             0.05,
-            (-5.0, 0.95),
             "share of friction lost at reference load, speed and distance",
-            linear=True,
+            bounds=LOST,
         ),
     ),
     shape=warming_conduction_load_shape,
@@ -237,7 +228,7 @@ LAB_TEMPERATURE = Effect(
     reference="{lab_temperature_C} = {lab_temperature_C_ref}",
     reads=("lab_temperature_C",),
     acts_on=ROOM,
-    parameters=(Parameter("A", "{y}/{x}", -0.005, AMPLITUDE, "change per degree", linear=True),),
+    parameters=(amplitude("A", "{y}/{x}", -0.005, "change per degree"),),
     shape=lab_temperature_shape,
     source="Friction and temperature of rubber: Grosch 1963, Proc. R. Soc. A 274, 21-39, "
     "doi:10.1098/rspa.1963.0112. First order: ours.",
