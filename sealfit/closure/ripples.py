@@ -149,19 +149,21 @@ def _with_shared_phase(peak: Peak, samples: pd.DataFrame) -> Peak:
 
 def _coherent(spectrum: Spectrum) -> list[Peak]:
     """Return the best peak per mode: the same force in both directions, or with the sign of the direction."""
-    peaks = []
-    for common in spectrum.common:
-        total = np.abs(common.total) ** 2
-        statistic = total / np.maximum(common.square, 1e-300)
+    peaks, modes = [], len(spectrum.units)
+    for mode in range(modes):
+        total = np.abs(spectrum.total[mode]) ** 2
+        statistic = total / np.maximum(spectrum.square[mode], 1e-300)
         sharp = total / background(np.where(spectrum.taken, np.nan, total)) > ABOVE_BACKGROUND
-        if common.units < 4 or not sharp.any():
+        units = int(spectrum.units[mode])
+        if units < 4 or not sharp.any():
             continue
         k = int(np.argmax(np.where(sharp & tops(total) & ~spectrum.taken, statistic, 0)))
-        p = _coherence_p(statistic[k], common.units) * spectrum.frequency.size * len(spectrum.common)
-        wavelength, amplitude = _refined(total, spectrum.frequency, k), float(np.abs(common.amplitude[k]))
+        p = _coherence_p(statistic[k], units) * spectrum.frequency.size * modes
+        wavelength = _refined(total, spectrum.frequency, k)
+        amplitude = float(np.abs(spectrum.mean[mode, k]))
         energy = amplitude**2 * float(spectrum.count[k])
         peaks.append(
-            Peak(spectrum.axis, wavelength, common.symmetric, True, float(statistic[k]), p, amplitude, energy)
+            Peak(spectrum.axis, wavelength, mode == 0, True, float(statistic[k]), p, amplitude, energy)
         )
     return peaks
 

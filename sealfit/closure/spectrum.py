@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import add
 
 import numpy as np
 import pandas as pd
@@ -153,27 +154,22 @@ LEAST_FREQUENCIES = 4  # Fewest frequencies of a spectrum.
 
 
 @dataclass(frozen=True)
-class Common:
-    """Sums over units of complex amplitudes, for one mode (symmetric or with the sign of the direction)."""
-
-    symmetric: bool  # True: same force in both directions; False: with the sign of the direction
-    total: np.ndarray  # (f,) complex, each unit on its own scale
-    square: np.ndarray  # (f,) sum of the units' powers, each on its own scale
-    units: int
-    amplitude: np.ndarray  # (f,) complex, mean over the passes that reach the frequency
-
-
-@dataclass(frozen=True)
 class Spectrum:
-    """Sums over passes (units in one direction) at f frequencies."""
+    """Sums over passes (units in one direction) at f frequencies, and over units in one or two modes.
+
+    The first mode is the same force in both directions, the second has the sign of the direction.
+    """
 
     axis: str
     frequency: np.ndarray  # (f,)
+    taken: np.ndarray  # (f,) whether it lies in the main lobe of a component in the model
     count: np.ndarray  # (f,) passes that reach each frequency
     power: np.ndarray  # (f,) mean of the passes' powers, each on its own scale
     amplitude: np.ndarray  # (f,) root mean square of the passes' amplitudes
-    common: tuple[Common, ...]
-    taken: np.ndarray  # (f,) whether it lies in the main lobe of a component in the model
+    total: np.ndarray  # (modes, f) complex sum of the units' amplitudes, each on its own scale
+    square: np.ndarray  # (modes, f) sum of the units' powers, each on its own scale
+    mean: np.ndarray  # (modes, f) complex mean amplitude of the passes that reach the frequency
+    units: np.ndarray  # (modes,)
 
 
 def spectrum_of(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -> Spectrum | None:
@@ -187,19 +183,15 @@ def spectrum_of(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -
     grid = _Grid.of(Strokes.of(samples, axis))
     if grid is None:
         return None
-    sums = _Sums.none(grid.numbers.size, min(np.unique(grid.strokes.direction).size, 2))
-    for chosen in _parts(grid.strokes.unit, grid.points):
-        _add(sums, grid, chosen)
-    frequency, count = grid.numbers / grid.longest, np.maximum(sums.count, 1)
+    parts = (_sums(grid, chosen) for chosen in _parts(grid.strokes.unit, grid.points))
+    sums = reduce(lambda one, other: list(map(add, one, other)), parts)
+    passes, power, square, total, scaled, amplitude, units = sums
+    frequency, count = grid.numbers / grid.longest, np.maximum(passes, 1)
     taken = np.zeros(frequency.size, dtype=bool)
     for wavelength in known:
         taken |= np.abs(frequency - 1 / wavelength) <= LOBE / grid.longest
-    common = tuple(
-        Common(k == 0, sums.total[k], sums.scaled[k], int(units), sums.amplitude[k] / count)
-        for k, units in enumerate(sums.units)
-    )
-    amplitude = np.sqrt(sums.square / count)
-    return Spectrum(axis, frequency, sums.count, sums.power / count, amplitude, common, taken)
+    means = (power / count, np.sqrt(square / count), total, scaled, amplitude / count)
+    return Spectrum(axis, frequency, taken, passes, *means, units)
 
 
 @dataclass(frozen=True)
@@ -248,30 +240,14 @@ def _parts(unit: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     return np.split(order, begin[1:][np.diff(part) > 0])
 
 
-@dataclass(frozen=True)
-class _Sums:
-    """Sums over passes, (f,), and over units for each mode, symmetric first, (modes, f)."""
+def _sums(grid: _Grid, chosen: np.ndarray) -> list[np.ndarray]:
+    """Return the sums of a `Spectrum` over the chosen strokes, which are those of whole units.
 
-    count: np.ndarray
-    power: np.ndarray
-    square: np.ndarray
-    total: np.ndarray
-    scaled: np.ndarray
-    units: np.ndarray  # (modes,)
-    amplitude: np.ndarray
-
-    @classmethod
-    def none(cls, f: int, modes: int) -> _Sums:
-        total, amplitude = np.zeros((modes, f), dtype=complex), np.zeros((modes, f), dtype=complex)
-        return cls(*np.zeros((3, f)), total, np.zeros((modes, f)), np.zeros(modes), amplitude)
-
-
-def _add(sums: _Sums, grid: _Grid, chosen: np.ndarray) -> None:
-    """Add the chosen strokes, which are those of whole units, to the sums."""
+    They are those over passes (number, scaled power, power), shape (f,), and those over units in each mode
+    (scaled amplitude, scaled power, amplitude), shape (modes, f), and the number of units, (modes,).
+    """
     direction, reach = grid.strokes.direction[chosen], grid.reach[chosen]
     sides, width = np.unique(grid.strokes.direction), int(reach.max())
-    if not width:  # the strokes reach none of the frequencies
-        return
     units, unit = np.unique(grid.strokes.unit[chosen], return_inverse=True)
     passes = unit * sides.size + np.searchsorted(sides, direction)
     each = np.arange(unit.size)
@@ -281,20 +257,24 @@ def _add(sums: _Sums, grid: _Grid, chosen: np.ndarray) -> None:
     wave, known = (part.reshape(units.size, sides.size, width) for part in (wave, known > 0))
     power = _power(wave)
     mean = power.sum(axis=2) / np.maximum(known.sum(axis=2), 1)
-    sums.count[:width] += known.sum(axis=(0, 1))
-    sums.square[:width] += power.sum(axis=(0, 1))
-    sums.power[:width] += (power / np.maximum(mean, 1e-300)[:, :, None]).sum(axis=(0, 1))
+    scaled = power / np.maximum(mean, 1e-300)[:, :, None]
+    over_passes = [own.sum(axis=(0, 1)) for own in (known, scaled, power)]
     most = np.zeros(units.size, dtype=int)
     np.maximum.at(most, unit, reach)
-    for k in range(sums.units.size):
-        own = np.einsum("usf,s->uf", wave, sides) if k else wave.sum(axis=1)
-        power = _power(own)
-        square = _medians(power, most)  # units are scaled, so that one noisy file does not dominate
-        kept = square > 0
-        sums.total[k, :width] += (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
-        sums.scaled[k, :width] += (power[kept] / square[kept, None]).sum(axis=0)
-        sums.units[k] += own.any(axis=1).sum()
-        sums.amplitude[k, :width] += own.sum(axis=0)
+    modes = [wave.sum(axis=1), np.einsum("usf,s->uf", wave, sides)][: min(sides.size, 2)]
+    over_units = [np.stack(own) for own in zip(*(_sums_of_mode(own, most) for own in modes), strict=True)]
+    beyond = grid.numbers.size - width  # frequencies that none of the strokes reach
+    padded = [np.pad(own, [(0, 0)] * (own.ndim - 1) + [(0, beyond)]) for own in (*over_passes, *over_units)]
+    return [*padded, np.array([own.any(axis=1).sum() for own in modes])]
+
+
+def _sums_of_mode(own: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sums over units of one mode from their amplitudes, (units, f), reaching `most`, (units,)."""
+    power = _power(own)
+    square = _medians(power, most)  # units are scaled, so that one noisy file does not dominate
+    kept = square > 0
+    total = (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
+    return total, (power[kept] / square[kept, None]).sum(axis=0), own.sum(axis=0)
 
 
 def _transformed(grid: _Grid, chosen: np.ndarray) -> np.ndarray:
