@@ -261,19 +261,13 @@ class AcceptedEffect:
 class RefusedEffect:
     """A significant effect that is in no model, with the reason."""
 
-    term: Term
-    p_value: float
+    proposal: Proposal
     reason: str
-
-    @classmethod
-    def of(cls, proposal: Proposal, reason: str) -> RefusedEffect:
-        """Return a proposal as refused."""
-        return cls(proposal.term, proposal.p_value, reason)
 
     @property
     def weak(self) -> bool:
         """Whether its evidence is too weak for the verdict `unexplained`."""
-        return self.p_value > WEAK_P
+        return self.proposal.p_value > WEAK_P
 
     @property
     def negligible(self) -> bool:
@@ -298,14 +292,13 @@ def confirmed(
     samples: pd.DataFrame,
     context: Context,
     number: int,
-    refused: list[tuple[Proposal, str]],
-) -> AcceptedEffect | None:
+) -> tuple[AcceptedEffect | None, list[RefusedEffect]]:
     """Return the first of a round's best proposals that has a gain on held-out data; None if none has.
 
-    If none is confirmed, the significant ones are appended to `refused`, best first, each with the reason.
+    If none is confirmed, the significant ones are returned too, best first, each with the reason.
     """
     config = context.config
-    failed: list[tuple[Proposal, str]] = []
+    refused: list[RefusedEffect] = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
     for proposal in proposals[:MOST_PROPOSALS]:
         gain = heldout_gain(fitted, proposal, *folds_of)
@@ -320,11 +313,10 @@ def confirmed(
                 (rival, heldout_gain(fitted, rival, *folds_of).left_N if k < most else np.nan)
                 for k, rival in enumerate(rivals(proposal, proposals))
             )
-            return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, others, number)
+            return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, others, number), []
         if proposal.p_value <= config.loop.family_error:
-            failed.append((proposal, reason))
-    refused += failed
-    return None
+            refused.append(RefusedEffect(proposal, reason))
+    return None, refused
 
 
 def _reason_refused(

@@ -273,7 +273,7 @@ def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
         + "; ".join(describe(a.proposal.term, selection.after.rows) for a in selection.added)
     )
     reason = "its evidence is weak, and the repeated search finds it in no fold"
-    refused = [RefusedEffect.of(a.proposal, reason) for a in selection.added]
+    refused = [RefusedEffect(a.proposal, reason) for a in selection.added]
     return replace(selection, after=selection.before, added=(), refused=(*selection.refused, *refused))
 
 
@@ -302,7 +302,7 @@ def _only_gains(
         last = selection.added[-1].proposal
         reason = NEGATIVE if negative else "it does not lower the error, in sample or on held-out data"
         say(f"removed, because {reason}: {describe(last.term, selection.after.rows)}")
-        refused.append(RefusedEffect.of(last, reason))
+        refused.append(RefusedEffect(last, reason))
         model = selection.after.model.without_term(len(selection.added) - 1)
         own = (
             fit(model, selection.after.rows, selection.after.scatter, turns=2)

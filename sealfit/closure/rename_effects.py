@@ -185,7 +185,7 @@ class Renaming:
         self, without: Fitted, proposals: Sequence[Proposal], number: int
     ) -> AcceptedEffect | None:
         self.context.say(f"  round {number} again:")
-        return confirmed(without, proposals, self.samples, self.context, number, [])
+        return confirmed(without, proposals, self.samples, self.context, number)[0]
 
     def _channel(self, item: AcceptedEffect) -> str | None:
         """Return the channel along which an effect was found; None for a pair and for a ripple."""

@@ -183,12 +183,13 @@ def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
 
 
 def _refused(item: RefusedEffect, rows: Rows) -> dict:
+    term = item.proposal.term
     return {
-        "id": item.term.effect.id,
-        "channels": channels_of(item.term, rows),
-        "acts_on": item.term.acts_on,
-        "label": describe(item.term, rows),
-        "p_value": item.p_value,
+        "id": term.effect.id,
+        "channels": channels_of(term, rows),
+        "acts_on": term.acts_on,
+        "label": describe(term, rows),
+        "p_value": item.proposal.p_value,
         "reason": item.reason,
         "weak": item.weak,
     }
@@ -320,26 +321,30 @@ def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> di
     significant.
     """
     above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
+    level, channel, p_value = _left(selection)
+    return {"rmse_N": above, "level": level, "channel": channel, "p_value": p_value}
+
+
+def _left(selection: Selection) -> tuple[str | None, str | None, float | None]:
+    """Return level, channel and p-value of what is left; the least p-value if that is nothing."""
     left = selection.left
     if left is None and selection.worse:
-        item, rows = selection.worse[-1], selection.after.rows
-        found = {"level": effect_level(item.term, rows), "channel": " ".join(channels_of(item.term, rows))}
-        return {"rmse_N": above, **found, "p_value": item.p_value}
+        item, rows = selection.worse[-1].proposal, selection.after.rows
+        return effect_level(item.term, rows), " ".join(channels_of(item.term, rows)), item.p_value
     if left is None and selection.added:
         last = [
             c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P
         ]
         left = _unsteady_offset(selection) or _largest(selection.after, last)
     if isinstance(left, Peak):
-        return {"rmse_N": above, "level": "trace", "channel": left.axis, "p_value": left.p_value}
-    if left is not None:
-        names = [selection.channels[n].unit for n in left.channels if n in selection.channels]
-        level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
-        if left.channels[0] == "direction" and len(left.channels) > 1:
-            level = LEVEL_NAMES[max(names, key=FINER.get)]  # offsets differ along the other channel
-        return {"rmse_N": above, "level": level, "channel": " ".join(left.channels), "p_value": left.p_value}
-    smallest = min((c.p_value for c in selection.last), default=None)
-    return {"rmse_N": above, "level": None, "channel": None, "p_value": smallest}
+        return "trace", left.axis, left.p_value
+    if left is None:
+        return None, None, min((c.p_value for c in selection.last), default=None)
+    names = [selection.channels[n].unit for n in left.channels if n in selection.channels]
+    level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
+    if left.channels[0] == "direction" and len(left.channels) > 1:
+        level = LEVEL_NAMES[max(names, key=FINER.get)]  # offsets differ along the other channel
+    return level, " ".join(left.channels), left.p_value
 
 
 def _unsteady_offset(selection: Selection) -> Candidate | None:

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
-from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import propose_ripples
 from sealfit.closure.ripples import Peak, find_ripple
 from sealfit.fit.joint import Fitted, fit
@@ -46,10 +45,9 @@ class Ripples:
             number = len(self.added) + 1
             self.context.say(f"round {number}: a significant ripple in the samples, before all other effects")
             proposals = propose_ripples(own, self.found, self.samples, self.context.effects)
-            failed: list[tuple[Proposal, str]] = []
-            accepted = confirmed(own, proposals, self.samples, self.context, number, failed)
+            accepted, failed = confirmed(own, proposals, self.samples, self.context, number)
             if accepted is None:
-                self.refused += [RefusedEffect.of(*one) for one in failed[:1]]
+                self.refused += failed[:1]
                 self.found = None
                 break
             self.added.append(accepted)

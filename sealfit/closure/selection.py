@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import Channel, channels_of, searched
-from sealfit.closure.confirm import NEGLIGIBLE, AcceptedEffect, Context, RefusedEffect, confirmed
+from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
 from sealfit.closure.criteria import EQUAL_BIC, HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
 from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
@@ -131,10 +131,10 @@ class _Loop:
         return propose(base, candidates, self.channels, self.context.effects, also)
 
     def confirm(
-        self, base: Fitted, proposals: Sequence[Proposal], number: int, failed: list[tuple[Proposal, str]]
-    ) -> AcceptedEffect | None:
-        """Return the first proposal that held-out data confirm; if none, `failed` has the reasons."""
-        return confirmed(base, proposals, self.samples, self.context, number, failed)
+        self, base: Fitted, proposals: Sequence[Proposal], number: int
+    ) -> tuple[AcceptedEffect | None, list[RefusedEffect]]:
+        """Return the first proposal that held-out data confirm; if there is none, those refused."""
+        return confirmed(base, proposals, self.samples, self.context, number)
 
     def run_round(self, number: int) -> bool:
         """Search, name and confirm once; return whether the loop is finished."""
@@ -156,15 +156,14 @@ class _Loop:
         claimable, laws = self.found.claimable, [p for _, p in self.found.laws]
         open_ += [c for c in _related_candidates(open_, claimable) if c.key not in self.refused]
         proposals = self.propose(self.fitted, open_, laws)
-        failed: list[tuple[Proposal, str]] = []
-        accepted = self.confirm(self.fitted, proposals, number, failed)
-        self.unconfirmed += [RefusedEffect.of(*one) for one in failed[:1]]
+        accepted, failed = self.confirm(self.fitted, proposals, number)
+        self.unconfirmed += failed[:1]
         if accepted is None:
             keys = {p.source for p in proposals[:MOST_PROPOSALS]} or {c.key for c in open_}
-            for proposal, reason in failed:
-                if reason in NEGLIGIBLE:
-                    self.negligible |= _no_stronger(open_, proposal) | {proposal.source}
-            if failed and failed[0][1] in NEGLIGIBLE:
+            for one in failed:
+                if one.negligible:
+                    self.negligible |= _no_stronger(open_, one.proposal) | {one.proposal.source}
+            if failed and failed[0].negligible:
                 keys |= _no_stronger(open_, proposals[0])
                 self.negligible |= keys
             self.refused |= keys
@@ -218,12 +217,12 @@ class _Loop:
         """Return two effects of which each is confirmed given the other; None if they are not."""
         first, second = two
         base = self.propose(self.fitted, [first])[0].fitted
-        later = self.confirm(base, self.propose(base, [second]), number, [])
+        later, _ = self.confirm(base, self.propose(base, [second]), number)
         if later is None:
             return None
         alone = later.proposal.fitted.model.without_term(len(self.fitted.model.terms))
         base = fit(alone, self.rows, self.fitted.scatter, turns=1)
-        earlier = self.confirm(base, self.propose(base, [first]), number, [])
+        earlier, _ = self.confirm(base, self.propose(base, [first]), number)
         return None if earlier is None else (later, earlier)
 
     def open_candidates(self) -> list[Candidate]:

@@ -10,7 +10,6 @@ from sealfit.closure.confirm import (
     NEGATIVE,
     Context,
     Gain,
-    RefusedEffect,
     about_means,
     confirmed,
     gain_between_settings,
@@ -160,10 +159,9 @@ def decide(monkeypatch):
         monkeypatch.setattr(
             "sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen]
         )
-        failed, said = [], []
+        said = []
         context = Context(Config(), EFFECTS, **{"compare": False, "say": said.append} | more)
-        found = confirmed(FORCE, proposals, samples, context, 2, failed)
-        return found, [RefusedEffect.of(*one) for one in failed], said
+        return *confirmed(FORCE, proposals, samples, context, 2), said
 
     return decided
 
@@ -221,7 +219,7 @@ def test_the_first_that_gains_is_accepted_with_its_rivals_and_what_they_leave(de
 def test_after_three_that_gain_nothing_none_is_tried_and_these_are_refused(decide):
     found, refused, said = decide([proposal(f"form {k}") for k in range(4)], [Gain(-1, 2, -1)] * 3 + [GOOD])
     assert found is None
-    assert [item.term.effect.id for item in refused] == ["form 0", "form 1", "form 2"]
+    assert [item.proposal.term.effect.id for item in refused] == ["form 0", "form 1", "form 2"]
     assert len(said) == 3
 
 

@@ -241,7 +241,7 @@ def test_of_an_unconfirmed_effect_and_a_later_one_the_one_that_explains_least_go
         for k, (t, v) in enumerate(zip(fitted.model.terms, fitted.model.values, strict=True))
     ]
     channels = {c.name: c for c in find_channels(rows)}
-    monkeypatch.setattr(rename_effects, "confirmed", lambda *given: None)
+    monkeypatch.setattr(rename_effects, "confirmed", lambda *given: (None, []))
     again = rename_effects.Renaming(channels, rows.table.head(0), Context(Config(), EFFECTS, compare=False))
     after, kept = again.earlier_renamed(fitted, added)
     assert [a.proposal.term.channels for a in kept] == [("oil_ppm",)]

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from sealfit.closure import selection
-from sealfit.closure.confirm import NO_GAIN
+from sealfit.closure.confirm import NO_GAIN, RefusedEffect
 from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.closure.search import MaskedPair
 from sealfit.config import Config
@@ -71,7 +71,8 @@ def test_effects_that_take_the_place_of_others_in_turn_end_the_loop(monkeypatch)
     """A new effect that is merged with an earlier one, and explains no more, is not asked again."""
     candidate, proposal = named("c", "x", 5.0)
     loop = a_loop(monkeypatch, [candidate], [proposal])
-    monkeypatch.setattr(loop.__class__, "confirm", lambda own, *given: SimpleNamespace(proposal=proposal))
+    accepted = SimpleNamespace(proposal=proposal)
+    monkeypatch.setattr(loop.__class__, "confirm", lambda own, *given: (accepted, []))
     monkeypatch.setattr(loop.__class__, "add", lambda own, accepted: setattr(own, "added", ["merged"]))
     assert not loop.run_round(2)
     assert loop.refused == {"c"}
@@ -83,10 +84,8 @@ def test_an_effect_too_small_to_matter_is_known_behind_another_that_is_refused(m
         named(*one) for one in (("pair", "speed", 90.0), ("time", "time", 50.0), ("weaker", "time", 40.0))
     )
     loop = a_loop(monkeypatch, [pair, time, weaker], [of_pair, of_time])
-    reasons = [(of_pair, "it does not lower the error"), (of_time, NO_GAIN)]
-    monkeypatch.setattr(
-        loop.__class__, "confirm", lambda own, base, found, number, failed: failed.extend(reasons)
-    )
+    failed = [RefusedEffect(of_pair, "it does not lower the error"), RefusedEffect(of_time, NO_GAIN)]
+    monkeypatch.setattr(loop.__class__, "confirm", lambda own, *given: (None, failed))
     assert not loop.run_round(2)
     assert loop.refused == {"pair", "time"}
     assert loop.negligible == {"time", "weaker"}
