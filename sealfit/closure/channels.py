@@ -13,21 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import BSpline
 
-from sealfit.closure.criteria import (
-    COMMON_PROFILE,
-    CONSTANT_SHARE,
-    FREE_DF,
-    LEAST_BESIDE_STEP,
-    LEAST_GROUPS_HELD_OUT,
-    MANY_RUNS,
-    MOST_LEVELS,
-    MOST_SET_VALUES,
-    MOST_STEPS,
-    MOST_WITHIN_RUNS,
-    SAME_VALUE,
-    SHORT_STROKES,
-)
-from sealfit.closure.criteria import LEAST_UNITS_OF_SLOPES as LEAST_SLOPES
+from sealfit.closure import criteria
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.declared import SAME_SPEED
@@ -86,7 +72,7 @@ def too_short(rows: Rows) -> bool:
         return False
     last = np.r_[rows.groups.starts["stroke"][1:], rows.force.size] - 1
     left = np.abs(rows.table["presliding_N"].to_numpy(dtype=float)[last])
-    return bool(np.mean(left > STILL_RISING * np.abs(rows.force[last])) >= SHORT_STROKES)
+    return bool(np.mean(left > STILL_RISING * np.abs(rows.force[last])) >= criteria.SHORT_STROKES)
 
 
 def find_channels(
@@ -110,7 +96,7 @@ def find_channels(
             if _one_setting(name, values):
                 continue
             values = settings(level_values(values, rows))
-        elif not 2 <= np.unique(values).size <= MOST_LEVELS:
+        elif not 2 <= np.unique(values).size <= criteria.MOST_LEVELS:
             continue
         if name == "stroke" and "direction" not in skip and _out_and_back(values, rows):
             continue
@@ -151,7 +137,7 @@ def incomplete_channels(rows: Rows) -> list[dict]:
 def unit_of(values: np.ndarray, rows: Rows) -> str:
     """Return the coarsest level in whose groups `values` are nearly constant; "sample" if there is none."""
     numeric = values.dtype.kind == "f"
-    least = CONSTANT_SHARE * float(np.var(values)) if numeric else 0.0
+    least = criteria.CONSTANT_SHARE * float(np.var(values)) if numeric else 0.0
     for level in reversed(LEVELS):
         start, code = rows.groups.starts[level], rows.codes(level)
         if not numeric:
@@ -182,7 +168,7 @@ def run_means(channel: Channel, rows: Rows) -> Channel | None:
     if not (channel.numeric and finer):
         return None
     means = rows.groups.means(channel.values, "run")[rows.codes("run")]
-    if np.mean((channel.values - means) ** 2) > MOST_WITHIN_RUNS * np.var(channel.values):
+    if np.mean((channel.values - means) ** 2) > criteria.MOST_WITHIN_RUNS * np.var(channel.values):
         return None
     return replace(channel, values=means, unit="run")
 
@@ -201,7 +187,7 @@ def follows_strokes(name: str, rows: Rows) -> bool:
     columns = columns - rows.groups.means(columns, "stroke")[rows.codes("stroke")]
     shared, own = columns[:, :-1], columns[:, -1]
     left = own - shared @ np.linalg.lstsq(shared, own)[0]
-    return bool(left @ left < (1 - COMMON_PROFILE) * (own @ own))
+    return bool(left @ left < (1 - criteria.COMMON_PROFILE) * (own @ own))
 
 
 def without_trends(channel: Channel, rows: Rows) -> Channel | None:
@@ -231,9 +217,9 @@ def settings(values: np.ndarray) -> np.ndarray:
     if distinct.size == 1:
         return values
     at = scaled(distinct)
-    first = np.flatnonzero(np.r_[True, np.diff(at) > SAME_VALUE])
+    first = np.flatnonzero(np.r_[True, np.diff(at) > criteria.SAME_VALUE])
     widest = float((at[np.r_[first[1:] - 1, at.size - 1]] - at[first]).max())
-    if first.size == at.size or first.size > MOST_SET_VALUES or widest > 10 * SAME_VALUE:
+    if first.size == at.size or first.size > criteria.MOST_SET_VALUES or widest > 10 * criteria.SAME_VALUE:
         return values
     group = (np.searchsorted(first, np.arange(at.size), side="right") - 1)[place]
     return (np.bincount(group, values) / np.bincount(group))[group]
@@ -252,9 +238,8 @@ def scatter_level(channels: Iterable[Channel], rows: Rows) -> str:
     unit = max((c.unit for c in channels), key=FINER.get)
     coarsest = "specimen" if unit == "specimen" or any(c.scatters for c in channels) else "run"
     levels = LEVELS[max(FINER[unit], 1) - 1 : FINER[coarsest]]
-    return next(
-        (level for level in reversed(levels) if rows.groups.starts[level].size >= LEAST_SLOPES), levels[0]
-    )
+    least = criteria.LEAST_UNITS_OF_SLOPES
+    return next((level for level in reversed(levels) if rows.groups.starts[level].size >= least), levels[0])
 
 
 def flip_level(unit: str, rows: Rows) -> str:
@@ -264,9 +249,11 @@ def flip_level(unit: str, rows: Rows) -> str:
     """
     if FINER[unit] >= FINER["run"]:
         return unit
-    if rows.groups.starts["run"].size >= MANY_RUNS:
+    if rows.groups.starts["run"].size >= criteria.MANY_RUNS:
         return "run"
-    return "file" if rows.groups.starts["file"].size >= LEAST_GROUPS_HELD_OUT or unit == "file" else "stroke"
+    if unit == "file" or rows.groups.starts["file"].size >= criteria.LEAST_GROUPS_HELD_OUT:
+        return "file"
+    return "stroke"
 
 
 def _out_and_back(stroke: np.ndarray, rows: Rows) -> bool:
@@ -281,7 +268,7 @@ def _is_grouping(channel: Channel, rows: Rows) -> bool:
     return np.unique(first).size == first.size
 
 
-def free_columns(channel: Channel, most: int = FREE_DF) -> np.ndarray:
+def free_columns(channel: Channel, most: int = criteria.FREE_DF) -> np.ndarray:
     """Return the columns of a free shape, first a straight line: shape (n, k), each centred and scaled.
 
     A cubic B-spline with knots at quantiles (of the logarithm if a positive channel spans a factor of 20, but
@@ -323,11 +310,11 @@ def steps(channel: Channel, rows: Rows) -> np.ndarray:
     """
     start = rows.groups.starts[flip_level(channel.unit, rows)]
     values = np.sort(channel.values[start])
-    inner = slice(LEAST_BESIDE_STEP - 1, max(values.size - LEAST_BESIDE_STEP, 0))
+    inner = slice(criteria.LEAST_BESIDE_STEP - 1, max(values.size - criteria.LEAST_BESIDE_STEP, 0))
     before, after = values[:-1][inner], values[1:][inner]
     places = ((before + after) / 2)[after > before]
-    if places.size > MOST_STEPS:
-        places = places[np.linspace(0, places.size - 1, MOST_STEPS).round().astype(int)]
+    if places.size > criteria.MOST_STEPS:
+        places = places[np.linspace(0, places.size - 1, criteria.MOST_STEPS).round().astype(int)]
     columns = (channel.values[:, None] > places).astype(float)
     return columns - columns.mean(axis=0)
 

@@ -8,23 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
+from sealfit.closure import criteria
 from sealfit.closure.channels import follows_strokes, level_values, settings, varies
-from sealfit.closure.criteria import (
-    CURVE_P,
-    HALVED,
-    LEAST_FALL,
-    LEAST_GAIN,
-    LEAST_SIZE,
-    MOST_PROPOSALS,
-    MOST_RIVALS,
-    MOST_WITHIN,
-    RIPPLE_CONFIRMED_P,
-    SAMPLES_PER_VALUE,
-    SMALL_SIZE,
-    VAGUER,
-    WEAK_P,
-    WITHIN_P,
-)
 from sealfit.closure.errors_and_intervals import mean_se
 from sealfit.closure.forms import describe
 from sealfit.closure.left_out import between_speeds, blocks, covered, foldable, folds, whole_settings
@@ -44,8 +29,8 @@ LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 """Least and most settings for which interpolation is tested: fewer have no inner one, and more are dense."""
 
 TOO_FINE = "it is smaller than the resolution of the recorded force"
-TOO_SMALL = f"it is less than {LEAST_SIZE:.2%} of the force"
-NO_GAIN = f"it lowers the error on held-out data by less than {LEAST_GAIN:.2%} of the force"
+TOO_SMALL = f"it is less than {criteria.LEAST_SIZE:.2%} of the force"
+NO_GAIN = f"it lowers the error on held-out data by less than {criteria.LEAST_GAIN:.2%} of the force"
 NEGLIGIBLE = (TOO_FINE, TOO_SMALL, NO_GAIN)
 """Reasons of a refusal after which nothing is left to explain: the effect is too small to matter."""
 
@@ -167,7 +152,7 @@ def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows)
     return test.force - evaluate(kept.model, test, jacobian=False)[0]
 
 
-def varies_within(proposal: Proposal, share: float = MOST_WITHIN) -> str | None:
+def varies_within(proposal: Proposal, share: float = criteria.MOST_WITHIN) -> str | None:
     """Return the finest level in whose groups a share of the variance of the effect's shape lies, or None.
 
     The shape is used, not the added force. The force of a relative loss of friction along each stroke differs
@@ -215,7 +200,7 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
     from scipy.stats import wilcoxon  # imported here: scipy.stats takes half a second to load
 
     both = agreement(samples, sample_first, length, axis)
-    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < RIPPLE_CONFIRMED_P
+    there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < criteria.RIPPLE_CONFIRMED_P
     rmse = np.sqrt(squares)
     return Gain(float(rmse[0] - rmse[1]), float(rmse[1]), float(squares[0] - squares[1]) if there else -1.0)
 
@@ -254,7 +239,7 @@ class AcceptedEffect:
     @property
     def weak(self) -> bool:
         """Whether its evidence is weak."""
-        return self.proposal.p_value > WEAK_P
+        return self.proposal.p_value > criteria.WEAK_P
 
 
 @dataclass(frozen=True)
@@ -267,7 +252,7 @@ class RefusedEffect:
     @property
     def weak(self) -> bool:
         """Whether its evidence is too weak for the verdict `unexplained`."""
-        return self.proposal.p_value > WEAK_P
+        return self.proposal.p_value > criteria.WEAK_P
 
     @property
     def negligible(self) -> bool:
@@ -300,7 +285,7 @@ def confirmed(
     config = context.config
     refused: list[RefusedEffect] = []
     folds_of = (config.loop.folds, config.loop.seed, samples, {})
-    for proposal in proposals[:MOST_PROPOSALS]:
+    for proposal in proposals[: criteria.MOST_PROPOSALS]:
         gain = heldout_gain(fitted, proposal, *folds_of)
         negative = turns_negative(proposal.fitted)
         reason = NEGATIVE if negative else _reason_refused(fitted, proposal, gain, samples, folds_of[-1])
@@ -308,7 +293,7 @@ def confirmed(
         label = describe(proposal.term, fitted.rows)
         context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
-            most = MOST_RIVALS if context.compare else 0
+            most = criteria.MOST_RIVALS if context.compare else 0
             others = tuple(
                 (rival, heldout_gain(fitted, rival, *folds_of).left_N if k < most else np.nan)
                 for k, rival in enumerate(rivals(proposal, proposals))
@@ -327,22 +312,24 @@ def _reason_refused(
     size = float(np.sqrt(np.mean(added_force(proposal) ** 2)))
     if size <= rounding_error_N(samples):
         return TOO_FINE
-    if size <= LEAST_SIZE * force:
+    if size <= criteria.LEAST_SIZE * force:
         return TOO_SMALL
     if not gain.real:
-        small = size <= SMALL_SIZE * force and not proposal.term.effect.periodic
+        small = size <= criteria.SMALL_SIZE * force and not proposal.term.effect.periodic
         return NO_GAIN if small else "it does not lower the error on held-out data"
-    if gain.rmse_N < LEAST_GAIN * force and not proposal.term.effect.periodic:
+    if gain.rmse_N < criteria.LEAST_GAIN * force and not proposal.term.effect.periodic:
         return NO_GAIN
-    halved = gain.share > 1 - HALVED
-    if proposal.p_value > CURVE_P and not halved and _changes_the_curve(proposal):
-        return f"its p-value is above {CURVE_P:g}, and the scatter of such a coefficient is not known"
-    if proposal.p_value > WITHIN_P and not halved and _shape_along_strokes(proposal.term, fitted.rows):
-        return f"its p-value is above {WITHIN_P:g}, and it is a shape along strokes without a mechanism"
-    if proposal.p_value > WEAK_P and gain.share < LEAST_FALL:
+    halved, p_value = gain.share > 1 - criteria.HALVED, proposal.p_value
+    if p_value > criteria.CURVE_P and not halved and _changes_the_curve(proposal):
         return (
-            f"its p-value is above {WEAK_P:g}, and it lowers the held-out error by less than {LEAST_FALL:.0%}"
+            f"its p-value is above {criteria.CURVE_P:g}, and the scatter of such a coefficient is not known"
         )
+    if p_value > criteria.WITHIN_P and not halved and _shape_along_strokes(proposal.term, fitted.rows):
+        above = f"its p-value is above {criteria.WITHIN_P:g}"
+        return f"{above}, and it is a shape along strokes without a mechanism"
+    if p_value > criteria.WEAK_P and gain.share < criteria.LEAST_FALL:
+        above = f"its p-value is above {criteria.WEAK_P:g}"
+        return f"{above}, and it lowers the held-out error by less than {criteria.LEAST_FALL:.0%}"
     if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
         return "it does not predict held-out settings between those it was fitted to"
     if not proposal.term.effect.periodic and vague_between_speeds(fitted, proposal):
@@ -368,7 +355,7 @@ def vague_between_speeds(before: Fitted, proposal: Proposal) -> bool:
     if points.speed.size == 0:
         return False
     largest = [float(mean_se(evaluate(f.model, points)[1], f.covariance).max()) for f in fits]
-    return largest[1] > max(VAGUER * largest[0], before.rmse_N)
+    return largest[1] > max(criteria.VAGUER * largest[0], before.rmse_N)
 
 
 def _changes_the_curve(proposal: Proposal) -> bool:
@@ -405,7 +392,7 @@ def rounding_error_N(samples: pd.DataFrame) -> float:
     """
     force = samples["force_N"].to_numpy(dtype=float)
     steps = np.diff(np.unique(force))
-    if steps.size == 0 or steps.size > force.size / SAMPLES_PER_VALUE:
+    if steps.size == 0 or steps.size > force.size / criteria.SAMPLES_PER_VALUE:
         return 0.0
     step = float(np.median(steps))
     same = np.diff(samples["stroke_id"].to_numpy()) == 0

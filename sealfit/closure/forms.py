@@ -9,17 +9,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import fdtrc
 
+from sealfit.closure import criteria
 from sealfit.closure.channels import FINER, Channel, scaled
-from sealfit.closure.criteria import (
-    FREE_DF,
-    JACKKNIFE_UNITS,
-    KNOTS_APART,
-    MOST_KNOTS,
-    SEARCHES,
-    SPANS,
-    SURFACE_KNOTS,
-    UNITS_PER_KNOT,
-)
 from sealfit.closure.errors_and_intervals import t_quantile
 from sealfit.closure.linearised import Proposal, middles
 from sealfit.closure.ripples import Peak, common_wavelength, pass_shifts
@@ -67,7 +58,7 @@ def terms_of(
         return
     name = candidate.channels[-1]
     channel = channels[name]
-    knots = min(MOST_KNOTS, candidate.test_result.units // UNITS_PER_KNOT)
+    knots = min(criteria.MOST_KNOTS, candidate.test_result.units // criteria.UNITS_PER_KNOT)
     for term, grid in _terms_of_single(channel, target, channels, fitted, effects, knots):
         fits = len(term.effect.parameters) <= room_along(channel, fitted)
         # a smoothing spline has fewer effective degrees of freedom
@@ -188,17 +179,17 @@ def _terms_of_pair(
             yield Term(effect, effect.reads, *target, fixed=fixed), grid_of(effect, np.abs(one.values))
 
 
-def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FREE_DF + 1) -> Term:
+def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = criteria.FREE_DF + 1) -> Term:
     """Return the free shape of a channel: one level per category, or a spline.
 
     A spline of up to five knots has them at quantiles and no penalty; one of more has even knots and a
     penalty.
     """
     if channel.numeric:
-        places = _knots(np.unique(channel.values), max(knots, FREE_DF + 1))
+        places = _knots(np.unique(channel.values), max(knots, criteria.FREE_DF + 1))
         means = natural(places, channel.values).mean(axis=0)
         fixed = {"knots": places, "x_ref": places[0], "means": tuple(means.tolist())}
-        smoothness = 1.0 if len(places) > FREE_DF + 1 else None
+        smoothness = 1.0 if len(places) > criteria.FREE_DF + 1 else None
         return Term(free_effect(SMOOTH, fixed), (channel.name,), acts_on, operation, fixed, smoothness)
     categories, count = np.unique(channel.values, return_counts=True)
     fixed = {"categories": tuple(categories.tolist()), "means": tuple((count / count.sum()).tolist())}
@@ -207,7 +198,7 @@ def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = FR
 
 def surface_term(one: Channel, other: Channel, acts_on: str, operation: str) -> Term:
     """Return the free surface of two numeric channels, with a penalty."""
-    x, z = (_knots(np.unique(c.values), SURFACE_KNOTS) for c in (one, other))
+    x, z = (_knots(np.unique(c.values), criteria.SURFACE_KNOTS) for c in (one, other))
     means = np.einsum("nj,nk->jk", natural(x, one.values), natural(z, other.values)) / one.values.size
     fixed = {"x_knots": x, "z_knots": z, "means": tuple(means.ravel().tolist())}
     names = (one.name, other.name)
@@ -220,12 +211,12 @@ def _knots(values: np.ndarray, count: int) -> tuple[float, ...]:
     Even knots that are nearest to no value are left out: in a gap between the values nothing determines them.
     """
     at, kept = scaled(values), [0]
-    while (after := int(at.searchsorted(at[kept[-1]] + KNOTS_APART, "right"))) < at.size:
+    while (after := int(at.searchsorted(at[kept[-1]] + criteria.KNOTS_APART, "right"))) < at.size:
         kept.append(after)
     wide = values[0] > 0 and values[-1] / values[0] >= WIDE
     if len(kept) <= count:
         return tuple(values[kept].tolist())
-    if not wide and count <= FREE_DF + 1:
+    if not wide and count <= criteria.FREE_DF + 1:
         return tuple(np.quantile(values[kept], np.linspace(0, 1, count)).tolist())
     knots = (np.geomspace if wide else np.linspace)(values[0], values[-1], count)
     middles = np.sqrt(knots[1:] * knots[:-1]) if wide else (knots[1:] + knots[:-1]) / 2
@@ -301,7 +292,7 @@ def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
     A peak far outside is not distinguishable from a curve with a constant.
     """
     low, high, span = float(values.min()), float(values.max()), float(np.ptp(values)) or 1.0
-    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, SPANS * span)}
+    limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, criteria.SPANS * span)}
     parameters = []
     for p in effect.parameters:
         if p.search in limits:
@@ -375,7 +366,7 @@ def richer_laws(
         AGING not in channels
         or channels[AGING].unit != "specimen"
         or not lawful
-        or specimens >= JACKKNIFE_UNITS
+        or specimens >= criteria.JACKKNIFE_UNITS
     ):
         return []
     known = {t.effect.id for t in fitted.model.terms}
@@ -412,7 +403,7 @@ def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tupl
     values = after.model.values[place]
     shape = shape_of(term, values, fitted.rows)
     column = project(fitted, (fitted.slope(*TARGET) * shape)[:, None])[:, 0]
-    adjusted = float(min(1.0, (SEARCHES + 1) * laws * p_value))
+    adjusted = float(min(1.0, (criteria.SEARCHES + 1) * laws * p_value))
     test = SmallSampleTest(
         TARGET, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error
     )

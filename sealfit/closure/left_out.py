@@ -8,14 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtr
 
+from sealfit.closure import criteria
 from sealfit.closure.channels import level_values, settings
-from sealfit.closure.criteria import (
-    BLOCKS_OF_A_FOLD,
-    LEAST_GROUPS_HELD_OUT,
-    LEAST_HELD_OUT,
-    OUTSIDE,
-    SAME_SETTING,
-)
 from sealfit.fit.joint import Fitted, fit, fit_declared, fitted_at
 from sealfit.fit.joint.rows import LEVELS, POWER, SAME_SPEED, Rows, sliding_power
 from sealfit.fit.joint.search import search_nonlinear
@@ -159,7 +153,7 @@ def _like_others_of_its_speed(fitted: Fitted, number: int) -> bool:
 def heldout_level(rows: Rows) -> str:
     """Return the level whose groups are held out: run, or file or stroke if there are fewer than six."""
     for level in ("run", "file"):
-        if rows.groups.starts[level].size >= LEAST_GROUPS_HELD_OUT:
+        if rows.groups.starts[level].size >= criteria.LEAST_GROUPS_HELD_OUT:
             return foldable(rows, level)
     return "stroke"
 
@@ -208,9 +202,9 @@ def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]
     place = np.empty(start.size, dtype=int)
     place[np.argsort(rows.values(channel)[start], kind="stable")] = np.arange(start.size)
     masks: list[np.ndarray] = []
-    for parts in BLOCKS_OF_A_FOLD:
+    for parts in criteria.BLOCKS_OF_A_FOLD:
         masks = list(_masks(rows, level, place * min(count * parts, start.size) // start.size % count))
-        if np.any(masks, axis=0).mean() > LEAST_HELD_OUT:
+        if np.any(masks, axis=0).mean() > criteria.LEAST_HELD_OUT:
             break
     return masks
 
@@ -275,7 +269,7 @@ def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.nda
 def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return which values lie outside the range of those seen, by more than values of one setting differ."""
     low, high = float(seen.min()), float(seen.max())
-    slack = OUTSIDE * (high - low) + SAME_SETTING * max(abs(low), abs(high))
+    slack = criteria.OUTSIDE * (high - low) + criteria.SAME_SETTING * max(abs(low), abs(high))
     return (values < low - slack) | (values > high + slack)
 
 

@@ -8,18 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from sealfit.closure import criteria
 from sealfit.closure.after import reference_of
 from sealfit.closure.channels import FINER, Channel, incomplete_channels, unit_of
 from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
-from sealfit.closure.criteria import (
-    CHANCE_P,
-    HALVED,
-    HARMLESS,
-    LACK_OF_FIT,
-    NOT_ADJUSTED,
-    SAME_ERROR,
-    UNSTEADY,
-)
 from sealfit.closure.errors_and_intervals import (
     effect_intervals,
     errors,
@@ -77,12 +69,12 @@ class BeforeAfter:
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)
-        if max(inside) > SAME_ERROR or (weak and inside[1] >= 1):
+        if max(inside) > criteria.SAME_ERROR or (weak and inside[1] >= 1):
             return False
-        if around is not None and not weak and max(inside) < HALVED:
-            return whole[0] <= HARMLESS
-        strong = not weak or inside[1] < HALVED
-        return max(whole) <= (HARMLESS if strong else SAME_ERROR)
+        if around is not None and not weak and max(inside) < criteria.HALVED:
+            return whole[0] <= criteria.HARMLESS
+        strong = not weak or inside[1] < criteria.HALVED
+        return max(whole) <= (criteria.HARMLESS if strong else criteria.SAME_ERROR)
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
         """Return the ratio of errors after and before, in sample and held out (1 if nothing was held out).
@@ -178,7 +170,7 @@ def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
     p_value = errors_after["lack_of_fit_p"]
     if floor_N is None or p_value is None:
         return {"state": "unknown", "ratio": None, "p_value": None}
-    state = "above_scatter" if p_value < LACK_OF_FIT else "within_scatter"
+    state = "above_scatter" if p_value < criteria.LACK_OF_FIT else "within_scatter"
     return {"state": state, "ratio": errors_after["rmse_N"] / max(floor_N, 1e-300), "p_value": p_value}
 
 
@@ -333,7 +325,9 @@ def _left(selection: Selection) -> tuple[str | None, str | None, float | None]:
         return effect_level(item.term, rows), " ".join(channels_of(item.term, rows)), item.p_value
     if left is None and selection.added:
         last = [
-            c for c in selection.last if c.test_result.log_p <= np.log(NOT_ADJUSTED) and c.p_value < CHANCE_P
+            c
+            for c in selection.last
+            if c.test_result.log_p <= np.log(criteria.NOT_ADJUSTED) and c.p_value < criteria.CHANCE_P
         ]
         left = _unsteady_offset(selection) or _largest(selection.after, last)
     if isinstance(left, Peak):
@@ -359,7 +353,7 @@ def _unsteady_offset(selection: Selection) -> Candidate | None:
     amplitude = max((abs(v["A"]) for term, v in effects if term.effect.id == OFFSET), default=0.0)
     variance = sum(c.variance for c in fitted.scatter.components if c.kind == "offset" and c.level == "run")
     categories = [c for c in selection.channels.values() if not c.numeric and not c.grouping]
-    if amplitude == 0 or np.sqrt(variance) < UNSTEADY * amplitude or not categories:
+    if amplitude == 0 or np.sqrt(variance) < criteria.UNSTEADY * amplitude or not categories:
         return None
     if 2 <= len(rows.conditions) <= rows.groups.starts["file"].size / 3:
         term = free_term(Channel("condition", rows.values("condition"), "run"), "force", "add")

@@ -10,15 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betainc, chdtrc, fdtrc
 
+from sealfit.closure import criteria
 from sealfit.closure.channels import FINER
-from sealfit.closure.criteria import (
-    CONSTANT_IN_RUNS,
-    IDENTIFIABLE,
-    JACKKNIFE_UNITS,
-    PROMISING,
-    TESTED_AGAINST_RUNS,
-    UNEQUAL_RUNS,
-)
 from sealfit.closure.small_sample_test import (
     ClusterTests,
     ContrastTest,
@@ -133,7 +126,7 @@ def project(fitted: Fitted, columns: np.ndarray) -> np.ndarray:
 
 def _distinct(left: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return projected columns, shape (n, k), with zeros for those that are not identifiable."""
-    left[:, _squares(left) < IDENTIFIABLE * _squares(columns)] = 0.0
+    left[:, _squares(left) < criteria.IDENTIFIABLE * _squares(columns)] = 0.0
     return left
 
 
@@ -176,7 +169,7 @@ class ScoreTests:
         white, basis = self.fitted.whitening(self.fitted.friction[:, None])[:, 0], self.fitted.basis
         size = rows.groups.sums(white**2, "specimen")
         taken = (basis.sums(rows.groups, "specimen", white).values ** 2).sum(axis=1)
-        identifiable = size - taken >= IDENTIFIABLE * size
+        identifiable = size - taken >= criteria.IDENTIFIABLE * size
         own = OwnColumns(rows.codes("specimen"), white * identifiable[rows.codes("specimen")])
         return own, basis.orthonormal(RANK, project_out=own.project_out)
 
@@ -189,7 +182,7 @@ class ScoreTests:
         units of evidence.
         """
         starts = self.fitted.rows.groups.starts
-        few_units = starts[between].size < JACKKNIFE_UNITS
+        few_units = starts[between].size < criteria.JACKKNIFE_UNITS
         found = []
         for left in variants:
             test_result = self._score_test(left, level if few_units else between, target)
@@ -230,7 +223,7 @@ class ScoreTests:
         """
         for level in ("run", "file"):
             tests = [self.cluster_tests[level].test(left, target) for left in variants]
-            if all(test is not None and test.share > CONSTANT_IN_RUNS for test in tests):
+            if all(test is not None and test.share > criteria.CONSTANT_IN_RUNS for test in tests):
                 return max(tests, key=lambda test: test.log_p)
         return None
 
@@ -248,16 +241,16 @@ class ScoreTests:
         total = left.T @ fitted.white_residual
         log_p = float(log_p_of(score_statistic(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
-        if units >= JACKKNIFE_UNITS:
+        if units >= criteria.JACKKNIFE_UNITS:
             explained, against_units = _log(chdtrc(left.shape[1], total @ total)), 0.0
-            if level in ("file", "run") and explained < np.log(TESTED_AGAINST_RUNS):
+            if level in ("file", "run") and explained < np.log(criteria.TESTED_AGAINST_RUNS):
                 test = self._test_of_constants([left], target)
                 if test is not None:
                     against_units = test.log_p
                     explained = min(explained, against_units)
-            if explained < np.log(PROMISING):
+            if explained < np.log(criteria.PROMISING):
                 jackknife = max(self._jackknife(left, level), explained)
-                jackknife = min(jackknife, against_units + np.log(UNEQUAL_RUNS))
+                jackknife = min(jackknife, against_units + np.log(criteria.UNEQUAL_RUNS))
         return ScoreTestResult(float(total @ total), left.shape[1], units, log_p, jackknife, scores)
 
     def _jackknife(self, left: np.ndarray, level: str) -> float:

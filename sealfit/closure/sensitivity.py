@@ -15,24 +15,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri, stdtrit
 
+from sealfit.closure import criteria
 from sealfit.closure.channels import Channel, scatter_level
 from sealfit.closure.confirm import about_means
-from sealfit.closure.criteria import (
-    CONSTANT_IN_RUNS,
-    JACKKNIFE_UNITS,
-    LARGE_SHARE,
-    LEAST_FALL,
-    LEAST_POWER,
-    LEAST_SIZE,
-    LEAST_UNITS_OF_SLOPES,
-    MATERIAL_SCATTER,
-    REAL_RATIO,
-    REAL_SHARE,
-    SEARCHES,
-    SIZE_MARGIN,
-    TARGET_POWER,
-    WEAK_P,
-)
 from sealfit.closure.multiplicity import critical_many, critical_small_sample
 from sealfit.closure.score_test import Candidate, ScoreTests, project
 from sealfit.closure.selection import Selection
@@ -98,7 +83,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
-                stated = float(max(TO_BE_ADDED * times, SIZE_MARGIN * LEAST_SIZE))
+                stated = float(max(TO_BE_ADDED * times, criteria.SIZE_MARGIN * criteria.LEAST_SIZE))
                 smallest = force * stated if times < 1 else None
             if smallest is None and name in in_model:
                 continue
@@ -107,8 +92,8 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 if channel.unit == "sample" and specimens > 1:
                     units = min(units, specimens)
                 needed = (
-                    int(np.ceil(files * LEAST_UNITS_OF_SLOPES / units))
-                    if units < LEAST_UNITS_OF_SLOPES
+                    int(np.ceil(files * criteria.LEAST_UNITS_OF_SLOPES / units))
+                    if units < criteria.LEAST_UNITS_OF_SLOPES
                     else None
                 )
             else:
@@ -123,8 +108,9 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                     "files_needed": needed,
                 }
             )
-    if len(rows.conditions) < specimens < LEAST_UNITS_OF_SLOPES:  # no variable describes how specimens differ
-        needed = int(np.ceil(files * LEAST_UNITS_OF_SLOPES / specimens))
+    # No variable describes how specimens differ.
+    if len(rows.conditions) < specimens < criteria.LEAST_UNITS_OF_SLOPES:
+        needed = int(np.ceil(files * criteria.LEAST_UNITS_OF_SLOPES / specimens))
         unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
         entries.append({**unknown, "smallest_pct": None, "files_needed": needed})
     return entries
@@ -147,7 +133,9 @@ def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
     size, left = (
         float(np.sqrt(rows.weight @ about_means(x, rows, around) ** 2)) for x in (own, fitted.residual)
     )
-    return SIZE_MARGIN * left * float(np.sqrt(1 / (1 - LEAST_FALL) ** 2 - 1)) / size if size > 0 else np.inf
+    if not size > 0:
+        return np.inf
+    return criteria.SIZE_MARGIN * left * float(np.sqrt(1 / (1 - criteria.LEAST_FALL) ** 2 - 1)) / size
 
 
 def _parts(
@@ -166,7 +154,7 @@ def _parts(
         parts[level] = means[k] - means[k + 1]
         square = weight @ parts[level] ** 2
         each = square / max(sizes[k] - sizes[k + 1], 1)  # mean square
-        if square > REAL_SHARE * (weight @ column**2) and each > REAL_RATIO * finer:
+        if square > criteria.REAL_SHARE * (weight @ column**2) and each > criteria.REAL_RATIO * finer:
             real.append(level)
         finer = max(finer, each)
     if len(real) < 2:
@@ -185,7 +173,7 @@ class _Search:
 
     def __init__(self, selection: Selection, alpha: float) -> None:
         self.fitted, self.channels, self.candidates = selection.after, selection.channels, selection.last
-        self.level, self.units = alpha / SEARCHES, {}
+        self.level, self.units = alpha / criteria.SEARCHES, {}
         results = [c.test_result for c in selection.last]
         slopes = [j.slopes for j in results if j.slopes]
         small_sample = [test for c in selection.last if (test := self._retested(c)) is not None]
@@ -222,13 +210,14 @@ class _Search:
         Infinite for few units without an F test, whose p-value falls too slowly.
         """
         test = candidate.test_result.small_sample
-        if test is None and candidate.test_result.units < JACKKNIFE_UNITS:
+        if test is None and candidate.test_result.units < criteria.JACKKNIFE_UNITS:
             return np.inf
         df = candidate.test_result.units if test is None else test.error_df
         found, strong = (
-            -stdtrit(df, p / 2 / SEARCHES / len(self.candidates)) for p in (self.level * SEARCHES, WEAK_P)
+            -stdtrit(df, p / 2 / criteria.SEARCHES / len(self.candidates))
+            for p in (self.level * criteria.SEARCHES, criteria.WEAK_P)
         )
-        return times * float((strong + ndtri(TARGET_POWER)) / (found + ndtri(TARGET_POWER)))
+        return times * float((strong + ndtri(criteria.TARGET_POWER)) / (found + ndtri(criteria.TARGET_POWER)))
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
         """Return the factor on an effect, shape (n,), that gives it `TARGET_POWER`; infinite if none does."""
@@ -238,7 +227,7 @@ class _Search:
                 return np.inf
             power = 1.0 if before is None else np.log(margin / before[1]) / np.log(size / before[0])
             before = size, margin
-            size *= margin ** (-1 / min(max(power, LEAST_POWER), 1.0))
+            size *= margin ** (-1 / min(max(power, criteria.LEAST_POWER), 1.0))
             if size > 1:
                 return np.inf
             margin = self.margin(candidate, size * effect, _under(self.fitted, size * effect))
@@ -258,7 +247,7 @@ class _Search:
         variants = tests.variants(columns, channel.unit)
         if all(enough_specimens(noise, left).all() for left in variants):
             return self._by_units(candidate, noise, effect, variants)
-        large = min(float(least_share(effect, left).max()) for left in variants) / LARGE_SHARE
+        large = min(float(least_share(effect, left).max()) for left in variants) / criteria.LARGE_SHARE
         return min(large, self._by_units(candidate, noise, effect, variants))
 
     def _by_units(
@@ -327,17 +316,17 @@ class _Search:
             float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect)
         )
         own *= max(1.0, k / float((scores**2).sum()))  # not smaller than the noise is on average
-        beyond = ndtri(TARGET_POWER) * np.sqrt(own)
+        beyond = ndtri(criteria.TARGET_POWER) * np.sqrt(own)
         share = 1 - betaincinv((units - k) / 2, k / 2, np.exp(self.critical_many))
         margin = length / (np.sqrt(units * share * (own + added)) + beyond)
-        if units < JACKKNIFE_UNITS:
+        if units < criteria.JACKKNIFE_UNITS:
             return margin
         tail = self.level / 2 / self.many
         spread = length / (np.sqrt(own * k * fdtri(k, units - k, 1 - tail)) + beyond)
         explained = length / (np.sqrt(chdtri(k, tail)) + beyond)
         for one in ("file", "run") if level in ("file", "run") else ():
             units = ClusterTests(noise, one), ClusterTests(effect, one)
-            by_units = _by_numbers(*units, left, candidate.target, tail, least=CONSTANT_IN_RUNS)
+            by_units = _by_numbers(*units, left, candidate.target, tail, least=criteria.CONSTANT_IN_RUNS)
             explained = max(explained, by_units)
         return max(margin, min(spread, explained))
 
@@ -369,7 +358,7 @@ def _margin(length: np.ndarray, quiet: np.ndarray, differs: np.ndarray, k: int, 
     """
     critical = fdtri(k, df, 1 - tail)
     return np.abs(length) / np.sqrt(
-        quiet * ncfdtrinc(k, df, 1 - TARGET_POWER, critical) + k * critical * differs
+        quiet * ncfdtrinc(k, df, 1 - criteria.TARGET_POWER, critical) + k * critical * differs
     )
 
 
@@ -412,8 +401,10 @@ def undetectable_variables(
             for s in scatter
             if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size
         ]
-        much = any(s["sd_rel"] > MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
-        few_specimens = channel.unit == "specimen" and starts["specimen"].size < LEAST_UNITS_OF_SLOPES
+        much = any(s["sd_rel"] > criteria.MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
+        few_specimens = (
+            channel.unit == "specimen" and starts["specimen"].size < criteria.LEAST_UNITS_OF_SLOPES
+        )
         decisive = channel.unit == "sample" or channel.name == "direction" or few_specimens
         if much or (decisive and not np.isfinite(smallest)):
             undetectable.append(channel.name)

@@ -11,22 +11,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import chdtrc, fdtrc, log_ndtr, polygamma, psi, stdtr
 
-from sealfit.closure.criteria import (
-    CONSISTENT_P,
-    CONSISTENT_P_IF_DIFFERENT,
-    DIFFERENT_P,
-    KNOWN_DF,
-    LARGE_SHARE,
-    LARGEST_LEVERAGE,
-    LEAST_DF,
-    LEAST_ERROR_DF,
-    LEAST_ERROR_DF_OF_RUNS,
-    LEAST_KNOWN_DF,
-    LEAST_LEVERAGE,
-    LEAST_OWN_VARIANCE,
-    LEAST_SPECIMENS,
-    LEAST_UNITS_OF_SLOPES,
-)
+from sealfit.closure import criteria
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import orthonormal
@@ -78,7 +63,7 @@ def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest 
     The columns of the force, shape (n, k), are whitened and projected; columns of zeros are ignored.
     """
     groups = fitted.rows.groups
-    if groups.starts[level].size < LEAST_UNITS_OF_SLOPES:
+    if groups.starts[level].size < criteria.LEAST_UNITS_OF_SLOPES:
         return None
     size = np.sqrt(np.einsum("ij,ij->j", left, left))
     left = left[:, size > 0] / size[size > 0]
@@ -87,9 +72,9 @@ def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest 
     leverage = groups.sums(left**2, level)
     slope = left.T @ fitted.white_residual
     scores = groups.sums(left * fitted.unit_residual(level)[:, None], level)
-    deviations = (scores - leverage * slope) / np.sqrt(1 - np.minimum(leverage, LARGEST_LEVERAGE))
+    deviations = (scores - leverage * slope) / np.sqrt(1 - np.minimum(leverage, criteria.LARGEST_LEVERAGE))
     df = satterthwaite_df(leverage)
-    known = df >= LEAST_DF
+    known = df >= criteria.LEAST_DF
     if not known.any():
         return None
     variance = np.maximum((deviations**2).sum(axis=0), LEAST_VARIANCE)
@@ -103,7 +88,7 @@ def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
 
     The leverages of a contrast add up to 1, or are all 0: its variance is 0 then, and known.
     """
-    shared = leverage**2 / (1 - np.minimum(leverage, LARGEST_LEVERAGE))
+    shared = leverage**2 / (1 - np.minimum(leverage, criteria.LARGEST_LEVERAGE))
     inverse = (leverage**2).sum(axis=0) + shared.sum(axis=0) ** 2 - (shared**2).sum(axis=0)
     return 1 / np.maximum(inverse, 1e-300)
 
@@ -128,17 +113,17 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
         t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
         log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
         chi2 = own @ (slopes - np.average(slopes, weights=own)) ** 2
-        equal_slopes = chdtrc(slopes.size - 1, chi2) > DIFFERENT_P
-        most = CONSISTENT_P if equal_slopes or not inside[k] else CONSISTENT_P_IF_DIFFERENT
+        equal_slopes = chdtrc(slopes.size - 1, chi2) > criteria.DIFFERENT_P
+        most = criteria.CONSISTENT_P if equal_slopes or not inside[k] else criteria.CONSISTENT_P_IF_DIFFERENT
         found[k] = log_p < np.log(most)
-    return found | (inside & (least_share(fitted, left) > LARGE_SHARE))
+    return found | (inside & (least_share(fitted, left) > criteria.LARGE_SHARE))
 
 
 def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return leverage and slope of each specimen along columns, (specimens, m); 0 below `LEAST_LEVERAGE`."""
     sums = fitted.rows.groups.sums
     leverage, scores = sums(left**2, "specimen"), sums(left * fitted.white_residual[:, None], "specimen")
-    shown = leverage > LEAST_LEVERAGE * leverage.sum(axis=0)
+    shown = leverage > criteria.LEAST_LEVERAGE * leverage.sum(axis=0)
     return np.where(shown, leverage, 0.0), np.where(shown, scores / np.where(shown, leverage, 1.0), 0.0)
 
 
@@ -164,13 +149,13 @@ def enough_specimens(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     if not few_specimens(fitted):
         return np.ones(left.shape[1], dtype=bool)
     leverage = fitted.rows.groups.sums(left**2, "specimen")
-    many = leverage.sum(axis=0) ** 2 > LEAST_SPECIMENS * (leverage**2).sum(axis=0)
+    many = leverage.sum(axis=0) ** 2 > criteria.LEAST_SPECIMENS * (leverage**2).sum(axis=0)
     return many | ~along_strokes(fitted, left)
 
 
 def few_specimens(fitted: Fitted) -> bool:
     """Return whether there are too few specimens (up to four) to be the units of a slope."""
-    return fitted.rows.groups.starts["specimen"].size < LEAST_UNITS_OF_SLOPES
+    return fitted.rows.groups.starts["specimen"].size < criteria.LEAST_UNITS_OF_SLOPES
 
 
 def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
@@ -286,7 +271,9 @@ class SmallSampleTest(NamedTuple):
     @property
     def enough_df(self) -> bool:
         """Whether there are enough residual degrees of freedom between units."""
-        return self.error_df >= (LEAST_ERROR_DF if self.level == "specimen" else LEAST_ERROR_DF_OF_RUNS)
+        return self.error_df >= (
+            criteria.LEAST_ERROR_DF if self.level == "specimen" else criteria.LEAST_ERROR_DF_OF_RUNS
+        )
 
 
 class Numbers(NamedTuple):
@@ -310,7 +297,7 @@ class Root:
 
     def __init__(self, taken: Tangent, moved: np.ndarray) -> None:
         share, axes = np.linalg.eigh(taken.gram())
-        kept = 1 - share > LEAST_OWN_VARIANCE
+        kept = 1 - share > criteria.LEAST_OWN_VARIANCE
         factor = np.where(kept, 1 / np.sqrt(np.where(kept, 1 - share, 1.0)) - 1, -1.0)
         self.taken, self.moved, self.df = taken, moved, int(moved.sum() - (~kept).sum())
         small = share < 1e-9  # the limit of the quotient
@@ -325,7 +312,7 @@ def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
     """Return the same for few units as a matrix in the principal axes of the covariance, shape (d, units)."""
     dense = taken.toarray()
     share, axes = np.linalg.eigh(np.diag(moved.astype(float)) - dense @ dense.T)
-    kept = share > LEAST_OWN_VARIANCE
+    kept = share > criteria.LEAST_OWN_VARIANCE
     return axes[:, kept].T / np.sqrt(share[kept])[:, None]
 
 
@@ -359,7 +346,7 @@ class ClusterTests:
             slope = fitted.slope(*target)[:, None]
             white = fitted.whitening(slope)[:, 0]
             size, finer = (groups.sums(w**2, self.level) for w in (white, self._finer(slope)[:, 0]))
-            known = KNOWN_DF * min(mean_ratio(size, finer), 1.0)
+            known = criteria.KNOWN_DF * min(mean_ratio(size, finer), 1.0)
             self._numbers[target] = self.along(white)._replace(known=known)
         return self._numbers[target]
 
@@ -404,7 +391,7 @@ class ClusterTests:
         found = {}
         for (target, numbers), own in zip(self._numbers.items(), np.split(drawn, ends, axis=1), strict=True):
             df = numbers.known  # the prior variance is that uncertain
-            scale = np.sqrt(df / rng.chisquare(df, count)) if df > LEAST_KNOWN_DF else np.ones(count)
+            scale = np.sqrt(df / rng.chisquare(df, count)) if df > criteria.LEAST_KNOWN_DF else np.ones(count)
             found[target] = own * scale[:, None]
         return found
 
