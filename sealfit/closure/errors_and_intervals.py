@@ -68,32 +68,22 @@ def without_repeat_pattern(rows: Rows, residual: np.ndarray) -> np.ndarray:
     return residual - pattern[repeat]
 
 
-def pure_error(rows: Rows, residual: np.ndarray) -> tuple[float, float] | None:
-    """Return (variance, df) of a bin about its run's mean over repeats; None without repeats.
+def noise_floor(fitted: Fitted) -> float | None:
+    """Return the RMS deviation of bins from their run's mean over repeats; None without repeats.
 
-    The mean shape over the repeats of a run and the mean pattern from one repeat to the next are not part of
-    it.
+    It is the RMSE that the true mean would have on these bins. The mean shape over the repeats of a run and
+    the mean pattern from one repeat to the next are not part of it. It does not contain the scatter of
+    set-ups, which cannot be distinguished from lack of fit without replicated runs.
     """
-    table = rows.table
-    clean = without_repeat_pattern(rows, residual)
-    place = table.groupby(["run_id", "stroke", "bin"], sort=False).ngroup().to_numpy()
+    clean = without_repeat_pattern(fitted.rows, fitted.residual)
+    place = fitted.rows.table.groupby(["run_id", "stroke", "bin"], sort=False).ngroup().to_numpy()
     count = np.bincount(place)
     mean = np.bincount(place, clean) / count
     repeated = count[place] > 1
     df = float((count[count > 1] - 1).sum())
     if df <= 0:
         return None
-    return float(((clean - mean[place])[repeated] ** 2).sum() / df), df
-
-
-def noise_floor(fitted: Fitted) -> float | None:
-    """Return the RMSE of the true mean on these bins, from the repeats of runs; None without repeats.
-
-    It does not contain the scatter of set-ups, which cannot be distinguished from lack of fit without
-    replicated runs.
-    """
-    pure = pure_error(fitted.rows, fitted.residual)
-    return None if pure is None else float(np.sqrt(pure[0]))
+    return float(np.sqrt(float(((clean - mean[place])[repeated] ** 2).sum() / df)))
 
 
 def lack_of_fit(fitted: Fitted) -> float | None:

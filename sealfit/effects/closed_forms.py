@@ -41,7 +41,6 @@ LINEAR = closed_form(
     label="linear in {x}",
     equation=r"h = A (x - x_{ref})",
     form="A (x - x_ref)",
-    reference="{x} = {x_ref}",
     parameters=(amplitude("A", "{y}/{x}", 0.01, "slope"),),
     shape=linear_shape,
     source="Form: ours. First order of any smooth dependence.",
@@ -64,7 +63,6 @@ LINEAR_EACH_WAY = closed_form(
     label="linear in {x}, with its own slope in each direction",
     equation=r"h = A_f (x - x_{ref}) \text{ forward}, \; A_b (x - x_{ref}) \text{ backward}",
     form="A_f (x - x_ref) forward, A_b (x - x_ref) backward",
-    reference="{x} = {x_ref}",
     reads=(CHANNEL, "direction"),
     acts_on=factors("mu", "force"),
     parameters=(
@@ -89,7 +87,6 @@ QUADRATIC = closed_form(
     label="quadratic in {x}",
     equation=r"h = A (x - x_{ref}) + B (x - x_{ref})^2",
     form="A (x - x_ref) + B (x - x_ref)^2",
-    reference="{x} = {x_ref}",
     parameters=(
         amplitude("A", "{y}/{x}", 0.01, "slope at the reference"),
         amplitude("B", "{y}/{x}^2", 0.001, "curvature, halved"),
@@ -115,7 +112,6 @@ LOG = closed_form(
     label="logarithmic in {x}",
     equation=r"h = A \ln(x / x_{ref})",
     form="A ln(x / x_ref)",
-    reference="{x} = {x_ref}",
     parameters=(amplitude("A", "{y}", 0.05, "change per factor e of the channel"),),
     shape=log_shape,
     source="Form: ours. The dependence that is the same in every decade.",
@@ -164,7 +160,6 @@ POWER = closed_form(
     label="power of {x}",
     equation=r"h = A [(x / x_{ref})^n - 1]",
     form="A ((x / x_ref)^n - 1)",
-    reference="{x} = {x_ref}",
     parameters=(
         amplitude("A", "{y}", 0.1, "size at the reference"),
         Parameter("n", "", 0.5, (-6.0, 6.0), "exponent", search=(-3.0, -2.0, -1.0, -0.5, 0.5, 1.5, 2.0, 3.0)),

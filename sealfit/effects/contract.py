@@ -123,8 +123,8 @@ class Effect:
     parameters: tuple[Parameter, ...]
     shape: Callable[..., np.ndarray]
     source: str
-    # inputs, values and result of a check by hand
-    worked: tuple[Mapping[str, float], Mapping[str, float], float]
+    # inputs, values and result of a check by hand; None for a free shape, which depends on the data
+    worked: tuple[Mapping[str, float], Mapping[str, float], float] | None = None
     physical: bool = True  # false for a closed form that names no mechanism
     reference: str = ""  # state in which the shape is zero
     periodic: bool = False  # searched in the spectrum; its mean over a bin has a closed form
@@ -155,8 +155,9 @@ class Effect:
         return {p.name: p.start for p in self.parameters}
 
 
-# A closed form is of any one channel, acts anywhere and names no mechanism, unless it says otherwise.
-closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, physical=False)
+# A closed form is of any one channel, zero at its reference, acts anywhere and names no mechanism, unless it
+# says otherwise.
+closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, reference="{x} = {x_ref}", physical=False)
 
 
 def reference(inputs: Mapping[str, object], name: str, default: float) -> float:

@@ -52,12 +52,6 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
         ),
         shape=partial(_levels, names, mean),
         source="Form: ours. One number per category, as in any analysis of variance.",
-        # By hand: the last category has its own difference.
-        worked=(
-            {CHANNEL: names[-1]},
-            {f"d_{k}": k / 10 for k in range(1, len(names))},
-            (len(names) - 1) / 10 - sum(k / 10 * m for k, m in enumerate(mean)),
-        ),
     )
 
 
@@ -96,19 +90,12 @@ def slopes_effect(categories: Sequence[str]) -> Effect:
         label="linear in {x}, by {z}",
         equation=r"h = \sum_k e_k [z = k] (x - x_{ref})",
         form=f"e_k (x - x_ref) for category k of {listed(names)}",
-        reference="{x} = {x_ref}",
         reads=(CHANNEL, SECOND),
         parameters=tuple(
             amplitude(f"e_{k}", "{y}/{x}", 0.0, f"slope for {name}") for k, name in enumerate(names, start=1)
         ),
         shape=partial(_slopes, names),
         source="Form: ours. One slope per category, as in any analysis of covariance.",
-        # By hand: 3 above the reference, in the last category.
-        worked=(
-            {CHANNEL: 5.0, "x_ref": 2.0, SECOND: names[-1]},
-            {f"e_{k}": k / 10 for k in range(1, len(names) + 1)},
-            0.3 * len(names),
-        ),
     )
 
 
@@ -172,7 +159,6 @@ def smooth_effect(
     zero = 0 if x_ref is None else int(np.argmin(np.abs(np.array(places) - x_ref)))
     mean = shares(means, len(places))
     free = [j for j in range(len(places)) if j != zero]
-    x = places[free[-1]]
     return closed_form(
         id=SMOOTH,
         label="smooth in {x}",
@@ -186,12 +172,6 @@ def smooth_effect(
         ),
         shape=partial(_spline, places, zero, mean),
         source="Form: ours. de Boor 2001, A Practical Guide to Splines, Springer; natural end conditions.",
-        # By hand: at a knot the spline is that knot's amplitude, whatever the others are.
-        worked=(
-            {CHANNEL: x},
-            {f"c_{j + 1}": float(j + 1) for j in free},
-            float(free[-1] + 1) - sum((j + 1) * mean[j] for j in free),
-        ),
     )
 
 
@@ -290,14 +270,6 @@ def surface_effect(
         ),
         shape=partial(_surface, knots, mean),
         source="Form: ours. Wood 2017, Generalized Additive Models, 2nd ed., CRC Press.",
-        # By hand: at the upper corner the surface is the last amplitude.
-        worked=(
-            {CHANNEL: knots[0][-1], SECOND: knots[1][-1]},
-            {f"c_{j + 1}{k + 1}": 10.0 * j + k for j, k in places[1:]},
-            10.0 * places[-1][0]
-            + places[-1][1]
-            - sum((10.0 * j + k) * m for (j, k), m in zip(places, mean, strict=True)),
-        ),
     )
 
 

@@ -170,6 +170,8 @@ def _parameter_faults(p: Parameter) -> Iterator[str]:
 
 
 def _worked_faults(effect: Effect) -> Iterator[str]:
+    if effect.worked is None:
+        yield "it has no worked value"
     inputs, values, _ = effect.worked
     names = {p.name for p in effect.parameters}
     missing = [name for name in effect.reads if name not in inputs]

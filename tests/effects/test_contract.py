@@ -66,14 +66,14 @@ def nonzero(effect: Effect) -> dict[str, float]:
     return {**effect.start(), **{name: 0.1 * (k + 1) for k, name in enumerate(effect.linear)}}
 
 
-@every_effect
+@every_registered
 def test_gives_its_worked_value(effect):
     inputs, values, expected = effect.worked
     arrays = {name: np.array([value]) if name in effect.reads else value for name, value in inputs.items()}
     npt.assert_allclose(effect.shape(arrays, **values), [expected], rtol=1e-12, atol=1e-15)
 
 
-@every_effect
+@every_registered
 def test_worked_value_gives_every_channel_and_parameter(effect):
     inputs, values, _ = effect.worked
     assert set(effect.reads) <= set(inputs)

@@ -102,9 +102,43 @@ def test_refuses_what_makes_no_effect(call, words):
         call()
 
 
-@pytest.mark.parametrize("effect", [surface_effect((2.0, 6.0), (0.0, 10.0)), slopes_effect(["A", "B"])])
-def test_effects_of_a_pair_give_what_is_worked_by_hand(effect):
-    inputs, values, expected = effect.worked
+@pytest.mark.parametrize(
+    ("effect", "inputs", "values", "expected"),
+    [
+        # At a knot the spline is that knot's amplitude, whatever the others are.
+        (smooth_effect([0, 1, 3, 10], 1.2), {"x": 10.0}, {"c_1": 1.0, "c_3": 3.0, "c_4": 4.0}, 4.0),
+        # The mean is 2 * 0.3 + 3 * 0.2 + 4 * 0.1.
+        (
+            smooth_effect([0, 1, 3, 10], 0.0, (0.4, 0.3, 0.2, 0.1)),
+            {"x": 10.0},
+            {"c_2": 2.0, "c_3": 3.0, "c_4": 4.0},
+            4.0 - 1.6,
+        ),
+        (levels_effect(["A", "B", "C"]), {"x": "C"}, {"d_1": 0.1, "d_2": 0.2}, 0.2),
+        (
+            levels_effect(["A", "B", "C"], (0.5, 0.25, 0.25)),
+            {"x": "C"},
+            {"d_1": 0.1, "d_2": 0.2},
+            0.2 - 0.075,
+        ),
+        # 3 above the reference, in the last category.
+        (slopes_effect(["A", "B"]), {"x": 5.0, "x_ref": 2.0, "z": "B"}, {"e_1": 0.1, "e_2": 0.2}, 0.6),
+        # At the upper corner the surface is the last amplitude; the mean is 1 * 0.2 + 10 * 0.3 + 11 * 0.4.
+        (
+            surface_effect((2.0, 6.0), (0.0, 10.0)),
+            {"x": 6.0, "z": 10.0},
+            {"c_12": 1.0, "c_21": 10.0, "c_22": 11.0},
+            11.0,
+        ),
+        (
+            surface_effect((2.0, 6.0), (0.0, 10.0), (0.1, 0.2, 0.3, 0.4)),
+            {"x": 6.0, "z": 10.0},
+            {"c_12": 1.0, "c_21": 10.0, "c_22": 11.0},
+            11.0 - 7.6,
+        ),
+    ],
+)
+def test_free_shapes_give_what_is_worked_by_hand(effect, inputs, values, expected):
     assert float(effect.shape(inputs, **values)) == pytest.approx(expected)
 
 

@@ -156,6 +156,7 @@ def test_gives_the_contracts_own_words(tmp_path):
         ('reads=("displacement_mm",)', 'reads=("x", "displacement_mm")', "mixes 'x'"),
         ('reads=("displacement_mm",)', 'reads=("displacement_mm", "load_N")', "worked value gives no load_N"),
         ('{"A": -0.2, "x_0": 3.0}', '{"A": -0.2}', "gives parameters"),
+        ("worked=({", "# ({", "no worked value"),
         ("(-100.0, 100.0)", '(-100.0, float("inf"))', "bounds of x_0 are not finite"),
         ('search="inside"', 'search="outside"', "search of x_0 is 'outside'"),
         ('Parameter("x_0"', 'Parameter("A"', "two parameters share a name"),
