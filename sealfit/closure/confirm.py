@@ -16,7 +16,7 @@ from sealfit.closure.left_out import between_speeds, blocks, covered, foldable, 
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
 from sealfit.closure.ripples import agreement, pass_shifts
-from sealfit.config import Config
+from sealfit.config import Config, Loop
 from sealfit.effects.contract import Effect
 from sealfit.fit.joint import Fitted, fit, with_reml_smoothness
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
@@ -61,12 +61,7 @@ class Gain:
 
 
 def heldout_gain(
-    before: Fitted,
-    proposal: Proposal,
-    count: int,
-    seed: int,
-    samples: pd.DataFrame,
-    known: dict[tuple, np.ndarray],
+    before: Fitted, proposal: Proposal, loop: Loop, samples: pd.DataFrame, known: dict[tuple, np.ndarray]
 ) -> Gain:
     """Return the gain of a proposal on held-out groups of its own unit.
 
@@ -80,7 +75,10 @@ def heldout_gain(
     rows = before.rows
     calendar = [name for name in proposal.term.channels if name in CALENDAR]
     level = foldable(rows, proposal.unit)
-    masks = blocks(rows, level, count, calendar[0]) if calendar else folds(rows, level, count, seed)
+    if calendar:
+        masks = blocks(rows, level, loop.folds, calendar[0])
+    else:
+        masks = folds(rows, level, loop.folds, loop.seed)
     around = None if calendar else varies_within(proposal)  # a block of time is predicted as a whole
     return _gain(before, proposal, masks, around, (level, *calendar[:1]), known)
 
@@ -284,18 +282,18 @@ def confirmed(
     """
     config = context.config
     refused: list[RefusedEffect] = []
-    folds_of = (config.loop.folds, config.loop.seed, samples, {})
+    held_out = (config.loop, samples, {})
     for proposal in proposals[: criteria.MOST_PROPOSALS]:
-        gain = heldout_gain(fitted, proposal, *folds_of)
+        gain = heldout_gain(fitted, proposal, *held_out)
         negative = turns_negative(proposal.fitted)
-        reason = NEGATIVE if negative else _reason_refused(fitted, proposal, gain, samples, folds_of[-1])
+        reason = NEGATIVE if negative else _reason_refused(fitted, proposal, gain, samples, held_out[-1])
         unit = config.units.unit("force")
         label = describe(proposal.term, fitted.rows)
         context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
             most = criteria.MOST_RIVALS if context.compare else 0
             others = tuple(
-                (rival, heldout_gain(fitted, rival, *folds_of).left_N if k < most else np.nan)
+                (rival, heldout_gain(fitted, rival, *held_out).left_N if k < most else np.nan)
                 for k, rival in enumerate(rivals(proposal, proposals))
             )
             return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, others, number), []

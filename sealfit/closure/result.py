@@ -177,14 +177,16 @@ def fit_quality(errors_after: Mapping, floor_N: float | None) -> dict:
 def _refused(item: RefusedEffect, rows: Rows) -> dict:
     term = item.proposal.term
     return {
-        "id": term.effect.id,
-        "channels": channels_of(term, rows),
-        "acts_on": term.acts_on,
+        **_identity(term, rows),
         "label": describe(term, rows),
         "p_value": item.proposal.p_value,
         "reason": item.reason,
         "weak": item.weak,
     }
+
+
+def _identity(term: Term, rows: Rows) -> dict:
+    return {"id": term.effect.id, "channels": channels_of(term, rows), "acts_on": term.acts_on}
 
 
 def effect_entries(after: Fitted, selection: Selection, config: Config) -> list[dict]:
@@ -228,12 +230,7 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
         "heldout_gain_N": _number(item.gain_N),
         "heldout_rmse_N": _number(item.left_N),
         "alternatives": [
-            {
-                "id": rival.term.effect.id,
-                "channels": channels_of(rival.term, after.rows),
-                "acts_on": rival.term.acts_on,
-                "heldout_rmse_N": _number(rmse),
-            }
+            {**_identity(rival.term, after.rows), "heldout_rmse_N": _number(rmse)}
             for rival, rmse in item.rivals
         ],
     }

@@ -255,16 +255,8 @@ def _incoherent(spectrum: Spectrum) -> Peak:
     energy = spectrum.amplitude**2 * spectrum.count * (1 - 1 / np.maximum(ratio, 1.0))
     significant = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
     significant[k] = True
-    return Peak(
-        spectrum.axis,
-        wavelength,
-        True,
-        False,
-        float(ratio[k]),
-        p,
-        float(spectrum.amplitude[k]),
-        float(energy[significant].max()),
-    )
+    amplitude, most = float(spectrum.amplitude[k]), float(energy[significant].max())
+    return Peak(spectrum.axis, wavelength, True, False, float(ratio[k]), p, amplitude, most)
 
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:

@@ -51,16 +51,9 @@ from sealfit.fit.joint.variance_components import orthonormal
 # Does a channel explain the residual? A free shape of each is tested on every quantity it may act on.
 
 TARGETS = (
-    ("mu", "multiply"),
-    ("force", "add"),
-    ("force", "multiply"),
-    ("mu_s", "multiply"),
-    ("mu_c", "multiply"),
-    ("v_s", "multiply"),
-    ("sigma_2", "add"),
-    ("a", "multiply"),
-    ("b", "multiply"),
-)
+    ("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply"),
+    ("v_s", "multiply"), ("sigma_2", "add"), ("a", "multiply"), ("b", "multiply"),
+)  # fmt: skip
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
 
 

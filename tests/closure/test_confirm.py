@@ -20,7 +20,7 @@ from sealfit.closure.confirm import (
     varies_within,
 )
 from sealfit.closure.left_out import between_speeds, blocks
-from sealfit.config import Config
+from sealfit.config import Config, Loop
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit, fit_declared, fitted_at
 from sealfit.fit.joint.model import Term
@@ -72,7 +72,9 @@ def test_a_gain_is_weighed_by_the_scatter_that_is_left_with_the_effect_in(seed):
     before = fit_declared(rows)
     term = Term(EFFECTS["aging_floor"], ("aging_days",), "mu", "multiply")
     after = fit(before.model.with_term(term, {"A": 0.05, "t_f": 4.0}), rows, before.scatter, turns=2)
-    gain = heldout_gain(before, SimpleNamespace(term=term, fitted=after, unit="specimen"), 5, 0, None, {})
+    gain = heldout_gain(
+        before, SimpleNamespace(term=term, fitted=after, unit="specimen"), FIVE_FOLDS, None, {}
+    )
     assert gain.real
 
 
@@ -92,7 +94,7 @@ def test_one_run_of_a_specimen_in_a_fold_is_compared_with_the_mean_of_all_its_ru
     after = fit(before.model.with_term(term, {"A": 0.5}), before.rows, before.scatter, turns=2)
     column = after.force - before.force
     proposal = SimpleNamespace(term=term, fitted=after, unit="run", column=column)
-    gain = heldout_gain(before, proposal, 5, 0, None, {})
+    gain = heldout_gain(before, proposal, FIVE_FOLDS, None, {})
     assert gain.real
     assert gain.rmse_N > 0.2
 
@@ -107,6 +109,7 @@ def test_blocks_of_the_calendar_are_shorter_than_conditions_that_follow_one_anot
 
 
 # ---------------------------------------------------------------- the decision, on gains given by hand
+FIVE_FOLDS = Loop(folds=5, seed=0)
 SAMPLES = pd.DataFrame({"force_N": np.random.default_rng(0).normal(size=50), "stroke_id": 0})
 ROWS = SimpleNamespace(force=np.full(3, 10.0), values=lambda channel: channel, has_load=True)
 FORCE = SimpleNamespace(rows=ROWS)
