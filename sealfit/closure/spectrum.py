@@ -46,14 +46,6 @@ class Strokes:
         unit, direction = (samples[name].to_numpy()[start[good]] for name in ("unit", "direction"))
         return cls(place, residual, start[good], size[good], low[good], (high - low)[good], unit, direction)
 
-    def on_grids(self, chosen: np.ndarray, step: float, size: int) -> np.ndarray:
-        """Return residuals of chosen strokes on even grids from their start, shape (strokes, size)."""
-        grid = step * np.arange(size)
-        found = np.empty((chosen.size, size))
-        for row, k in zip(found, chosen, strict=True):
-            row[:] = np.interp(self.low[k] + grid, *self.along(k))
-        return found
-
     def along(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Return places and residuals of one stroke, sorted by place."""
         own = slice(self.start[k], self.start[k] + self.size[k])
@@ -279,18 +271,20 @@ def _sums_of_mode(own: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _transformed(grid: _Grid, chosen: np.ndarray) -> np.ndarray:
     """Return complex amplitudes of strokes with phases from place 0, (strokes, most); 0 beyond reach."""
-    points, reach, low = grid.points[chosen], grid.reach[chosen], grid.strokes.low[chosen]
+    strokes, points, reach = grid.strokes, grid.points[chosen], grid.reach[chosen]
     found = np.zeros((reach.size, int(reach.max())), dtype=complex)
-    size = np.ceil(grid.strokes.span[chosen] * points / grid.longest).astype(int)
+    size = np.ceil(strokes.span[chosen] * points / grid.longest).astype(int)
     for length, count in np.unique(np.column_stack([points, size]), axis=0):
         same_size = np.flatnonzero((points == length) & (size == count))
         trend, taper = _on_grid(count)
-        value = grid.strokes.on_grids(chosen[same_size], grid.longest / length, count)
+        at = grid.longest / length * np.arange(count)  # from the start of a stroke
+        value = np.stack([np.interp(strokes.low[k] + at, *strokes.along(k)) for k in chosen[same_size]])
         value -= (value @ trend) @ trend.T
         width = int(reach[same_size].max())
         wave = np.fft.rfft(value * taper, length)[:, grid.numbers[0] : grid.numbers[0] + width]
         found[same_size, :width] = np.where(np.arange(width) < reach[same_size, None], wave, 0.0)
-    return found * np.exp(-2j * np.pi / grid.longest * low[:, None] * grid.numbers[: found.shape[1]])
+    low = strokes.low[chosen, None]
+    return found * np.exp(-2j * np.pi / grid.longest * low * grid.numbers[: found.shape[1]])
 
 
 @lru_cache(maxsize=512)  # strokes of one speed share their grid

@@ -105,13 +105,7 @@ WARMING_POWER = Effect(
     reads=("time_s", "speed_mm_s", "load_N"),
     acts_on=FRICTION,
     parameters=(
-        amplitude(
-            "A",
-            "{y}",
-            0.05,
-            "share of friction lost when warm at reference load and speed",
-            bounds=LOST,
-        ),
+        amplitude("A", "{y}", 0.05, "share of friction lost when warm at reference load and speed", LOST),
         Parameter("tau", "{x}", 5.0, (1e-4, 1e7), "time constant of warming", search="span"),
     ),
     shape=warming_power_shape,
@@ -184,13 +178,7 @@ WARMING_CONDUCTION_LOAD = Effect(
     reads=("distance_mm", "speed_mm_s", "load_N"),
     acts_on=FRICTION,
     parameters=(
-        amplitude(
-            "A",
-            "{y}",
-            0.05,
-            "share of friction lost at reference load, speed and distance",
-            bounds=LOST,
-        ),
+        amplitude("A", "{y}", 0.05, "share of friction lost at reference load, speed and distance", LOST),
     ),
     shape=warming_conduction_load_shape,
     source=WARMING_CONDUCTION.source,
