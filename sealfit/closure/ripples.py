@@ -158,7 +158,9 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
         if units < 4 or not sharp.any():
             continue
         k = int(np.argmax(np.where(sharp & tops(total) & ~spectrum.taken, statistic, 0)))
-        p = _coherence_p(statistic[k], units) * spectrum.frequency.size * modes
+        # With random phases R/n is Beta(1, n - 1) for equal amplitudes of n units.
+        p = float(betaincc(1, max(units - 1, 1), min(statistic[k] / units, 1.0)))
+        p = p * spectrum.frequency.size * modes
         wavelength = _refined(total, spectrum.frequency, k)
         amplitude = float(np.abs(spectrum.mean[mode, k]))
         energy = amplitude**2 * float(spectrum.count[k])
@@ -230,11 +232,6 @@ def _mean_of_zero(numbers: np.ndarray) -> tuple[float, float]:
     mean = numbers.mean(axis=0)
     statistic = float((n - k) / k * mean @ np.linalg.pinv(np.cov(numbers.T, ddof=0)) @ mean)
     return statistic, float(fdtrc(k, n - k, statistic))
-
-
-def _coherence_p(statistic: float, units: int) -> float:
-    """Return P(R >= statistic) for random phases: R/n is Beta(1, n - 1) for equal amplitudes."""
-    return float(betaincc(1, max(units - 1, 1), min(statistic / units, 1.0)))
 
 
 def _incoherent(spectrum: Spectrum) -> Peak:

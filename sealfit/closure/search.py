@@ -347,7 +347,8 @@ def _pairs(
     straight = [c for c in candidates if c.straight and c.claimable]
     between = {c.channels: [channels[n] for n in c.channels if n != "direction"] for c in straight}
     level = {id(c): scatter_level(between[c.channels] or [channels["direction"]], rows) for c in straight}
-    lines = [c for c in straight if not c.pair and c.target in _targets(c)]
+    targets = {("direction",): OF_DIRECTION}
+    lines = [c for c in straight if not c.pair and c.target in targets.get(c.channels, MAIN_TARGETS)]
     lines = list({c.key: c for c in reversed(lines)}.values())
     products = [c for c in straight if c.pair]
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
@@ -369,10 +370,6 @@ def _is_simple_pair(line: Candidate, other: Candidate, channels: Mapping[str, Ch
         and not all(inside)
         and line.acts_on == other.acts_on
     )
-
-
-def _targets(candidate: Candidate) -> Sequence[tuple[str, str]]:
-    return OF_DIRECTION if candidate.channels == ("direction",) else MAIN_TARGETS
 
 
 def _joint_test(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -157,7 +157,7 @@ def reselect_on_all(
     """
     added, after = list(selection.added), selection.after
     whole = fit(after.model, every, after.scatter, turns=1)
-    for first in (a for a in selection.added if a.rivals and not _periodic(a.proposal)):
+    for first in (a for a in selection.added if a.rivals and not a.proposal.term.effect.periodic):
         item = first
         for others_of in (_first_rivals, _on_other_quantities):
             number = next(k for k, a in enumerate(added) if a is item)
@@ -182,7 +182,7 @@ def reselect_on_all(
 
 def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
     """Return the first rivals of an effect."""
-    return [rival for rival, _ in item.rivals[:MOST_RIVALS] if not _periodic(rival)]
+    return [rival for rival, _ in item.rivals[:MOST_RIVALS] if not rival.term.effect.periodic]
 
 
 def _on_other_quantities(item: AcceptedEffect) -> list[Proposal]:
@@ -201,17 +201,13 @@ def _replaced(
 ) -> tuple[AcceptedEffect, Fitted]:
     """Return an effect replaced by another proposal, its own now a rival, and the fit of the part with it."""
     without = after.refitted(after.model.without_term(number))
-    model = without.model.with_term(chosen.term, _values(chosen))
+    model = without.model.with_term(chosen.term, chosen.fitted.model.values[-1])
     chosen = replace(chosen, fitted=after.refitted(model))
     gain = heldout_gain(without, chosen, config.loop, samples, {})
     rest = (r for r in _rivals(item) if r[0].term is not chosen.term)
     rivals = ((item.proposal, item.left_N), *rest)
     after = fit(chosen.fitted.model, after.rows, after.scatter, turns=2)
     return AcceptedEffect(chosen, gain.rmse_N, gain.left_N, rivals, item.round), after
-
-
-def _periodic(proposal: Proposal) -> bool:
-    return proposal.term.effect.periodic
 
 
 def _rivals(item: AcceptedEffect) -> list[tuple[Proposal, float]]:
@@ -221,14 +217,8 @@ def _rivals(item: AcceptedEffect) -> list[tuple[Proposal, float]]:
 
 def _on_full_campaign(proposal: Proposal, every: Rows) -> Proposal:
     """Return a proposal of a part as one for all strokes, not fitted yet."""
-    return replace(
-        proposal, units=every.groups.starts[proposal.unit].size, values=_values(proposal), fitted=None
-    )
-
-
-def _values(proposal: Proposal) -> Mapping[str, float]:
-    """Return the parameters of a fitted proposal."""
-    return proposal.fitted.model.values[-1]
+    units = every.groups.starts[proposal.unit].size
+    return replace(proposal, units=units, values=proposal.fitted.model.values[-1], fitted=None)
 
 
 def missed_by_subsample(fitted: Fitted, selection: Selection, config: Config) -> str:
