@@ -10,7 +10,7 @@ from bristle_helpers import integrated
 
 from sealfit.config import load_config
 from sealfit.fit import whole_steady_fit
-from sealfit.fit.dynamic import fit_dynamic
+from sealfit.fit.dynamic import bristle_rows, fit_dynamic
 from sealfit.fit.dynamic.bristle_model import Curve, Stroke
 from sealfit.fit.dynamic.presliding import fit_stiffness
 from sealfit.fit.dynamic.starts import starts_of, strokes_along
@@ -68,6 +68,22 @@ def test_no_damping_is_found_where_there_is_none():
     strokes = [start(k, 2.0 ** (k % 6), noise=0.05, sigma_1=0.0) for k in range(12)]
     found = fit_stiffness(strokes, CURVE)
     assert found.sigma_1 - found.damping_half_width() <= 0.0 <= found.damping_half_width() < 0.3
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_damping_is_not_determined_if_strokes_begin_at_constant_speed(seed):
+    rng, strokes, curve = np.random.default_rng(seed), [], Curve(14.0, 9.0, 2.0, 0.02)
+    for k, speed in enumerate(np.repeat([0.3, 1.0, 3.0, 10.0], 3)):
+        distance = np.arange(40) / 15
+        limit = curve.limit_N(np.array([speed]))[0]
+        force = limit * (1 - np.exp(-40.0 * distance / limit)) + 0.02 * speed
+        noisy = force + 0.05 * rng.standard_normal(40)
+        strokes.append(Stroke(k, k, 1.0, distance, speed * (1 + 1e-5 * rng.standard_normal(40)), noisy))
+    found = fit_stiffness(strokes, curve)
+    assert found.sigma_0 == pytest.approx(40.0, rel=0.02)
+    row = list(bristle_rows(found, curve, load_config()))[1]
+    assert not row["identified"]
+    assert "constant speed" in row["reason"]
 
 
 def test_a_rise_within_a_sample_is_not_seen():

@@ -30,6 +30,10 @@ ALONG = (
 TOO_FAST = "the force rises within a few samples: sample faster, or start more slowly"
 MISSED = "the rise of the force differs from the model's: the residual is {share:.0%} of the sliding force"
 NO_CURVE = "the Stribeck curve is not known: its effect along the ramp cannot be distinguished from damping"
+CONSTANT = (
+    "the strokes begin at constant speed: damping cannot be distinguished from their initial force; "
+    "record the motion from rest"
+)
 ONE_START = "one start alone: no scatter is known; measure repeats"
 WIDE = "the starts disagree: only that it lies between {low:.3g} and {high:.3g} {unit} is known"
 
@@ -81,8 +85,8 @@ def _damping_row(found: Stiffness, curve: Curve, unit: str) -> dict:
     if found.files < 2 or not found.stiffness_known:
         why = ONE_START if found.files < 2 else "sigma_0 is not determined"
         return table_row(**row, identified=False, reason=why)
-    if not curve.known:
-        return table_row(**row, identified=False, reason=NO_CURVE)
+    if not (found.damped and curve.known):
+        return table_row(**row, identified=False, reason=NO_CURVE if found.damped else CONSTANT)
     half = found.damping_half_width()
     low, high = max(found.sigma_1 - half, 0.0), found.sigma_1 + half
     row |= {"lo95": low, "hi95": high, "se": found.damping_se}

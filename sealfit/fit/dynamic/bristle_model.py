@@ -90,6 +90,10 @@ STIFFNESSES = 40
 DAMPINGS = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0])
 # Samples between these shares of the rise determine its length.
 SHARE = (0.02, 0.98)
+# Damping is distinguishable if more than this share of its sum of squares remains after projection off the
+# level and the initial force of the strokes. At constant speed nothing remains, otherwise about the square of
+# the relative variation of the speed. 1e-4: a variation of 1 %.
+DISTINCT = 1e-4
 # Number of rise lengths after which the exponential is zero; larger exponents overflow.
 FAR = 500.0
 # Level and start are not distinguishable if the determinant of their normal equations is below this share of
@@ -241,8 +245,18 @@ class Rises:
             moved.append(-model - (change * both).sum(axis=1))
         return Tangent(linear[:, 0, 0], linear[:, 1, 0], residual, np.stack(moved))
 
-    def best_of_grid(self) -> tuple[np.ndarray, tuple[float, float]]:
-        """Return the best point of a grid, (log sigma_0, tau), and the range of log sigma_0 of the grid."""
+    def shows_damping(self, sigma_0: float) -> bool:
+        """Return whether a small damping is distinguishable from the level and initial force of strokes."""
+        at = self.tangent(np.array([np.log(sigma_0), 0.0]))
+        lagging = self._columns(sigma_0, slopes=False)[0][1]
+        effect = at.level[:, None] * lagging[:, 0] + at.begin[:, None] * lagging[:, 1]
+        return float(at.normal[:, 1, 1].sum()) > DISTINCT * float((effect**2).sum())
+
+    def best_of_grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the best point of a grid, (log sigma_0, tau), and its lower and upper bounds, shape (2, 2).
+
+        tau is 0 if the damping is not distinguishable.
+        """
         level = float(np.median(self.limit[self.there]))
         steps = self.step[self.step > 0]
         lengths = np.geomspace(0.3 * np.median(steps), self.step.sum(axis=1).max(), STIFFNESSES)
@@ -252,10 +266,13 @@ class Rises:
             constant, lagging = self._columns(level / length, slopes=False)[0]
             for m, tau in enumerate(DAMPINGS * length / pace):
                 squares[k, m] = (self._solved(constant + tau * lagging)[2] ** 2).sum()
+        damped = self.shows_damping(level / lengths[np.argmin(squares[:, 0])])
+        squares[:, 1:] += 0.0 if damped else np.inf
         best, damping = np.unravel_index(np.argmin(squares), squares.shape)
         low, high = np.log(level / lengths[[-1, 0]])
         tau = DAMPINGS[damping] * lengths[best] / pace
-        return np.array([np.log(level / lengths[best]), tau]), (float(low), float(high))
+        bounds = np.array([[low - 1.0, 0.0], [high + 1.0, np.inf if damped else 0.0]])
+        return np.array([np.log(level / lengths[best]), tau]), bounds
 
     def noise_N(self) -> float:
         """Return the standard deviation of a sample in N, from second differences."""

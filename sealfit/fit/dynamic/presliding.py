@@ -19,7 +19,7 @@ evidence is the run, as a set-up shifts all files of a run.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -64,6 +64,7 @@ class Stiffness:
 
     sigma_0: float
     tau_s: float
+    damped: bool  # whether the damping is distinguishable; tau is NaN otherwise
     covariance: np.ndarray  # (2, 2) of log sigma_0 and tau; NaN from fewer than two units
     df: np.ndarray  # (2,) Satterthwaite's degrees of freedom of the two
     within: int  # samples inside the rise
@@ -120,8 +121,8 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     if not strokes:
         return None
     rises = Rises(strokes, curve)
-    x, (least, most) = rises.best_of_grid()
-    bounds = np.array([[least - 1.0, 0.0], [most + 1.0, np.inf]])
+    x, bounds = rises.best_of_grid()
+    damped = bool(bounds[1, 1] > 0)
 
     def evaluate(x: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = rises.tangent(x[0])
@@ -129,6 +130,7 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
 
     x = levenberg_marquardt(evaluate, x[None], *bounds)[0][0]
     found = rises.tangent(x)
+    found = found if damped else replace(found, jacobian=found.jacobian * [[[1.0]], [[0.0]]])
     level = rises.run_levels(found.level)
     inverse = np.linalg.pinv(found.normal.sum(axis=0), rcond=1e-12, hermitian=True)
     shifts = []
@@ -146,7 +148,8 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     )
     return Stiffness(
         sigma_0=float(np.exp(x[0] + level.mean())),
-        tau_s=float(x[1]),
+        tau_s=float(x[1]) if damped else np.nan,
+        damped=damped,
         covariance=by_files + np.diag([by_level, 0.0]) + by_curve,
         df=together(parts),
         gain=rises.gain_of(found.rss),
