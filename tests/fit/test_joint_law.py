@@ -93,6 +93,13 @@ def test_a_law_that_passes_through_nearly_all_values_is_not_compared(seed):
     assert 100.0 < life.days < 1500.0  # 366 d
 
 
+def test_a_law_without_degrees_of_freedom_is_not_compared_with_one_that_has_some():
+    days, value = np.array([0.0, 7.0, 21.0, 56.0]), np.array([0.70, 0.602, 0.570, 0.531])
+    laws = fit_laws(Aged(days, value))
+    assert {law.loss.name for law in laws} == {"log", "power"}
+    assert {law.loss.name for law in fit_laws(Aged(days[:3], value[:3]))} == {"log", "power"}
+
+
 def test_intervals_hold_the_truth():
     hits = []
     for seed in range(30):

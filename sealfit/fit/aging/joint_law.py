@@ -27,7 +27,7 @@ ROUNDING = 1e-14
 # Largest number of series that are left out in turn for held-out errors. The root mean square of their errors
 # is then known to a tenth.
 MOST_LEFT_OUT = 50
-# Fewest degrees of freedom of a law that is compared with others.
+# Fewest degrees of freedom of a law that is compared with others that leave more.
 SPARE = 2
 
 
@@ -326,7 +326,7 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
 def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw]:
     """Return every law that the values determine, acting on rate and on loss, in order of BIC.
 
-    Laws that leave fewer than `SPARE` degrees of freedom are left out if another leaves more: with one, a law
+    Laws that leave fewer than `SPARE` degrees of freedom are left out if another leaves more: such a law
     often passes through all values, and its scatter, and so its BIC, is far too small. FitError if they
     determine none.
     """
@@ -340,8 +340,9 @@ def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw
                 first = first or error  # of the law with the fewest parameters
     if not found:
         raise first
-    compared = [law for law in found if aged.value.size >= len(law.names) + SPARE]
-    return sorted(compared or found, key=lambda law: law.bic)
+    enough = min(aged.value.size - min(len(law.names) for law in found), SPARE)
+    compared = [law for law in found if aged.value.size - len(law.names) >= enough]
+    return sorted(compared, key=lambda law: law.bic)
 
 
 def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
