@@ -45,6 +45,15 @@ def test_what_is_never_or_already_reached_is_said(laws, value, words):
     assert "nan" not in text
 
 
+def test_the_interval_over_all_laws_is_given_if_the_first_law_never_ends():
+    days = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
+    value = 0.7 - 0.05 * np.log1p(days) * (1 + 0.05 * (-1.0) ** np.arange(8))
+    laws = sorted(fit_laws(Aged(days, value)), key=lambda law: law.loss.name != "stretched")
+    text = said(laws, Goal(0.1))
+    assert "0.1 is not reached within 1e9 d" in text
+    assert "95 % interval over all laws, weighted: " in text
+
+
 def test_the_temperature_for_years_has_an_interval_and_is_marked_beyond_the_tests(laws):
     text = said(laws, Goal(loss=0.3), 10.0)
     assert "it lasts 10 years at " in text

@@ -276,7 +276,7 @@ def lifetime_lines(part: Mapping) -> list[str]:
     found.append(line("life" if "days" in part else "use", _life(part)))
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
-    if part.get("ci95_over_laws") and part["rivals"] and part["days"]:
+    if part.get("ci95_over_laws") and part["rivals"] and part["days"] != 0:
         weighted = _days_between(part["ci95_over_laws"])
         found.append(line("", f"95 % interval over all laws, weighted: {weighted}"))
     if part.get("before"):
