@@ -7,8 +7,9 @@ from scipy.optimize import least_squares
 from steady_tables import MU_C, MU_S
 
 from sealfit.config import Config, Quantity
+from sealfit.errors import RequestError
 from sealfit.fit import steady
-from sealfit.fit.aging.all_series import aged_values, joint_laws, shared_levels
+from sealfit.fit.aging.all_series import aged_values, joint_laws, law_of, shared_levels
 from sealfit.fit.aging.joint_law import fit_joint_law
 from sealfit.fit.steady import fit_conditions, solve_conditions
 from sealfit.fit.steady.uncertainty import run_means
@@ -114,6 +115,13 @@ def test_days_that_do_not_agree_on_the_stribeck_speed_keep_their_free_fits(campa
     free = fits[fits["quantity"] == "steady"].set_index(["condition", "parameter"])["value"]
     for row in found.table.itertuples():
         assert row.value == free[row.condition, row.quantity]
+
+
+def test_a_quantity_that_no_condition_identifies_is_said_with_the_reason(campaign):
+    table = campaign(noise=0.01, ways=(1,))
+    few = table[table["speed_mm_s"].rank(method="dense") <= 4].drop_duplicates(["condition", "speed_mm_s"])
+    with pytest.raises(RequestError, match=r"mu_s is not identified in any condition: as many .* no repeats"):
+        law_of(few, fit_conditions(few, Config()), "mu_s")
 
 
 @pytest.mark.parametrize("quantity", ["mu_s", "mu_c"])

@@ -354,12 +354,19 @@ def law_of(
 ) -> list[JointLaw]:
     """Return the laws of one quantity, such as "mu_s", in order of BIC, or only a named one.
 
-    RequestError if rubber is not aged, the quantity was not fitted, there are several rubbers, or no such law
-    can be fitted.
+    RequestError if rubber is not aged, the quantity was not fitted or is not identified, there are several
+    rubbers, or no such law can be fitted.
     """
     if "aging_days" not in steady_fit.columns:
         raise RequestError("this rig ages no rubber.", fix="Name aging_days in the config's condition.")
-    return laws_of(aged_values(steady, steady_fit), quantity, name)
+    values = aged_values(steady, steady_fit)
+    rows = steady_fit[(steady_fit["quantity"] == "steady") & (steady_fit["parameter"] == quantity)]
+    if len(rows) and quantity not in {one for _, one in values}:
+        raise RequestError(
+            f"{quantity} is not identified in any condition: {rows['reason'].mode()[0]}",
+            fix="Measure more speeds and repeats, or follow another quantity.",
+        )
+    return laws_of(values, quantity, name)
 
 
 def laws_of(values: AgedValues, quantity: str, name: str | None = None) -> list[JointLaw]:
