@@ -133,6 +133,7 @@ SCATTER_FALL = 20.0
 # A channel is preferred to the calendar if it explains at least this share of what the calendar explains.
 HALF_OF_CALENDAR = 0.5
 # The scatter is re-estimated for proposals whose BIC, under the best one's scatter, is within this of it.
+# Others are no rivals.
 REFIT_MARGIN = 60.0
 # Forms are equal if their BIC differs by less than this: the simpler or more physical one is reported.
 EQUAL_BIC = 3.0
@@ -144,7 +145,7 @@ MOST_RELATIVE_ERROR = 0.5
 LARGE_CHANGE = 1 / 3
 # Two candidates with a smaller correlation explain different things.
 RIVAL_CORRELATION = 0.5
-# Two candidates with a larger correlation are the same effect in these data.
+# Two candidates with a larger correlation, and a BIC within REFIT_MARGIN, are the same effect in these data.
 SAME_EFFECT = 0.98
 
 

@@ -251,15 +251,18 @@ def correlation(one: Proposal, other: Proposal) -> float:
 
 
 def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
-    """Return proposals these data cannot distinguish from the chosen one: they add nearly the same force."""
+    """Return proposals these data cannot distinguish from the chosen one: they add nearly the same force.
+
+    Those with a far larger BIC are none. They were fitted under the scatter of the best, which does not
+    contain their misfit, and their forces may be wrong by many times the noise.
+    """
     return [p for p in found if p is not chosen and not _identical(p, chosen) and _rival(p, chosen)]
 
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
     similarity = correlation(proposal, chosen)
-    return similarity > SAME_EFFECT or (
-        similarity > RIVAL_CORRELATION and proposal.bic - chosen.bic < RIVAL_BIC
-    )
+    most = REFIT_MARGIN if similarity > SAME_EFFECT else RIVAL_BIC
+    return similarity > RIVAL_CORRELATION and proposal.bic - chosen.bic < most
 
 
 def _identical(one: Proposal, other: Proposal) -> bool:

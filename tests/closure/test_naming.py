@@ -206,7 +206,7 @@ def test_correlation_is_that_of_columns_whatever_their_sign_and_nothing_of_an_em
 
 @pytest.mark.parametrize(
     ("cosine", "behind", "told_apart"),
-    [(0.99, 50.0, False), (0.9, 9.0, False), (0.9, 11.0, True), (0.4, 1.0, True)],
+    [(0.99, 50.0, False), (0.99, 70.0, True), (0.9, 9.0, False), (0.9, 11.0, True), (0.4, 1.0, True)],
 )
 def test_rivals_add_the_same_to_the_force_or_much_of_it_and_are_hardly_worse(cosine, behind, told_apart):
     chosen = proposal("linear")
