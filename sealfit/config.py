@@ -351,7 +351,7 @@ class Strokes(Strict):
     """Every file is one steady stroke, without ramps."""
     turn: float | None = Field(None, ge=1e-9)
     """One turn of a rotation, in the unit of the displacement: `360`. Each turn is a stroke of its own, and
-    its displacement counts from the turn's start.
+    its displacement counts from the turn's start. An angle that begins anew at each turn is unwrapped.
     """
 
 

@@ -14,7 +14,7 @@ import pandas as pd
 from sealfit.config import Bins, Config
 from sealfit.errors import BadFile, Fault
 from sealfit.ingest.file_names import TraceRef
-from sealfit.ingest.files import bad_file, read_marked
+from sealfit.ingest.files import read_marked
 from sealfit.ingest.quality import (
     beginnings,
     equal_neighbours,
@@ -26,7 +26,7 @@ from sealfit.ingest.quality import (
 )
 from sealfit.ingest.reader import Trace, parse_trace
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
-from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, speed_fault
+from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, motion_fault, speed_fault
 from sealfit.ingest.window import acceleration
 from sealfit.store.manifest import Fingerprint, fingerprint
 
@@ -298,8 +298,8 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
     except BadFile as error:
         return FileStrokes(ref.file, mark or fingerprint(campaign / ref.file), 0, error.faults)
     trace, strokes = with_strokes(trace, config)
-    if not strokes:
-        return FileStrokes(ref.file, mark, trace.rows_read, (*trace.faults, _unmoved(trace, config)))
+    if fault := motion_fault(trace, strokes, config):
+        return FileStrokes(ref.file, mark, trace.rows_read, (*trace.faults, fault))
     if fault := speed_fault(trace, strokes, config):
         trace = replace(trace, faults=(*trace.faults, fault))
         if fault.action == "file left out":
@@ -310,8 +310,11 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
 
 
 def with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
-    """Return the trace without rows that are spikes, and its strokes."""
-    displacement = trace.columns["displacement_mm"]
+    """Return the trace without rows that are spikes, its displacement unwrapped, and its strokes."""
+    displacement, turn = trace.columns["displacement_mm"], config.strokes.turn
+    if turn is not None and np.ptp(displacement) <= turn:
+        displacement = np.unwrap(displacement, period=turn)
+        trace = replace(trace, columns={**trace.columns, "displacement_mm": displacement})
     keep, faults = displacement_spikes(trace.ref.file, displacement, trace.line, config.quality)
     trace = _without_inertia(trace.where(keep, faults), config.mass)
     strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
@@ -333,14 +336,6 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
     noise, wanted = (displacement_noise_mm(values, order=4) for values in (displacement, force))
     inertia = mass * acceleration(time_s, displacement, noise, wanted / mass)
     return replace(trace, columns={**trace.columns, "force_N": force - inertia})
-
-
-def _unmoved(trace: Trace, config: Config) -> Fault:
-    """Return what is to be said of a trace without strokes."""
-    span, unit = np.ptp(trace.columns["displacement_mm"]), config.units.unit("displacement")
-    reason = f"nothing moves: displacement stays within {span:.3g} {unit}."
-    fix = "Check the displacement column and its unit, or set strokes.min_travel_mm in the config."
-    return bad_file(trace.ref.file, "no_motion", reason, fix, column="displacement_mm").fault
 
 
 def _strokes_before(ref: TraceRef) -> int:

@@ -9,11 +9,12 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from sealfit.config import Config, Quality
-from sealfit.errors import KEPT, Fault
+from sealfit.errors import KEPT, ConfigError, Fault
+from sealfit.ingest.files import bad_file
 from sealfit.ingest.reader import Trace
 from sealfit.ingest.segments import weighted_median
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm
-from sealfit.units import Units
+from sealfit.units import Units, conversion
 
 # ---------------------------------------------------------------- spikes
 
@@ -113,6 +114,33 @@ def _spike(file: str, stroke: int | None, column: str, value: float, off: float,
     reason = f"a single sample, {abs(off):.4g} off its neighbours."
     place = {"file": file, "stroke": stroke, "line": int(line), "column": column, "value": float(value)}
     return Fault("spike", reason, severity="warning", action="row left out", fix=FIX, **place)
+
+
+# ---------------------------------------------------------------- motion
+
+
+def motion_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fault | None:
+    """Return a fault if nothing moves in a trace, or if its angle begins anew at each turn; else None."""
+    place, unit = trace.columns["displacement_mm"], config.units.unit("displacement")
+    span, step = np.ptp(place), np.abs(np.diff(place)).max(initial=0.0)
+    turn = _turn(unit) if step > 0.5 * span else None
+    if turn is not None and span <= turn < 2.0 * step:
+        check, reason = "wrapped", "it stays within a turn and jumps from its one end to the other: it wraps."
+        fix = f"Set turn = {turn:g} under [strokes]: the angle is then unwrapped, and each turn is a stroke."
+    elif strokes:
+        return None
+    else:
+        check, reason = "no_motion", f"nothing moves: displacement stays within {span:.3g} {unit}."
+        fix = "Check the displacement column and its unit, or set strokes.min_travel_mm in the config."
+    return bad_file(trace.ref.file, check, reason, fix, column="displacement_mm").fault
+
+
+def _turn(unit: str) -> float | None:
+    """Return a turn in the unit of an angle; None in any other unit."""
+    try:
+        return conversion("turn", unit).of_cell(1.0)
+    except ConfigError:
+        return None
 
 
 # ---------------------------------------------------------------- speed check

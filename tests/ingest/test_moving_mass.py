@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from trace_helpers import config
 
-from sealfit.errors import ConfigError
+from sealfit.errors import CampaignError, ConfigError
 from sealfit.fit.dynamic.starts import strokes_along
 from sealfit.fit.joint.rows import merge_directions, nesting_run, records
 from sealfit.fit.steady.uncertainty import run_means
@@ -102,6 +102,22 @@ def test_turns_of_a_rotation_share_their_positions_and_have_ripples_in_place(tmp
     npt.assert_allclose(np.diff(whole["distance_mm"]), 360.0, atol=2.0)  # it counts on
     place, residual = tables["bins"]["displacement_mm"], tables["bins"]["force_N"] - 20.0
     assert np.corrcoef(residual, np.cos(np.radians(3.0 * place)))[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_an_angle_that_begins_anew_at_each_turn_is_told_and_unwrapped(tmp_path, way):
+    time = np.arange(0.0, 20.0, 0.01)
+    angle = (1000.0 + way * 90.0 * time) % 360.0  # five turns
+    force = way * (20.0 + np.random.default_rng(3).normal(0.0, 0.1, time.size))
+    units = ONE + '[quantities]\ndisplacement = {quantity = "angle", unit = "deg"}\n'
+    units += 'speed = {quantity = "speed", unit = "deg/s"}\n'
+    with pytest.raises(CampaignError, match=r"it wraps\. Set turn = 360 under \[strokes\]"):
+        ingested(tmp_path / "wrapped", [(time, angle, force)], units)
+    units += "[strokes]\nturn = 360\n"
+    steady = ingested(tmp_path / "turns", [(time, angle, force)], units).tables["steady"]
+    assert len(steady) == 6
+    npt.assert_allclose(steady["speed_mm_s"], way * 90.0, rtol=1e-3)
+    npt.assert_allclose(steady["force_N"], way * 20.0, atol=0.1)
 
 
 @pytest.mark.parametrize(
