@@ -166,7 +166,7 @@ def ingest_campaign(
     faults += found
     if not strokes["used"].any():
         raise CampaignError(_nothing_left(faults, len(listing)))
-    if turned := turned_sign(strokes):
+    if turned := turned_sign(strokes, config):
         raise CampaignError(turned)
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found

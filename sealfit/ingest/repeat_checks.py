@@ -247,7 +247,7 @@ def copied_files(faults: Sequence[Fault], hashes: Mapping[str, str | None]) -> l
     return made
 
 
-def turned_sign(strokes: pd.DataFrame) -> list[Fault]:
+def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
     """Return a fault if the friction of a whole campaign has the direction of the motion.
 
     An offset of the sensor larger than the friction turns the sign in one direction only; with strokes in
@@ -261,7 +261,9 @@ def turned_sign(strokes: pd.DataFrame) -> list[Fault]:
     count = int((against < 0.0).sum())
     reason = f"the mean force has the direction of the motion in {count} of {len(used)} strokes; "
     reason += "friction opposes it."
-    fix = 'Change its sign in the config: force_N = "-force_N" under [trace.compute].'
+    computed = config.trace.compute.get("force_N")
+    turned = "-force_N" if computed is None else f"-({computed})"
+    fix = f'Change its sign in the config: force_N = "{turned}" under [trace.compute].'
     return [Fault("turned_sign", reason, column="force_N", value=friction, fix=fix)]
 
 

@@ -274,6 +274,11 @@ def test_a_friction_that_pushes_along_stops_with_the_line_for_the_config(tmp_pat
         ingest_campaign(tmp_path, config('condition = ["aging_days"]'))
     text = 'condition = ["aging_days"]\n[trace.compute]\nforce_N = "-force_N"\n'
     assert ingest_campaign(tmp_path, config(text)).tables["steady"]["force_N"].min() > 0
+    computed = 'condition = ["aging_days"]\n[trace.columns]\nraw = "force_N"\n[trace.compute]\nforce_N = '
+    with pytest.raises(CampaignError, match=r'force_N = "-\(2 \* raw\)" under \[trace.compute\]'):
+        ingest_campaign(tmp_path, config(computed + '"2 * raw"\n'))
+    made = ingest_campaign(tmp_path, config(computed + '"-(2 * raw)"\n'))
+    assert made.tables["steady"]["force_N"].min() > 0
 
 
 @pytest.mark.parametrize("how", ["copy", "link", "rewritten"])
