@@ -19,7 +19,7 @@ from sealfit.errors import KEPT, NOTED, STROKE_OUT, ConfigError, Fault
 from sealfit.ingest.strokes import Stroke
 from sealfit.ingest.trace_checks import resolution, with_unit
 from sealfit.tables import CALENDAR, QUALITY, STEADY
-from sealfit.units import conversion
+from sealfit.units import Conversion, conversion
 
 LEAST_DIFFERENT = 10  # forces at the beginning of a stroke that tell it from others
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
@@ -266,12 +266,16 @@ def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
     rows = steady[steady["used"].to_numpy(bool) & (np.abs(steady["load_N"].to_numpy(float)) > 0)]
     ratio = in_load_units(rows["force_N"].abs()) / rows["load_N"].abs()
     mu = ratio.groupby(rows["file"].to_numpy(), sort=False).mean()
-    faults = []
+    faults, ours = [], config.units.unit("force")
+    declared = config.conversions("trace").get("force_N", Conversion()).factor
     for wrong, fix in ((mu > MU_RANGE[1], _HEAVIER), (mu < MU_RANGE[0], _LIGHTER)):
         if wrong.any():
             middle = float(mu[wrong].median())
             if middle > IN_MN:
                 fix = f"Is the force in mN? {with_unit('force_N', 'mN', config)}"
+            if MU_RANGE[0] <= middle / declared <= MU_RANGE[1]:  # the numbers as they are
+                own = f"Is the force in {ours}? {with_unit('force_N', ours, config)}"
+                fix = own if middle > IN_MN else f"{own} {fix}"
             where = f"in {wrong.sum()} of {len(mu)} files"
             if wrong.sum() < len(mu) / 2:  # exceptions, not a unit of the campaign
                 where += f", such as {wrong.idxmax()}"

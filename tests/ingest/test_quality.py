@@ -339,6 +339,15 @@ def test_a_load_in_kg_or_g_is_a_warning(load, said, fix):
     assert f'unit = "{fix}"' in fault.fix
 
 
+@pytest.mark.parametrize(("unit", "load"), [("kN", False), ("mN", True), ("kgf", True)])
+def test_of_a_wrong_unit_that_is_declared_the_right_one_is_named(unit, load):
+    own = parse_config(f'trace.columns.force_N = {{name = "F", unit = "{unit}"}}\n', "rig.toml")
+    factor = {"kN": 1e3, "mN": 1e-3, "kgf": 9.80665}[unit]
+    (fault,) = improbable_loads(steady_of(49.03, force=36.2 * factor), own)
+    assert fault.fix.startswith("Is the force in N? Set force_N = {name = 'F', unit = \"N\"} under")
+    assert ("Is the load" in fault.fix) == load
+
+
 def test_of_a_few_improbable_files_the_first_is_named():
     steady = pd.DataFrame(
         {"file": ["a.csv", "b.csv", "c.csv"], "force_N": [30.0, 3100.0, 31.0], "load_N": 49.03, "used": True}
