@@ -202,7 +202,7 @@ def test_a_changed_file_is_found_and_everything_after_it_redone(first, campaign,
     assert json.loads(moved.stdout)["done"] == []
     assert "holds the same data" in moved.stderr
     trace = sorted((copy / "traces").iterdir())[0]
-    trace.write_text(trace.read_text().replace("time_s,", "time_s,", 1) + "oops,1,1\n")
+    trace.write_text(trace.read_text().replace("time_s,", "time_s,", 1) + "oops,no,1\n")
     for words in (["fit-steady", out], ["report", out]):
         assert f"inputs changed (traces/{trace.name}). Run: sealfit ingest" in sealfit(*words, code=1).stderr
     run = sealfit("run", copy, "--out", out, "--json")
@@ -211,7 +211,7 @@ def test_a_changed_file_is_found_and_everything_after_it_redone(first, campaign,
     assert json.loads(run.stdout)["ingest"]["rows_left_out"] == 1
     refused = sealfit("run", copy, "--out", tmp_path / "strict", "--strict", "--json", code=1)
     assert json.loads(refused.stdout)["errors"][0]["file"] == f"traces/{trace.name}"
-    assert sealfit("check", copy, code=1).stdout.endswith("1 fault found.\n")
+    assert sealfit("check", copy, code=1).stdout.endswith("2 faults found.\n")
 
 
 @pytest.mark.parametrize("moved", [False, True])

@@ -51,7 +51,7 @@ def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
     return {
         "files": {status.replace(" ", "_"): files[status] for status in ("used", "left out", "not matched")},
         "not_traces": {check: rows["file"].tolist() for check, rows in others.groupby("check", sort=False)},
-        "rows_left_out": actions["row left out"],
+        "rows_left_out": _rows_left_out(quality[quality["action"] == "row left out"]),
         "strokes_left_out": actions["stroke left out"],
         "faults": {severity: severities[severity] for severity in ("error", "warning")},
         "incomplete_columns": [
@@ -61,6 +61,13 @@ def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
         "runs": int(runs.loc[runs["used"].astype(bool), "run_id"].nunique()),
         "conditions": int(tables["steady"]["condition"].nunique()),
     }
+
+
+def _rows_left_out(faults: pd.DataFrame) -> int:
+    """Return how many rows are left out: a row may have several faults, a fault may count several rows."""
+    listed = faults["line"].notna()
+    more = faults.loc[~listed, "value"].astype(float).groupby(faults["file"]).max().sum()
+    return len(faults.loc[listed, ["file", "line"]].drop_duplicates()) + int(more)
 
 
 def of_fit(fit: pd.DataFrame, of: str) -> dict:
