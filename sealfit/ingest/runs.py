@@ -54,7 +54,7 @@ from sealfit.ingest.derived_columns import (
     with_computed,
     with_day_0,
 )
-from sealfit.ingest.file_names import Listing, TraceRef, channels_of, fits_up_to, name_parts, unmatched
+from sealfit.ingest.file_names import Listing, channels_of, fits_up_to, name_parts, unmatched
 from sealfit.ingest.files import as_number, bad_file, cut_files, read_bytes
 from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt
@@ -334,6 +334,7 @@ def _from_traces(
     Also the measured speed of each file read (nan of the others), the files to leave out, and their faults.
     """
     none = [None] * len(entries)
+    refs = Listing([entry.file for entry in entries], _set_speed(columns), [])
     lacking = _lacking(columns, len(entries), config)
     runs = known(columns.get("run_id", none)) | known(columns.get("speed_mm_s", none))
     added: dict[str, dict[int, float | str]] = {}
@@ -343,7 +344,7 @@ def _from_traces(
     for i in np.flatnonzero(np.any([~runs, *lacking.values()], axis=0)).tolist():
         wanted, file = [name for name, lack in lacking.items() if lack[i]], entries[i].file
         try:
-            trace, strokes = with_strokes(read_trace(campaign, TraceRef(file, {}), config), config)
+            trace, strokes = with_strokes(read_trace(campaign, refs[i], config), config)
         except BadFile as error:
             if wanted:  # otherwise it is left out, and said why, when it is read for good
                 left_out.add(i)

@@ -122,6 +122,14 @@ def test_a_folder_in_which_nothing_fits_stops_the_run(tmp_path):
     assert [fault.check for fault in faults(tmp_path, DAYS)] == ["no_rows", "nothing_left"]
 
 
+def test_an_empty_cell_of_a_condition_is_told_where_keep_reads_the_table(tmp_path):
+    for file in "ab":
+        trace(tmp_path, f"{file}.csv")
+    (tmp_path / "runs.csv").write_text("file,run_id,aging_days,status\na.csv,a,4,ok\nb.csv,b,,ok\n")
+    (fault,) = faults(tmp_path, DAYS + "trace.keep = \"status == 'ok'\"")
+    assert (fault.check, fault.column, fault.line) == ("empty_cell", "aging_days", 3)
+
+
 @pytest.mark.parametrize("glob", ["../*.csv", "/etc/*"])
 def test_globs_stay_inside(tmp_path, glob):
     assert faults(tmp_path, f'files.glob = "{glob}"')[0].check == "path_outside"
