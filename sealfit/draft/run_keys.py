@@ -313,12 +313,14 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
             if ours == "started_at" and (time := excel_time(cell.replace(",", "."))):
                 evidence += f": Excel's serial number of {time.isoformat(' ', 'minutes')}"
             notes.guess(f"files.runs_columns.{ours}", value, evidence)
+    told = {*table.ours, clock}
     if "started_at" not in table.given:
-        _dates_doubt(table, clock, notes)
-    if unknown := [f"'{name}'" for name in table.cells if name not in table.ours and not name.isidentifier()]:
+        told.add(_dates_doubt(table, clock, notes))
+    if unknown := [f"'{name}'" for name in table.cells if name not in told and not Units().of(name)]:
         hold = "holds" if len(unknown) == 1 else "hold"
         reason = f"what {', '.join(unknown)} of {table.file} {hold} is not known here."
-        fix = "Name a load, a temperature or the like by our name for it."
+        fix = "Name a load, a temperature or the like by our name for it; "
+        fix += "what is neither sample nor contact, such as remarks, goes into loop.ignore_channels."
         notes.doubt("files.runs_columns", reason, fix)
 
 
@@ -336,7 +338,8 @@ def _compressed(theirs: str, table: RunsTable, notes: Notes) -> bool:
     return True
 
 
-def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> None:
+def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> str:
+    """Add a doubt about the first column of dates in a form that is not known, and return it; "" if none."""
     dates = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}")
     for name, cells in table.cells.items():
         full = [cell for cell in cells if cell]
@@ -349,7 +352,8 @@ def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> None:
             form = " or ".join(usual_formats(full)) or "a list of formats, such as ['%d.%m.%Y %H:%M']"
             fix = f"Set {started} and files.date_format = {form}."
             notes.doubt("files.runs_columns", f"column '{name}' of {table.file} {what}.", fix)
-            return
+            return name
+    return ""
 
 
 # ---------------------------------------------------------------- condition
@@ -369,7 +373,8 @@ def condition_keys(names: Names, table: RunsTable | None, header: Collection[str
         missing = [name for name in AGING_CONDITION if name not in given]
         if missing:
             reason = f"nothing says {' or '.join(missing)}: the same is assumed for all files."
-            notes.doubt("condition", reason, "Add it to a runs.csv if it differs.")
+            where = f"a {RUNS_CSV}" if table is None else table.file
+            notes.doubt("condition", reason, f"Add it to {where} if it differs.")
         return
     own = [part.ours for part in names.parts if part.ours and part.ours not in NO_CONDITION]
     own += sorted(of_table - set(NO_CONDITION))
@@ -379,10 +384,11 @@ def condition_keys(names: Names, table: RunsTable | None, header: Collection[str
         fix = "Leave those that change nothing about the sample or the contact out of it."
         notes.doubt("condition", reason, fix)
         return
+    write = f"Write a {RUNS_CSV} with" if table is None else f"Add to {table.file}"
     notes.guess("condition", ["state"], "nothing tells conditions apart")
     notes.guess("files.columns.state", "one", "the same for all files")
     notes.doubt("condition", "nothing says what differs between the files: all are taken as one condition.",
-                f"Write a {RUNS_CSV} with temperature_C, compression_ratio_pct and aging_days.")  # fmt: skip
+                f"{write} temperature_C, compression_ratio_pct and aging_days.")  # fmt: skip
 
 
 def _origin(name: str, names: Names, table: RunsTable | None) -> str:

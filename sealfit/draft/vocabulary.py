@@ -35,7 +35,7 @@ _SPELLINGS = {
     ("time", "min"): ("min", "minutes", "minuten"),
     ("time", "h"): ("h", "hr", "hours", "std", "stunden"),
     ("time", "d"): ("d", "days", "day", "tage", "tag"),
-    ("time", "week"): ("wk", "week", "weeks", "woche", "wochen"),
+    ("time", "week"): ("wk", "week", "weeks", "woche", "wochen", "semaines"),
     ("length", "ft"): ("ft",),
     ("force", "N"): ("N",),
     ("force", "kN"): ("kN",),
@@ -106,6 +106,8 @@ def name_and_unit(text: str) -> tuple[str, Unit | None]:
     ('Weg', 's', 'kN')
     >>> name_and_unit("Speed_mm_s")[1].name, name_and_unit("Reibkraft")
     ('mm/s', ('Reibkraft', None))
+    >>> name_and_unit("Weeks")[1].name
+    'week'
     """
     for pattern in _NAME_AND_UNIT:
         if match := pattern.match(text.strip()):
@@ -116,7 +118,7 @@ def name_and_unit(text: str) -> tuple[str, Unit | None]:
             bare = match["unit"] in ("F", "K") and setting(name) != "temperature_C"  # Kraft F, Karte K
             if unit is not None and not bare:
                 return name, unit
-    return text.strip(), None
+    return text.strip(), unit_of(text) if setting(text) == "aging_days" else None
 
 
 # ---------------------------------------------------------------- words
@@ -181,7 +183,11 @@ _SETTING_WORDS = (
         "temperature_C",
         r"^temp|^oven$|^ofen$|(aging|ageing|alterungs?|(aus)?lager(ungs?)?|ofen|oven) ?temp|temp.*aging",
     ),
-    ("aging_days", r"aging|ageing|\baged?\b|alter|auslager|lager|\b(days?|tage?|dias|jours|giorni|dagen)\b"),
+    (
+        "aging_days",
+        r"aging|ageing|\baged?\b|alter|auslager|lager"
+        r"|\b(days?|tage?|dias|jours|giorni|dagen|weeks|wochen|semaines)\b",
+    ),
     ("compression_ratio_pct", r"compres|verpress|verform|stauch|height|hoehe"),
     ("speed_mm_s", r"speed|velocit|velocid|vitesse|snelheid|geschwind|vorschub|feed"),
     ("load_N", r"load\b|normal|auflast|\blast\b|anpress|carga"),

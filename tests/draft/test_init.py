@@ -326,6 +326,19 @@ def test_a_column_in_a_unit_of_another_quantity_is_not_what_its_words_say(tmp_pa
     assert (columns["aging_days"].name, columns["aging_days"].unit) == ("Lagerdauer [Wochen]", "week")
 
 
+@pytest.mark.parametrize("weeks", ["Weeks", "Wochen", "Semaines"])
+def test_weeks_in_a_log_are_aging_times_and_what_it_lacks_belongs_there(weeks, tmp_path):
+    write_with_log(tmp_path, f"{weeks},Date,Remark", lambda one: f"{one.days},14/03/2024,")
+    log = (tmp_path / "log.csv").read_text()
+    exports.write(tmp_path, "log.csv", log.replace("File,Days,", "File,Status,"))
+    made = draft(tmp_path)
+    days = parse_config(made.text, "rig.toml").files.runs_columns["aging_days"]
+    assert (days.name, days.unit) == (weeks, "week")
+    doubts = " ".join(f"{doubt.reason} {doubt.fix}" for doubt in made.doubts)
+    assert "what 'Status', 'Remark' of log.csv hold is not known here" in doubts
+    assert "same is assumed for all files. Add it to log.csv if it differs." in doubts
+
+
 def test_files_that_nothing_tells_apart_are_one_condition(tmp_path):
     for number in range(1, 9):
         (one,) = exports.records(days=(1,), speeds=(5.0,), repeats=(1,))
