@@ -86,9 +86,10 @@ def dialect_keys(found: Found, notes: Notes) -> None:
         example = f"such as '{number.group()}'" if number else "such as with a comma"
         notes.guess("trace.decimal", ",", f"numbers {example} in {of}")
     _header_keys(found, of, notes)
-    if found.wider:
-        further = sorted({name for other in found.wider.values() for name in other.names} - set(one.names))
-        reason = f"{len(found.wider)} of {len(sniffed)} files have further columns: {', '.join(further)}."
+    extra = [set(other.names) - set(one.names) for other in found.wider.values()]
+    if further := sorted(set().union(*extra)):  # none where the columns are in another order
+        count = f"{sum(map(bool, extra))} of {len(sniffed)} files"
+        reason = f"{count} have further columns: {', '.join(further)}."
         notes.doubt("trace", reason, "They are read by the names that all files have.")
     trailing = sum(other.trailing for other in sniffed)
     if trailing:

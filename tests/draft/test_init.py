@@ -241,6 +241,18 @@ def test_files_with_further_columns_are_read_by_the_names_that_all_have(tmp_path
     assert ingested.tables["runs"]["speed_mm_s"].abs().round(2).isin([1.0, 5.0]).all()
 
 
+def test_files_with_their_columns_in_another_order_are_read_by_name_and_no_doubt(tmp_path):
+    for one in exports.records():
+        columns, header = exports.slots(one), ["t [s]", "x [mm]", "F [N]"]
+        if one.repeat == 2 and one.days == 4:
+            columns, header = columns[::-1], header[::-1]
+        file = f"d{one.days}_v{one.speed:g}_r{one.repeat}.csv"
+        exports.write(tmp_path, file, ";".join(header) + "\n" + exports.table(columns, ";", 4))
+    made = draft(tmp_path)
+    assert made.files == 12
+    assert not any("further columns" in doubt.reason for doubt in made.doubts)
+
+
 def test_a_broken_file_among_traces_is_said_and_excluded(tmp_path):
     exports.tribometer(tmp_path)
     name = "EPDM_90C_80pct_1d_1mms_1.csv"
