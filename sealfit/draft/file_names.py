@@ -227,7 +227,9 @@ def read_names(files: Sequence[str]) -> Names:
     groups: dict[tuple, list[str]] = defaultdict(list)
     for file, pieces in cut.items():
         groups[shape_of(pieces)].append(file)
-    main = max(groups.values(), key=len)
+    # A word for unaged rubber may stand for what other names spell out, not the other way round.
+    unaged = {id(own) for own in groups.values() if any(one.text.lower() in UNAGED for one in cut[own[0]])}
+    main = max(groups.values(), key=lambda own: len(own) * (ALIKE if id(own) in unaged else 1.0))
     sign = None
     for base in sorted(groups.values(), key=lambda members: len(cut[members[0]])):
         if len(base) >= ALIKE * len(main) and (sign := _optional_word(base, groups, cut)) is not None:

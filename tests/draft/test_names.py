@@ -122,6 +122,13 @@ def test_one_word_stands_for_rubber_that_was_not_aged(word):
     assert told([*unaged, *aged]) == {"aging_days": 0.0, "speed_mm_s": 1.0, "repeat": 1.0}
 
 
+def test_unaged_rubber_at_room_temperature_is_no_other_way_of_naming():
+    unaged = made("D_23C_unaged_P{p}_v{v}.csv", p=(1, 2), v=(2, 8))
+    aged = made("D_40C_2d_P{p}_v{v}.csv", p=(1, 2), v=(2, 8))
+    assert read_names([*unaged, *aged]).unmatched == ()
+    assert told([*unaged, *aged])["aging_days"] == 0.0
+
+
 def test_a_number_that_counts_files_is_no_repeat():
     files = [f"Messung_{number:03d}_d{number % 3}.csv" for number in range(1, 10)]
     assert told(files) == {"aging_days": 1.0}
