@@ -170,7 +170,8 @@ def ingest_campaign(
         raise CampaignError(turned)
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
-    faults += incomplete_columns(steady, config.series_columns if config.aging else ())
+    asked = steady.drop(columns=config.loop.ignore_channels, errors="ignore")
+    faults += incomplete_columns(asked, config.series_columns if config.aging else ())
     faults += improbable_loads(steady, config)
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)

@@ -328,6 +328,8 @@ def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) ->
             follows = _what_follows(name, used[name], missing / files)
             reason = f"{missing} of {files} files have no value: {follows}."
             fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."
+            if NO_VALUE in follows:
+                fix += " If it holds remarks, list it under loop.ignore_channels."
             value = float(missing)
             faults.append(Fault("incomplete_column", reason, column=name, value=value, fix=fix, **KEPT))
     return faults

@@ -322,6 +322,15 @@ def test_where_nothing_is_left_the_campaign_is_at_fault_and_every_reason_is_give
     assert [fault.check for fault in caught.value.faults] == ["too_short", "too_short", "nothing_left"]
 
 
+def test_nothing_is_said_of_empty_cells_in_a_column_that_the_loop_ignores(campaign):
+    table = pd.read_csv(campaign / "runs.csv")
+    table["Remark"] = ["cable", *[None] * (len(table) - 1)]
+    table.to_csv(campaign / "runs.csv", index=False)
+    for ignored, said in (([], ["Remark"]), (["Remark"], [])):
+        made = ingest_campaign(campaign, Config(loop={"ignore_channels": ignored}))
+        assert [fault.column for fault in made.faults if fault.check == "incomplete_column"] == said
+
+
 def test_a_platform_that_does_not_move_is_named(campaign):
     path = campaign / "traces" / "0_1.csv"
     table = pd.read_csv(path)

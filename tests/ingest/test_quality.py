@@ -374,3 +374,10 @@ def test_unaged_rubber_needs_no_temperature_and_aged_rubber_does():
     aged = pd.DataFrame(rows | {"temperature_C": [np.nan, np.nan, 60.0]})
     (fault,) = incomplete_columns(aged, ["temperature_C"])
     assert (fault.column, fault.value) == ("temperature_C", 1.0)
+
+
+def test_of_a_column_of_remarks_it_is_said_how_to_leave_it_out():
+    rows = {"file": ["a", "b"], "used": True, "Remark": ["cable", None], "room_C": [21.0, np.nan]}
+    remarks, numbers = incomplete_columns(pd.DataFrame(rows))
+    assert remarks.fix.endswith("too. If it holds remarks, list it under loop.ignore_channels.")
+    assert "ignore_channels" not in numbers.fix
