@@ -200,7 +200,7 @@ def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -
         tested = model["ranges"].get(name)
         if name == "direction":
             agrees = table[name].to_numpy() == np.sign(speed)
-            _note(notes, slides & ~agrees, "direction must be 1 or -1, the sign of speed_mm_s")
+            _note(notes, slides & ~agrees, "direction must be 1 or -1, and speed_mm_s must have its sign")
         elif _is_range(tested):
             table[name] = pd.to_numeric(table[name], errors="coerce").astype(float)
             _note(notes, ~(np.abs(table[name].to_numpy()) < OVERLOAD), f"{name} must be a number")

@@ -72,4 +72,4 @@ def test_the_direction_of_a_point_is_that_of_its_speed():
     for wrong in (2 * own, -own, "up"):
         refused = predict(model, points.assign(direction=wrong))
         assert refused["force_after_N"].isna().all()
-        assert (refused["note"] == "direction must be 1 or -1, the sign of speed_mm_s").all()
+        assert (refused["note"] == "direction must be 1 or -1, and speed_mm_s must have its sign").all()
