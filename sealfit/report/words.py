@@ -126,9 +126,13 @@ def _missed(label: str, does: Markup) -> Markup:
 def error_clause(closure: Mapping, config: Config) -> Markup:
     """Return the held-out error before and after, and the noise floor, in a clause."""
     unit = config.units.unit("force")
-    key, what = "heldout_rmse_N", f"rms error on held-out {closure['heldout_unit']}s"
-    if not known(closure["before"][key]):
-        key, what = "rmse_N", "in-sample rms error (nothing could be held out)"
+    held = f"rms error on held-out {closure['heldout_unit']}s"
+    errors = (
+        ("heldout_rmse_N", held),
+        ("heldout_extrapolated_rmse_N", f"{held}, all of them extrapolated,"),
+        ("rmse_N", "in-sample rms error (nothing could be held out)"),
+    )
+    key, what = next((error for error in errors if known(closure["before"][error[0]])), errors[-1])
     before, after, floor = closure["before"][key], closure["after"][key], closure["noise_floor_N"]
     texts = together([before, after, floor])
     if before == after or not known(after):

@@ -12,6 +12,7 @@ NUMBERS = {
     "rmse_N": 1.3,
     "rmse_runs_N": 0.9,
     "heldout_rmse_N": 1.4212,
+    "heldout_extrapolated_rmse_N": None,
     "max_abs_N": 4.0,
     "mean_abs_pct": 3.0,
     "lack_of_fit_p": 0.0001,
@@ -193,6 +194,10 @@ def test_without_held_out_errors_the_fitted_ones_are_named_so():
     for stage in ("before", "after"):
         closure[stage] = {**closure[stage], "heldout_rmse_N": None}
     assert "the in-sample rms error (nothing could be held out) falls from 1.30 N to 0.31 N" in said(closure)
+    for stage, error in (("before", 2.5), ("after", 1.8)):
+        closure[stage] = {**closure[stage], "heldout_extrapolated_rmse_N": error}
+    found = said(closure)
+    assert "the rms error on held-out runs, all of them extrapolated, falls from 2.50 N to 1.80 N" in found
 
 
 def test_the_units_are_the_declared_ones():
