@@ -78,7 +78,10 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
     for (quantity, parameter, unit), group in rows.groupby(keys, sort=False, dropna=False):
         identified = group["identified"].astype(bool)
         known = group.loc[identified, "value"].dropna()
-        why = group.loc[~identified, "reason"].dropna().mode()
+        lacking = group[~identified & group["reason"].notna()]
+        why = "".join(lacking["reason"].mode()[:1])  # the most frequent reason
+        if lacking["reason"].nunique() > 1:
+            why = f"For example, {lacking.loc[lacking['reason'] == why, of].iloc[0]}: {why}"
         ranges.append(
             {
                 "quantity": quantity,
@@ -88,7 +91,7 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
                 "max": float(known.max()) if len(known) else None,
                 "identified": len(known),
                 "of": len(group),
-                "reason": str(why.iloc[0]) if len(why) else "",  # the most frequent reason
+                "reason": why,
             }
         )
     return {of: int(fit[of].nunique()), "parameters": ranges}

@@ -1,11 +1,12 @@
 import numpy as np
+import pandas as pd
 import pytest
 from report.made_campaigns import aging_campaign, torque_campaign
 from report.made_tables import empty, shapes
 
 from sealfit.config import Config
 from sealfit.report.page import fit_badge
-from sealfit.report.summary import outlier_clause, quality_clause
+from sealfit.report.summary import of_fit, outlier_clause, quality_clause
 from sealfit.report.words import acts, does, in_words, left_over, undecided, verdict, with_left_channels
 
 NUMBERS = {
@@ -187,6 +188,15 @@ def test_without_repeats_the_floor_is_unknown():
     unknown = {"state": "unknown", "ratio": None, "p_value": None}
     text = said({**document(floor=None), "fit_quality": unknown})
     assert text.endswith("(noise floor unknown: there are no repeats).")
+
+
+def test_a_reason_of_some_conditions_is_said_to_be_theirs():
+    fit = pd.DataFrame(
+        {"condition": ["a", "b", "c"], "identified": False, "reason": ["few", "at most 7", "few"]}
+    )
+    fit = fit.assign(quantity="dynamic", parameter="sigma_1", unit="", value=1.0)
+    assert of_fit(fit, "condition")["parameters"][0]["reason"] == "For example, a: few"
+    assert of_fit(fit[::2], "condition")["parameters"][0]["reason"] == "few"
 
 
 def test_without_held_out_errors_the_fitted_ones_are_named_so():
