@@ -168,6 +168,9 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     if asked.model not in MODELS:
         raise RequestError(f"there is no model '{asked.model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
     goal, years = goal_of(asked.threshold, asked.loss_pct), asked.years
+    if goal.value is not None and goal.value <= 0 and store.state.properties is None:
+        reason = f"--threshold {goal.value:g} is never reached: friction is above 0."
+        raise RequestError(reason, fix="Give a positive number.")
     laws, taken_out = _laws_of(store, asked, asked.model)
     place = {"temperature_C": asked.temperature_C, "compression_ratio_pct": asked.compression_ratio_pct}
     chosen, rivals = answer(laws[0], goal, years, resample=True, **place), []

@@ -294,6 +294,8 @@ def test_a_lifetime_is_the_commands(results, out):
     assert life["days"] > 1
     shown = sealfit.Lifetime({**life, "form": "a < b"})._repr_html_()
     assert "a &lt; b" in shown
+    with pytest.raises(RequestError, match="--threshold -1 is never reached: friction is above 0"):
+        results.lifetime("mu_s", threshold=-1.0, temperature_C=60.0)
 
 
 # ---------------------------------------------------------------- plots
