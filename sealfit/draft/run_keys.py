@@ -162,6 +162,15 @@ def _unaged_apart(names: Names, found: Found) -> Names:
     return replace(names, templates={**names.templates, "specimen_id": template})
 
 
+def with_rotation(names: Names, roles: Roles) -> Names:
+    """Return the names with their rpm as the speed where traces hold an angle or a rotational speed."""
+    own = roles.displacement or roles.speed
+    rotates = own is not None and own.unit is not None and own.unit.dimension in ("angle", "rotation")
+    part = next((part for part in names.parts if part.ours == "speed_rpm"), None)
+    taken = part is None or "speed_mm_s" in names.given
+    return names.changed(part, ours="speed_mm_s") if rotates and not taken else names
+
+
 # ---------------------------------------------------------------- keys
 
 

@@ -281,6 +281,7 @@ def test_a_rotating_rig_with_two_loads_needs_no_edit(angle, turn, tmp_path):
     runs = ingested.tables["steady"].groupby("run_id")["speed_mm_s"].first()
     assert len(runs) == 8  # of a rubber, a load and a speed
     assert sorted(runs.round(1).unique()) == [2.0, 20.0]  # in rpm
+    assert set(ingested.tables["runs"]["speed_set_mm_s"]) == {2.0, 20.0}  # and no channel beside it
     assert list(ingested.faults) == []
 
 
