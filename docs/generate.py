@@ -128,7 +128,8 @@ EXPRESSIONS = """
 
 `compute` and `keep` know `+ - * / **`, parentheses, `pi`, `abs`, `sqrt`, `exp`, `log`, `sin`, `cos`, `tanh`,
 `sign`, `min`, `max`, `where`, comparisons with `and`, `or`, `not` (1 or 0 in a number), columns, parts of the
-file name and constants. They are not run as Python.
+file name and constants. A text is compared with `==` or `!=`: `keep = "status == 'ok'"`. They are not run as
+Python.
 """
 
 TABLES = """

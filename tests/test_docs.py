@@ -25,6 +25,7 @@ from page_helpers import (
     run,
 )
 
+from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.effects.user import load_user_effects
 from sealfit.report.summary import verdict_sentence
 from sealfit.units import Units
@@ -145,6 +146,11 @@ def test_the_verdicts_that_a_page_quotes_are_said_so():
     for verdict, closure in found.items():
         assert has(shown[verdict], verdict_sentence({"verdict": verdict, **others, **closure}, Units()))
     assert set(shown) == set(found)
+
+
+def test_every_column_of_predictions_is_explained():
+    page = (DOCS / "reference/results.md").read_text("utf-8")
+    assert {name for name in ANSWERS if f"`{name}`" not in page} == set()
 
 
 def test_generated_pages_are_up_to_date():
