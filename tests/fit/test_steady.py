@@ -221,6 +221,7 @@ def test_without_load_forces_are_fitted_in_the_true_unit(campaign):
     config = Config(
         quantities={
             "force": Quantity(quantity="torque", unit="mN m"),
+            "displacement": Quantity(quantity="angle", unit="deg"),
             "speed": Quantity(quantity="speed", unit="rpm"),
         }
     )
