@@ -85,8 +85,8 @@ def _damping_row(found: Stiffness, curve: Curve, unit: str) -> dict:
     if found.files < 2 or not found.stiffness_known:
         why = ONE_START if found.files < 2 else "sigma_0 is not determined"
         return table_row(**row, identified=False, reason=why)
-    if not (found.damped and curve.known):
-        return table_row(**row, identified=False, reason=NO_CURVE if found.damped else CONSTANT)
+    if np.isnan(found.tau_s) or not curve.known:
+        return table_row(**row, identified=False, reason=CONSTANT if np.isnan(found.tau_s) else NO_CURVE)
     half = found.damping_half_width()
     low, high = max(found.sigma_1 - half, 0.0), found.sigma_1 + half
     row |= {"lo95": low, "hi95": high, "se": found.damping_se}

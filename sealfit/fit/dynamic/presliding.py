@@ -60,11 +60,13 @@ FEW = "no repeats: no scatter is known"
 
 @dataclass(frozen=True)
 class Stiffness:
-    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with their scatter between units."""
+    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with their scatter between units.
+
+    tau is NaN if the damping is not distinguishable from the level and initial force of the strokes.
+    """
 
     sigma_0: float
     tau_s: float
-    damped: bool  # whether the damping is distinguishable; tau is NaN otherwise
     covariance: np.ndarray  # (2, 2) of log sigma_0 and tau; NaN from fewer than two units
     df: np.ndarray  # (2,) Satterthwaite's degrees of freedom of the two
     within: int  # samples inside the rise
@@ -149,7 +151,6 @@ def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
     return Stiffness(
         sigma_0=float(np.exp(x[0] + level.mean())),
         tau_s=float(x[1]) if damped else np.nan,
-        damped=damped,
         covariance=by_files + np.diag([by_level, 0.0]) + by_curve,
         df=together(parts),
         gain=rises.gain_of(found.rss),
