@@ -115,7 +115,7 @@ ALONG = ("displacement_mm", "distance_mm", "time_s")
 POWER = "power"
 
 # Measured speeds of a run are one setting if the largest exceeds the smallest by less than this share.
-SAME_SETTING = 0.05
+SAME_SPEED_OF_RUN = 0.05
 
 # Ratio of the largest to the smallest load up to which it is one setting.
 SAME_LOAD = 1.05
@@ -298,11 +298,12 @@ def set_speeds(speed: np.ndarray, run: np.ndarray) -> np.ndarray:
     """
     size = np.abs(speed)
     order = np.lexsort((size, run))
-    first = np.r_[True, (np.diff(run[order]) != 0) | (np.diff(size[order]) > SAME_SETTING * size[order][:-1])]
+    ascending = size[order]
+    apart = (np.diff(run[order]) != 0) | (np.diff(ascending) > SAME_SPEED_OF_RUN * ascending[:-1])
     setting = np.empty(speed.size, dtype=int)
-    setting[order] = np.cumsum(first[: speed.size])
+    setting[order] = np.cumsum(np.r_[False, apart][: speed.size])
     own = pd.Series(size).groupby(setting)
-    same = own.transform("max") <= (1 + SAME_SETTING) * own.transform("min")
+    same = own.transform("max") <= (1 + SAME_SPEED_OF_RUN) * own.transform("min")
     return np.sign(speed) * np.where(same, own.transform("mean"), size)
 
 
