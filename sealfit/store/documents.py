@@ -54,15 +54,11 @@ def _are_below(places: Iterable[int], count: int, least: int = 0) -> bool:
 
 # ---------------------------------------------------------------- closure.json
 
-ERRORS = record(
-    rmse_N=Maybe,
-    rmse_runs_N=Maybe,
-    heldout_rmse_N=Maybe,
-    heldout_extrapolated_rmse_N=Maybe,
-    max_abs_N=Maybe,
-    mean_abs_pct=Maybe,
-    lack_of_fit_p=Maybe,
-)
+NAMES_OF_ERRORS = (
+    "rmse_N", "rmse_runs_N", "heldout_rmse_N", "heldout_extrapolated_rmse_N", "max_abs_N", "mean_abs_pct",
+    "lack_of_fit_p",
+)  # fmt: skip
+ERRORS = record(**dict.fromkeys(NAMES_OF_ERRORS, Maybe))
 EFFECT = record(
     id=Text,
     label=Text,
