@@ -282,18 +282,22 @@ def confirmed(
     """
     config = context.config
     refused: list[RefusedEffect] = []
-    held_out = (config.loop, samples, {})
+    known: dict[tuple, np.ndarray] = {}  # residuals without the proposal in each fold
+
+    def gain_of(proposal: Proposal) -> Gain:
+        return heldout_gain(fitted, proposal, config.loop, samples, known)
+
     for proposal in proposals[: criteria.MOST_PROPOSALS]:
-        gain = heldout_gain(fitted, proposal, *held_out)
+        gain = gain_of(proposal)
         negative = turns_negative(proposal.fitted)
-        reason = NEGATIVE if negative else _reason_refused(fitted, proposal, gain, samples, held_out[-1])
+        reason = NEGATIVE if negative else _reason_refused(fitted, proposal, gain, samples, known)
         unit = config.units.unit("force")
         label = describe(proposal.term, fitted.rows)
         context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
             most = criteria.MOST_RIVALS if context.compare else 0
             others = tuple(
-                (rival, heldout_gain(fitted, rival, *held_out).left_N if k < most else np.nan)
+                (rival, gain_of(rival).left_N if k < most else np.nan)
                 for k, rival in enumerate(rivals(proposal, proposals))
             )
             return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, others, number), []
