@@ -239,8 +239,8 @@ def read_closure(world: World, rows: Rows, closure: dict, effects: list[dict]) -
 
 def copies(table: pd.DataFrame, true: set[str], claimed: set[str]) -> dict[str, str]:
     """Return the true variable of claimed channels that order the rows as it does (the calendar's do)."""
-    numeric = [n for n in sorted(true) if n in table and table[n].dtype.kind in "fi"]
-    others = [n for n in sorted(claimed - true) if n in table and table[n].dtype.kind in "fi"]
+    varying = {n for n in table if table[n].dtype.kind in "fi" and table[n].nunique() > 1}
+    numeric, others = sorted(true & varying), sorted((claimed - true) & varying)
     return {
         o: n for n in numeric for o in others if abs(table[n].corr(table[o], method="spearman")) > SAME_ORDER
     }
