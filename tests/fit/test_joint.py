@@ -146,6 +146,17 @@ def test_a_curve_is_seen_though_friction_falls_from_repeat_to_repeat():
     assert set(declare(rows).stribeck.values()) == {"interpolated"}
 
 
+def test_directions_that_differ_are_no_curve_however_their_repeats_are_numbered():
+    design = {"temperatures": (60.0,), "days": (4.0,), "speeds": (40.0, 80.0, 120.0), "directions": (1, -1)}
+    bins = bins_helpers.make_bins(**design, repeats=4, bins=4)
+    size = 40.0 + 0.05 * bins["speed_set_mm_s"] + np.where(bins["direction"] > 0, 0.0, 10.0)
+    bins["force_N"] = bins["direction"] * size
+    for seed in range(10):
+        numbers = np.random.default_rng(seed).integers(1, 9, bins["file"].nunique())
+        rows = make_rows(bins.assign(repeat=numbers[bins.groupby("file").ngroup()]), has_aging=False)
+        assert set(declare(rows).stribeck.values()) == {"viscous"}
+
+
 def test_a_rising_curve_through_three_speeds_does_not_start_with_friction_below_zero():
     rows = rows_of(speeds=(0.502, 9.81, 192.0), days=(), repeats=2, bins=4)
     mu = np.interp(np.abs(rows.speed), [0.502, 9.81, 192.0], [0.5695, 0.609, 0.654])

@@ -175,8 +175,8 @@ def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
     A curve through three speeds leaves few degrees of freedom for other effects, so a line is kept if it is
     not rejected. As in the declared model its slope is not negative and shared by all conditions, each of
     which has its own level. The curve adds curvature that all share, and may add a slope of each condition
-    (mu_s less mu_c). Repeats may differ, each by the same in all runs: seals run in. The two directions count
-    as repeats. Without a degree of freedom there is no test; it is 0 then, and the curve is taken.
+    (mu_s less mu_c). Repeats may differ, each by the same in all runs: seals run in. So may the directions.
+    Without a degree of freedom there is no test; it is 0 then, and the curve is taken.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     nearest = np.abs(speed[:, None] - tested_speeds(rows, chosen)).argmin(axis=1)
@@ -193,7 +193,8 @@ def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
         }
     )
     files = table.groupby(["file", "direction", "condition"], as_index=False).mean()
-    levels = np.hstack([pd.get_dummies(files[name], dtype=float) for name in ("condition", "repeat")])
+    of_level = ("condition", "repeat", "direction")
+    levels = np.hstack([pd.get_dummies(files[name], dtype=float) for name in of_level])
     slope = files["slope"].to_numpy()[:, None]
     line = np.column_stack([levels, slope])
     falls = np.linalg.lstsq(line, files["mu"], rcond=1e-9)[0][-1] < 0
