@@ -23,6 +23,8 @@ FEW_FILES = 20
 # Largest p-value of an outlier, times the number of files. With 0.01, 5 of 73 worlds drawn at random lost a
 # sound file: their scatter was not normal.
 OUTLIER_P = 1e-3
+# P-value, times the number of files, above which a file agrees with the rest.
+AGREES_P = 0.5
 # Largest p-value beside the files of the same speed. Where these scatter more than others, or differ from the
 # model like the file, it is no outlier.
 SAME_SPEED_P = 0.01
@@ -75,13 +77,17 @@ def outlier_files(rows: Rows) -> list[OutlierFile]:
 
 
 def _wrong_instead(one: OutlierFile, tried: Sequence[tuple[OutlierFile, Fitted]]) -> tuple[str, ...]:
-    """Return the files without which `one` agrees with the rest: each may be the wrong one instead."""
+    """Return the files without which `one` agrees with the rest, or the rest does not predict it.
+
+    Each may be the wrong one instead.
+    """
     found = []
     for other, kept in tried:
         if other.file == one.file:
             continue
         names = kept.rows.table["record"].to_numpy()[kept.rows.groups.starts["file"]].tolist()
-        if abs(_without(kept, names.index(one.file))[0].deviation) < OUTLIER_SHARE:
+        again, _ = _without(kept, names.index(one.file))
+        if abs(again.deviation) < OUTLIER_SHARE or again.p_value > AGREES_P:
             found.append(other.file)
     return tuple(found)
 

@@ -88,3 +88,13 @@ def test_no_file_is_left_out_where_another_may_be_the_wrong_one():
         (one,) = outlier_files(make_rows(bins, has_aging=True))
         assert one.instead
         assert files[number] in (one.file, *one.instead)
+
+
+def test_no_file_is_left_out_where_the_rest_does_not_predict_it_without_another():
+    """Two days of four speeds: without the wrong file nothing determines v_s of its condition but another."""
+    design = {"days": (1.0, 12.0), "temperatures": (40.0, 100.0), "speeds": (2.35, 9.4, 37.5, 150.0)}
+    for number in (3, 7):
+        bins, files = bins_with({number: 0.83}, gain=0.002, repeats=1, **design)
+        (one,) = outlier_files(make_rows(bins, has_aging=True))
+        assert one.instead
+        assert files[number] in (one.file, *one.instead)
