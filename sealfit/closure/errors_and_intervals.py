@@ -248,22 +248,29 @@ class Sandwich(NamedTuple):
 def degrees_of_freedom(fitted: Fitted) -> float:
     """Return the degrees of freedom of the coarsest level that scatters.
 
-    This is the number of its units less the parameters they estimate; 0 if the model has as many parameters
-    as there are runs, because the scatter of runs is then not estimable.
+    This is the number of its units less what the model takes of one number per unit, to which effects within
+    strokes add nothing; for specimens it is less the number of levels and aging laws. It is 0 if the model
+    takes nearly all runs: their scatter is not estimable then.
     """
-    groups = fitted.rows.groups
-    white = fitted.whitening(fitted.friction[:, None])[:, 0]
-    white = white / np.sqrt(groups.sums(white**2, "run"))[groups.codes["run"]]
-    taken = float((fitted.basis.sums(groups, "run", white).values ** 2).sum())
-    if groups.starts["run"].size - taken < LEAST_SPARE_RUNS:
+    starts = fitted.rows.groups.starts
+    if starts["run"].size - _taken(fitted, "run") < LEAST_SPARE_RUNS:
         return 0.0
     active = [c.level for c in fitted.scatter.components if c.variance > 0]
-    level = active[-1] if active else "file"
-    units = fitted.rows.groups.starts[LEVELS[max(LEVELS.index(level), 1)]].size
-    between = len(
-        {(p.quantity, p.owner) for p in fitted.model.declared.parameters if p.quantity in ("mu_0c", "a_c")}
-    )
-    return float(max(units - (between if level == "specimen" else fitted.basis.shape[1]), 1))
+    level = active[-1] if active and active[-1] != "stroke" else "file"
+    if level == "specimen":
+        parameters = fitted.model.declared.parameters
+        taken = len({(p.quantity, p.owner) for p in parameters if p.quantity in ("mu_0c", "a_c")})
+    else:
+        taken = round(_taken(fitted, level))
+    return float(max(starts[level].size - taken, 1))
+
+
+def _taken(fitted: Fitted, level: str) -> float:
+    """Return how many degrees of freedom the model takes of one number per unit of a level, its friction."""
+    groups = fitted.rows.groups
+    white = fitted.whitening(fitted.friction[:, None])[:, 0]
+    white = white / np.sqrt(groups.sums(white**2, level))[groups.codes[level]]
+    return float((fitted.basis.sums(groups, level, white).values ** 2).sum())
 
 
 def t_quantile(df: float) -> float:

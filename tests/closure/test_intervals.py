@@ -2,10 +2,18 @@ import numpy as np
 from bins_helpers import TWO_FOLDS, make_bins, make_traces
 
 from sealfit.closure.criteria import FEW_UNITS
-from sealfit.closure.errors_and_intervals import Sandwich, mean_half_width, sandwiches, t_quantile
+from sealfit.closure.errors_and_intervals import (
+    Sandwich,
+    degrees_of_freedom,
+    mean_half_width,
+    sandwiches,
+    t_quantile,
+)
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
-from sealfit.fit.joint import fit_declared
+from sealfit.effects import EFFECTS
+from sealfit.fit.joint import fit, fit_declared
+from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.tangent import Tangent
 
@@ -64,3 +72,16 @@ def test_files_runs_and_specimens_are_asked_down_to_the_first_of_which_there_are
     assert counts[1] >= FEW_UNITS
     found = sandwiches(fit_declared(rows))
     assert [len(own.information) for own in found] == [9, 0]
+
+
+def test_an_effect_within_strokes_takes_no_degree_of_freedom_of_the_runs():
+    design = {"days": (), "temperatures": (), "repeats": 1, "setup": 0.01}
+    rows = make_rows(make_bins(bins=6, **design), has_aging=False)
+    declared = fit_declared(rows)
+    fixed = {"x_ref": float(rows.values("distance_mm").mean())}
+    term = Term(EFFECTS["linear"], ("distance_mm",), "mu", "multiply", fixed=fixed)
+    model = declared.model.with_term(term, {p.name: 0.01 for p in term.effect.parameters})
+    with_effect = fit(model, rows, declared.scatter, turns=1)
+    assert (
+        degrees_of_freedom(declared) == degrees_of_freedom(with_effect) == rows.groups.starts["run"].size - 4
+    )
