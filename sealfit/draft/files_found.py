@@ -180,19 +180,19 @@ def text_of(folder: Path, file: str, *, first_sheet: bool = False) -> str:
     """
     kind = kind_of(file)
     if kind in OF_ARRAYS:
-        return _text_of_arrays(read_bytes(folder, file), file)
+        return _text_of_arrays(read_bytes(folder, file), kind)
     if kind == "xlsx":
         sheet = 1 if first_sheet else LONGEST
-        return read_sheet(read_bytes(folder, file), file, sheet).decode()
+        return read_sheet(read_bytes(folder, file), sheet).decode()
     whole = (folder / file).stat().st_size <= WHOLE_BYTES if (folder / file).exists() else True
     raw = read_bytes(folder, file, head=not whole)
-    text = as_utf8(raw, "auto", file, head=not whole).decode("utf-8", "replace")
+    text = as_utf8(raw, "auto", head=not whole).decode("utf-8", "replace")
     return text if whole else text.rpartition("\n")[0]
 
 
-def _text_of_arrays(raw: bytes, file: str) -> str:
+def _text_of_arrays(raw: bytes, kind: str) -> str:
     """Return the header lines, names, units and first rows of a file of arrays."""
-    found = read_arrays(raw, file, TraceFormat())
+    found = read_arrays(raw, kind, TraceFormat())
     lines = [*found.header]
     if found.names:
         lines += ["\t".join(found.names), "\t".join(_unit_in(found.header, name) for name in found.names)]

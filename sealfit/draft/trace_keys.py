@@ -61,7 +61,7 @@ def _sheet_key(found: Found, notes: Notes) -> None:
     """Add the sheet of the workbooks, if they have several."""
     if kind_of(found.traces[0]) == "xlsx":
         file = found.traces[0]
-        (sheet, most), *others = rows_of_sheets(read_bytes(found.folder, file), file).items()
+        (sheet, most), *others = rows_of_sheets(read_bytes(found.folder, file)).items()
         if filled := sum(rows > 0 for _, rows in others):
             evidence = f"has the most rows of the {filled + 1} sheets of a workbook"
             notes.guess("trace.sheet", sheet, evidence)

@@ -13,8 +13,9 @@ import pandas as pd
 
 from sealfit.config import Bins, Config
 from sealfit.errors import BadFile, Fault
+from sealfit.ingest.cells import Trace
 from sealfit.ingest.file_names import TraceRef
-from sealfit.ingest.files import read_marked
+from sealfit.ingest.files import placed, read_marked
 from sealfit.ingest.quality import (
     beginnings,
     equal_neighbours,
@@ -24,7 +25,7 @@ from sealfit.ingest.quality import (
     stroke_faults,
     swapped_faults,
 )
-from sealfit.ingest.reader import Trace, parse_trace
+from sealfit.ingest.reader import parse_trace
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, motion_fault, speed_fault
 from sealfit.ingest.window import acceleration
@@ -298,15 +299,17 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
     except BadFile as error:
         return FileStrokes(ref.file, mark or fingerprint(campaign / ref.file), 0, error.faults)
     trace, strokes = with_strokes(trace, config)
+    made = FileStrokes(ref.file, mark, trace.rows_read, trace.faults)
     if fault := motion_fault(trace, strokes, config):
-        return FileStrokes(ref.file, mark, trace.rows_read, (*trace.faults, fault))
-    if fault := speed_fault(trace, strokes, config):
-        trace = replace(trace, faults=(*trace.faults, fault))
-        if fault.action == "file left out":
-            return FileStrokes(ref.file, mark, 0, trace.faults)
-    samples = _samples(trace, strokes, config)
-    rows, faults = _stroke_rows(trace, strokes, samples, config)
-    return FileStrokes(ref.file, mark, trace.rows_read, (*trace.faults, *faults), rows, samples)
+        made = replace(made, faults=(*trace.faults, fault))
+    elif (fault := speed_fault(trace, strokes, config)) and fault.action == "file left out":
+        made = replace(made, faults=(*trace.faults, fault), rows=0)
+    else:
+        samples = _samples(trace, strokes, config)
+        rows, faults = _stroke_rows(ref.file, trace, strokes, samples, config)
+        found = (*trace.faults, *([fault] if fault else []), *faults)
+        made = replace(made, faults=found, strokes=rows, samples=samples)
+    return replace(made, faults=placed(made.faults, ref.file))
 
 
 def with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
@@ -314,12 +317,12 @@ def with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
     displacement, turn = trace.columns["displacement_mm"], config.strokes.turn
     if turn is not None and np.ptp(displacement) <= turn:
         displacement = np.unwrap(displacement, period=turn)
-        trace = replace(trace, columns={**trace.columns, "displacement_mm": displacement})
-    keep, faults = displacement_spikes(trace.ref.file, displacement, trace.line, config.quality)
-    trace = _without_inertia(trace.where(keep, faults), config.mass)
+        trace = trace.having({"displacement_mm": displacement})
+    keep, faults = displacement_spikes(displacement, trace.line, config.quality)
+    trace = _without_inertia(trace.where(keep).with_faults(faults), config.mass)
     strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
-    keep, faults = force_spikes(trace.ref.file, trace.columns["force_N"], strokes, trace.line, config.quality)
-    trace = trace.where(keep, faults)
+    keep, faults = force_spikes(trace.columns["force_N"], strokes, trace.line, config.quality)
+    trace = trace.where(keep).with_faults(faults)
     if not keep.all():
         strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
     return trace, strokes
@@ -335,12 +338,12 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
     time_s, displacement, force = (trace.columns[name] for name in SLOTS)
     noise, wanted = (displacement_noise_mm(values, order=4) for values in (displacement, force))
     inertia = mass * acceleration(time_s, displacement, noise, wanted / mass)
-    return replace(trace, columns={**trace.columns, "force_N": force - inertia})
+    return trace.having({"force_N": force - inertia})
 
 
-def _strokes_before(ref: TraceRef) -> int:
+def _strokes_before(trace: Trace) -> int:
     """Return how many strokes of the record other files hold."""
-    return int(ref.channels.get("stroke", 1)) - 1
+    return int(trace.channels.get("stroke", 1)) - 1
 
 
 def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[str, np.ndarray]:
@@ -357,7 +360,7 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         middle = [np.median(displacement[stroke.start : stroke.stop]) for stroke in strokes]
         turns = turn * np.floor(np.array(middle) / turn)
     return {
-        "stroke": np.repeat([stroke.number for stroke in strokes], size) + _strokes_before(trace.ref),
+        "stroke": np.repeat([stroke.number for stroke in strokes], size) + _strokes_before(trace),
         "time_s": time_s - np.repeat(since, size),
         "displacement_mm": displacement - np.repeat(turns, size),
         "force_N": force,
@@ -371,18 +374,18 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
 
 
 def _stroke_rows(
-    trace: Trace, strokes: Sequence[Stroke], samples: Mapping[str, np.ndarray], config: Config
+    file: str, trace: Trace, strokes: Sequence[Stroke], samples: Mapping[str, np.ndarray], config: Config
 ) -> tuple[tuple[Mapping[str, object], ...], list[Fault]]:
     """Return a row for every stroke, and what was found in them."""
-    ref, several, unit = trace.ref, len(strokes) > 1, config.units.unit("force")
+    several, unit = len(strokes) > 1, config.units.unit("force")
     rows, faults = [], []
     time_s, force = trace.columns["time_s"], trace.columns["force_N"]
     for stroke in strokes:
         row = {
-            **ref.channels,
+            **trace.channels,
             **_means(stroke, samples),
-            "file": ref.file,
-            "stroke": stroke.number + _strokes_before(ref),
+            "file": file,
+            "stroke": stroke.number + _strokes_before(trace),
             "direction": stroke.direction,
             "speed_mm_s": config.units.speed_factor * stroke.speed_mm_s,
             "several": several,
@@ -396,20 +399,20 @@ def _stroke_rows(
             found += speed_column_faults(row["speed_mm_s"], row[OWN_SPEED], config)
         rows.append({**row, "used": used})
         number = stroke.number if several else None
-        faults += [replace(fault, file=ref.file, stroke=number) for fault in found]
+        faults += [replace(fault, stroke=number) for fault in found]
     return tuple(rows), faults + _load_faults(trace, rows, config)
 
 
 def _load_faults(trace: Trace, rows: Sequence[Mapping[str, object]], config: Config) -> list[Fault]:
     """Return where the load measured in the strokes of use differs from the declared one, or is no load."""
-    declared = trace.ref.channels.get("load_N")
+    declared = trace.channels.get("load_N")
     loads = [row["load_N"] for row in rows if row["used"]] if "load_N" in trace.columns else []
     if not loads:
         return []
     found = swapped_faults(trace.columns["force_N"], trace.columns["load_N"], config)
     if isinstance(declared, int | float):
         found += load_faults(float(np.mean(loads)), declared, config.units.unit("load"))
-    return [replace(fault, file=trace.ref.file) for fault in found]
+    return found
 
 
 def _means(stroke: Stroke, samples: Mapping[str, np.ndarray]) -> dict[str, object]:

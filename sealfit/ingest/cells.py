@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -20,29 +20,42 @@ from sealfit.ingest.files import Layout, as_number, bad_file, split_line, withou
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
-    """Rows of a file on their way through the checks.
+class Trace:
+    """Rows of one trace file, in our columns and units.
 
     `columns` are float64 arrays, or object arrays of text (None where empty), by our names; `line` is the
-    1-based line in the file of every row; `bad` marks rows to leave out; `faults` names what was found.
+    1-based line in the file of every row; `bad` marks rows that are still to be left out; `rows_read` is the
+    number of data rows in the file. `faults` are what was found; `channels` is what is known of the whole
+    file.
     """
 
-    columns: dict[str, np.ndarray]
+    columns: Mapping[str, np.ndarray]
     line: np.ndarray
     bad: np.ndarray
+    rows_read: int
     faults: tuple[Fault, ...] = ()
+    channels: Mapping[str, float | str] = field(default_factory=dict)
 
-    def where(self, mask: np.ndarray) -> Rows:
-        """Return the rows that the mask chooses."""
-        columns = {name: values[mask] for name, values in self.columns.items()}
-        return Rows(columns, self.line[mask], self.bad[mask], self.faults)
+    def where(self, keep: np.ndarray) -> Trace:
+        """Return the trace with some of its rows."""
+        columns = {name: values[keep] for name, values in self.columns.items()}
+        return replace(self, columns=columns, line=self.line[keep], bad=self.bad[keep])
 
-    def having(self, columns: Mapping[str, np.ndarray]) -> Rows:
-        """Return the rows with further columns."""
+    def having(self, columns: Mapping[str, np.ndarray]) -> Trace:
+        """Return the trace with further columns."""
         return replace(self, columns={**self.columns, **columns})
 
+    def with_faults(self, faults: Iterable[Fault]) -> Trace:
+        """Return the trace with further findings."""
+        return replace(self, faults=(*self.faults, *faults))
 
-def clean(rows: Rows, names: list[str], file: str) -> Rows:
+    @property
+    def table(self) -> pd.DataFrame:
+        """The columns as a table."""
+        return pd.DataFrame(self.columns)
+
+
+def clean(rows: Trace, names: Sequence[str]) -> Trace:
     """Return the rows whose slots are finite and whose time rises, with the faults of the others."""
     faults: list[Fault] = []
     finite = np.ones(len(rows.line), bool)
@@ -50,12 +63,12 @@ def clean(rows: Rows, names: list[str], file: str) -> Rows:
         sizes = np.abs(rows.columns[name])
         wrong, overload = ~np.isfinite(sizes), (sizes >= OVERLOAD) & np.isfinite(sizes)
         finite &= ~(wrong | overload)
-        faults += _row_faults("not_finite", name, rows, wrong, file)
-        faults += _row_faults("overload", name, rows, overload, file)
+        faults += _row_faults("not_finite", name, rows, wrong)
+        faults += _row_faults("overload", name, rows, overload)
     good = rows.where(finite)
     back = _out_of_order(good.columns["time_s"])
-    faults += _row_faults("time_order", "time_s", good, back, file)
-    return replace(good.where(~back), faults=(*rows.faults, *faults))
+    faults += _row_faults("time_order", "time_s", good, back)
+    return good.where(~back).with_faults(faults)
 
 
 _ROW_FAULTS = {  # check: (reason, fix)
@@ -65,8 +78,8 @@ _ROW_FAULTS = {  # check: (reason, fix)
 }
 
 
-def _row_faults(check: str, name: str, rows: Rows, wrong: np.ndarray, file: str) -> list[Fault]:
-    place = {"file": file, "column": name, "action": "row left out"}
+def _row_faults(check: str, name: str, rows: Trace, wrong: np.ndarray) -> list[Fault]:
+    place = {"column": name, "action": "row left out"}
     reason, fix = _ROW_FAULTS[check]
 
     def make(i: int) -> Fault:
@@ -119,7 +132,6 @@ _NUMBER = re.compile(r"\s*[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?(?=[\s,;])")
 class ColumnOfFile:
     """A column of a trace file as messages name it; `line` are the lines of its rows, shape (n,)."""
 
-    file: str
     name: str
     line: np.ndarray
     decimal: str
@@ -127,7 +139,7 @@ class ColumnOfFile:
     def fault(self, row: int, check: str, reason: str, **more) -> Fault:
         """Return a fault of the cell in a row, which is left out."""
         line, action = int(self.line[row]), "row left out"
-        return Fault(check, reason, file=self.file, line=line, column=self.name, action=action, **more)
+        return Fault(check, reason, line=line, column=self.name, action=action, **more)
 
 
 def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str) -> list[Fault]:
@@ -139,7 +151,7 @@ def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str
     return faults
 
 
-def body_of(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> bytes:
+def body_of(text: bytes, layout: Layout, settings: TraceFormat) -> bytes:
     """Return the data lines of a file, without the line ends after the last one.
 
     Raises
@@ -150,7 +162,7 @@ def body_of(text: bytes, layout: Layout, settings: TraceFormat, file: str) -> by
     body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
     if not body.strip(b"\n \t,;"):
         reason = "has a header but no data." if len(layout.names) > 1 else "holds no table of numbers."
-        raise bad_file(file, "no_rows", reason, "Export it again.")
+        raise bad_file("no_rows", reason, "Export it again.")
     return body
 
 
@@ -166,8 +178,7 @@ def read_cells(
     settings: TraceFormat,
     ours: Mapping[int, str],
     must: Collection[str],
-    file: str,
-) -> Rows:
+) -> Trace:
     """Return the data of a trace file.
 
     `body` are its data lines as clean UTF-8 (`body_of`); `ours` are our names of the positions (from 0), and
@@ -178,8 +189,9 @@ def read_cells(
     line, bad, faults = np.arange(layout.first_line, layout.first_line + rows), np.zeros(rows, bool), []
     columns = _fast(body, rows, layout, settings, numeric)
     if columns is None:
-        columns, line, bad, faults = _patient(body, layout, settings, numeric, file)
-    return Rows({name: columns[i] for i, name in ours.items() if i in columns}, line, bad, tuple(faults))
+        columns, line, bad, faults = _patient(body, layout, settings, numeric)
+    columns = {name: columns[i] for i, name in ours.items() if i in columns}
+    return Trace(columns, line, bad, len(line), tuple(faults))
 
 
 def array_cells(
@@ -187,8 +199,7 @@ def array_cells(
     ours: Mapping[int, str],
     must: Collection[str],
     settings: TraceFormat,
-    file: str,
-) -> Rows:
+) -> Trace:
     """Return the columns of a file that is not text, a row of each sample; their numbers count from 1.
 
     Times of day, as datetime64, are seconds since the first where a number is needed, and else text in ISO
@@ -206,10 +217,10 @@ def array_cells(
         if name in must:
             wrong = ~np.isfinite(numbers)
             bad |= wrong
-            faults += cell_faults(ColumnOfFile(file, name, line, settings.decimal), wrong, values)
+            faults += cell_faults(ColumnOfFile(name, line, settings.decimal), wrong, values)
         plain = name in must or not any(cell is not None for cell in values[np.isnan(numbers)])
         made[name] = numbers if plain else values
-    return Rows(made, line, bad, tuple(faults))
+    return Trace(made, line, bad, len(line), tuple(faults))
 
 
 def _seconds(times: np.ndarray) -> np.ndarray:
@@ -282,7 +293,7 @@ def _single_tabs(body: bytes) -> bytes:
 
 
 def _patient(
-    body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str], file: str
+    body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
 ) -> tuple[dict[int, np.ndarray], np.ndarray, np.ndarray, list[Fault]]:
     """Return columns, lines, bad rows and faults, cell by cell: one for all that is not as it should be."""
     lines = body.decode("utf-8", "replace").split("\n")
@@ -302,10 +313,10 @@ def _patient(
         columns[i] = numbers_of(cells, settings.decimal) if times is None else times
         wrong = ~np.isfinite(columns[i])
         bad |= wrong
-        column = ColumnOfFile(file, name, line, settings.decimal)
+        column = ColumnOfFile(name, line, settings.decimal)
         faults += cell_faults(column, wrong, cells, rows)
     beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows], dtype=bool)
-    faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width, file)
+    faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width)
     bad |= beyond
     for i in set(range(width)) - columns.keys():
         cells = [(row[i].strip() or None) if i < len(row) else None for row in rows]
@@ -394,8 +405,7 @@ def decimal_fix(cell: str, decimal: str) -> str:
     return ""
 
 
-def _beyond_faults(at, rows, line, width, file) -> list[Fault]:
-    place = {"file": file, "action": "row left out"}
+def _beyond_faults(at, rows, line, width) -> list[Fault]:
 
     def make(i: int) -> Fault:
         value = " ".join(cell.strip() for cell in rows[i][width:] if cell.strip())
@@ -406,6 +416,6 @@ def _beyond_faults(at, rows, line, width, file) -> list[Fault]:
             check, reason = "too_many_cells", f"the line has {len(rows[i])} cells where {width} are named."
             if len(rows[i]) == 2 * width:
                 fix = "Decimal commas between commas? Export with another separator, or with decimal points."
-        return Fault(check, reason, line=int(line[i]), value=value, fix=fix, **place)
+        return Fault(check, reason, line=int(line[i]), value=value, fix=fix, action="row left out")
 
     return listed(at, make, "too_many_cells", "lines with cells beyond the last named column.")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import KEPT, NOTED, BadFile, Fault, SealfitError, nearest, shortened
-from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, Rows, cell_faults, listed, numbers_of
+from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, Trace, cell_faults, listed, numbers_of
 from sealfit.ingest.expression import parse
 from sealfit.ingest.files import Layout, bad_file, split_line
 from sealfit.tables import BINS, RUNS
@@ -190,7 +191,7 @@ def numeric_names(settings: TraceFormat) -> set[str]:
     return names | {settings.integrate_displacement} if settings.integrate_displacement else names
 
 
-def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict[int, str]:
+def locate(layout: Layout, width: int, settings: TraceFormat) -> dict[int, str]:
     """Return our name for each position (from 0) of a file with `width` columns.
 
     Columns that the config does not list keep the file's name (`column_4` where it has none), or a name
@@ -214,9 +215,9 @@ def locate(layout: Layout, width: int, settings: TraceFormat, file: str) -> dict
             reason = f"stands {len(positions)} times in the header."
             fix = "Rename one, or name the column by its position in the rig config."
             place = {"line": layout.names_line, "column": theirs}
-            faults += bad_file(file, "duplicate_column", reason, fix, **place).faults
+            faults += bad_file("duplicate_column", reason, fix, **place).faults
         elif ours not in settings.optional:
-            faults.append(_missing(ours, layout, width, settings, file))
+            faults.append(_missing(ours, layout, width, settings))
     if faults:
         raise BadFile(*faults)
     if settings.other_columns == "channels":
@@ -259,7 +260,7 @@ INSTEAD = {
 }
 
 
-def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
+def required(table: Mapping[str, object], layout: Layout) -> None:
     """Raise `BadFile` if, after everything is computed, a slot that every trace needs is not there."""
     found = []
     for name in SLOTS[:3]:
@@ -267,23 +268,23 @@ def required(table: Mapping[str, object], layout: Layout, file: str) -> None:
             fix = "Name it under [trace.columns], or compute it under [trace.compute]."
             if other := INSTEAD.get(name):
                 fix = f"Name it under [trace.columns], compute it under [trace.compute], or {other}."
-            found.append(missing_column(name, layout, file, fix))
+            found.append(missing_column(name, layout, fix))
     if found:
         raise BadFile(*found)
 
 
-def missing_column(column: str | int, layout: Layout, file: str, fix: str, reason: str = NO_COLUMN) -> Fault:
+def missing_column(column: str | int, layout: Layout, fix: str, reason: str = NO_COLUMN) -> Fault:
     """Return the fault of a file that lacks a column, and is left out."""
     place = {"line": layout.names_line, "column": str(column)}
-    return bad_file(file, "missing_column", reason, fix, **place).fault
+    return bad_file("missing_column", reason, fix, **place).fault
 
 
-def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat, file: str) -> Fault:
+def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat) -> Fault:
     theirs = settings.their_columns[ours]
     if isinstance(theirs, int):
         reason = f"there is no column {theirs}: the lines have {width}."
         fix = "Check delimiter and positions in the rig config."
-        return missing_column(theirs, layout, file, fix, reason)
+        return missing_column(theirs, layout, fix, reason)
     fix = "Columns without names go by position, from 1."
     if layout.names:
         fix = suggestion(theirs, layout.names)
@@ -295,7 +296,7 @@ def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat, file:
             if len(split_line(line, mark)) >= 2 and mark != settings.delimiter:
                 fix = f'The header looks separated otherwise: set delimiter = "{word}" in the rig config.'
                 break
-    return missing_column(theirs, layout, file, fix)
+    return missing_column(theirs, layout, fix)
 
 
 # ---------------------------------------------------------------- channels
@@ -304,7 +305,7 @@ def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat, file:
 MAX_LABELS = 20
 
 
-def channel_columns(rows: Rows, config: Config, file: str) -> Rows:
+def channel_columns(rows: Trace, config: Config) -> Trace:
     """Return the rows with the columns that are of use, and what was found in the channels.
 
     A channel with a few cells missing costs these rows; one with more than `quality.max_bad_rows` of them
@@ -320,7 +321,7 @@ def channel_columns(rows: Rows, config: Config, file: str) -> Rows:
             full = np.array([cell is not None for cell in values])
             numbers = numbers_of(values, config.trace.decimal)
             if np.isfinite(numbers).sum() <= 0.5 * full.sum():
-                found = _label_faults(name, values, full, rows.line, file)
+                found = _label_faults(name, values, full, rows.line)
                 faults += found
                 if found:
                     del kept[name]
@@ -329,23 +330,23 @@ def channel_columns(rows: Rows, config: Config, file: str) -> Rows:
         missing = good & ~(np.abs(numbers) < OVERLOAD)
         share = missing.sum() / max(good.sum(), 1)
         if share == 1:
-            faults.append(_left_out(name, "the column is empty", "", file, NOTED))
+            faults.append(_left_out(name, "the column is empty", "", NOTED))
             del kept[name]
         elif share > config.quality.max_bad_rows:
             reason = f"{missing.sum()} of {good.sum()} cells hold no number"
             fix = "Fill it, or list it under trace.optional and leave it out of the export."
-            faults.append(_left_out(name, reason, fix, file, KEPT))
+            faults.append(_left_out(name, reason, fix, KEPT))
             del kept[name]
         elif share:
             drop |= missing
-            faults += cell_faults(ColumnOfFile(file, name, rows.line, config.trace.decimal), missing, values)
-    return Rows(kept, rows.line, rows.bad | drop, (*rows.faults, *faults))
+            faults += cell_faults(ColumnOfFile(name, rows.line, config.trace.decimal), missing, values)
+    return replace(rows, columns=kept, bad=rows.bad | drop).with_faults(faults)
 
 
-def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarray, file: str) -> list[Fault]:
+def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarray) -> list[Fault]:
     """Return why a text column is no label; nothing if it is one."""
     if full.sum() < 0.5 * len(full):
-        place = {"file": file, "column": name, **NOTED}
+        place = {"column": name, **NOTED}
 
         def make(i: int) -> Fault:
             return Fault("remark", "a remark; the row is kept.", line=int(line[i]), value=texts[i], **place)
@@ -353,10 +354,10 @@ def _label_faults(name: str, texts: np.ndarray, full: np.ndarray, line: np.ndarr
         return listed(np.flatnonzero(full), make, "remark", "remarks.")
     labels = len(set(texts[full]))
     if labels > MAX_LABELS and labels > 0.5 * full.sum():
-        return [_left_out(name, f"{labels} different texts are too many for labels", "", file, NOTED)]
+        return [_left_out(name, f"{labels} different texts are too many for labels", "", NOTED)]
     return []
 
 
-def _left_out(name: str, reason: str, fix: str, file: str, done: Mapping[str, str]) -> Fault:
+def _left_out(name: str, reason: str, fix: str, done: Mapping[str, str]) -> Fault:
     reason = f"{reason}; the column is not used."
-    return Fault("channel_left_out", reason, file=file, column=name, fix=fix, **done)
+    return Fault("channel_left_out", reason, column=name, fix=fix, **done)

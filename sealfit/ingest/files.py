@@ -7,8 +7,9 @@ import csv
 import os
 import re
 import stat
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 
@@ -40,7 +41,8 @@ def inside(campaign: Path, file: str) -> Path | None:
 
 def read_marked(campaign: Path, file: str) -> tuple[bytes, Fingerprint]:
     """Return the file's bytes, and the fingerprint of these very bytes; raises as `read_bytes`."""
-    raw, status = _read(campaign, file)
+    with in_file(file):
+        raw, status = _read(campaign, file)
     return raw, fingerprint_of(raw, status)
 
 
@@ -52,7 +54,8 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
     BadFile
         If it is missing, outside the campaign, no file, not readable or empty.
     """
-    return _read(campaign, file, HEAD_BYTES if head else None)[0]
+    with in_file(file):
+        return _read(campaign, file, HEAD_BYTES if head else None)[0]
 
 
 def cut_files(campaign: Path, texts: Sequence[str]) -> frozenset[str]:
@@ -77,63 +80,77 @@ def _ends_a_line(path: str) -> bool:
         return True
 
 
-def whole_lines(text: bytes, file: str) -> tuple[bytes, Fault]:
+def whole_lines(text: bytes) -> tuple[bytes, Fault]:
     """Return a text without its last line, which may end within a number, and the fault that says so."""
     end = max(text.rfind(b"\n"), text.rfind(b"\r")) + 1
     reason = "the last line has no line end, which most files here have: it may be cut within a number."
     line = text.count(b"\n", 0, end) + 1
     fix = "Copy the file again; if it is whole, end its last line."
-    place = {"file": file, "line": line, "severity": "warning", "action": "row left out"}
-    return text[:end], Fault("cut_file", reason, fix=fix, **place)
+    done = {"severity": "warning", "action": "row left out"}
+    return text[:end], Fault("cut_file", reason, line=line, fix=fix, **done)
 
 
 def _read(campaign: Path, file: str, size: int | None = None) -> tuple[bytes, os.stat_result]:
     path = inside(campaign, file)
     if path is None:
         fix = "Copy it into the folder of runs.csv."
-        raise bad_file(file, "path_outside", "lies outside the campaign folder.", fix)
+        raise bad_file("path_outside", "lies outside the campaign folder.", fix)
     try:
         # A pipe would be waited for forever, unless it is opened without waiting.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except OSError as error:
-        raise _not_opened(path, file, error) from None
+        raise _not_opened(path, error) from None
     try:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
-            raise bad_file(file, "unreadable_file", "is not a file.", "Check the path.")
+            raise bad_file("unreadable_file", "is not a file.", "Check the path.")
         raw = os.read(handle, status.st_size + 1 if size is None else size)
         # Short where it is the whole file; a network's file system, or a file above 2 GB, may give it piece
         # by piece.
         while size is None and len(raw) != status.st_size and (more := os.read(handle, 1 << 24)):
             raw += more
     except OSError as error:
-        raise _not_readable(file, error) from error
+        raise _not_readable(error) from error
     finally:
         os.close(handle)
     marks = [len(mark) for mark, _ in _BOMS if raw.startswith(mark)]
     if not raw[max(marks, default=0) :].strip(_BLANK):
         fix = "Export it again, or leave it out: of runs.csv, or by files.exclude in the rig config."
-        raise bad_file(file, "empty_file", "is empty.", fix)
+        raise bad_file("empty_file", "is empty.", fix)
     return raw, status
 
 
-def _not_opened(path: Path, file: str, error: OSError) -> BadFile:
+def _not_opened(path: Path, error: OSError) -> BadFile:
     if isinstance(error, FileNotFoundError) and path.is_symlink():
         reason = f"is a link to '{path.readlink()}', which does not exist."
-        return bad_file(file, "missing_file", reason, "Copy the file itself into the campaign.")
+        return bad_file("missing_file", reason, "Copy the file itself into the campaign.")
     if isinstance(error, FileNotFoundError):
         fix = did_you_mean(path, Path.is_file) or "Paths are relative to the folder of runs.csv."
-        return bad_file(file, "missing_file", "does not exist.", fix)
-    return _not_readable(file, error)
+        return bad_file("missing_file", "does not exist.", fix)
+    return _not_readable(error)
 
 
-def _not_readable(file: str, error: OSError) -> BadFile:
-    return bad_file(file, "unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.")
+def _not_readable(error: OSError) -> BadFile:
+    return bad_file("unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.")
 
 
-def bad_file(file: str, check: str, reason: str, fix: str, **place) -> BadFile:
-    """Return the error of a file that is left out."""
-    return BadFile(Fault(check, reason, file=file, action="file left out", fix=fix, **place))
+def bad_file(check: str, reason: str, fix: str, **place) -> BadFile:
+    """Return the error of a file that is left out; the path is added by `in_file`."""
+    return BadFile(Fault(check, reason, action="file left out", fix=fix, **place))
+
+
+def placed(faults: Sequence[Fault], file: str) -> tuple[Fault, ...]:
+    """Return what was found in a file with the file's path."""
+    return tuple(replace(fault, file=file) for fault in faults)
+
+
+@contextmanager
+def in_file(file: str) -> Iterator[None]:
+    """Add the path of a file to the error of reading it."""
+    try:
+        yield
+    except BadFile as error:
+        raise BadFile(*placed(error.faults, file)) from error
 
 
 # ---------------------------------------------------------------- text
@@ -180,7 +197,7 @@ class Layout:
     first_line: int
 
 
-def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> bytes:
+def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
     """Return the text as UTF-8 bytes without byte-order mark, lines ended by a single line feed.
 
     `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then tries UTF-8, then takes
@@ -191,7 +208,7 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
     BadFile
         If the bytes are not text in that encoding, or begin as files of other formats do.
     """
-    _refuse_packed(raw, file)
+    _refuse_packed(raw)
     automatic = encoding == "auto"
     if automatic:
         encoding = next((name for mark, name in _BOMS if raw.startswith(mark)), None) or _guess(raw)
@@ -206,39 +223,39 @@ def as_utf8(raw: bytes, encoding: str, file: str, *, head: bool = False) -> byte
                 text = raw.decode("latin-1")
             elif not isinstance(error, UnicodeDecodeError):  # UTF-16 or UTF-32 without its mark
                 reason = f"is not {encoding}: there is no byte-order mark."
-                raise bad_file(file, "wrong_encoding", reason, 'Set encoding = "auto".') from error
+                raise bad_file("wrong_encoding", reason, 'Set encoding = "auto".') from error
             else:
                 line = raw[: error.start].count(b"\n") + 1
                 reason = f"is not {encoding}: byte {error.start} cannot be read."
                 fix = "Export it again." if automatic else 'Set encoding = "auto".'
-                raise bad_file(file, "wrong_encoding", reason, fix, line=line) from error
+                raise bad_file("wrong_encoding", reason, fix, line=line) from error
         raw = text.encode("utf-8", "replace").removeprefix(codecs.BOM_UTF8)
     if raw.translate(None, _CONTROL) != raw:
         place = next(i for i, byte in enumerate(raw) if byte in _CONTROL)
         line = raw[:place].count(b"\n") + 1
         reason = f"is not text: byte {raw[place]:#04x} stands in it."
-        raise bad_file(file, "binary_file", reason, "Export the trace as text (CSV).", line=line)
+        raise bad_file("binary_file", reason, "Export the trace as text (CSV).", line=line)
     if b"\r" in raw:
         raw = raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return raw
 
 
-def _refuse_packed(raw: bytes, file: str) -> None:
+def _refuse_packed(raw: bytes) -> None:
     for magic, what in _PACKED.items():
         if raw.startswith(magic):
             fix = "Export it as CSV, or give the file the ending of its format."
-            raise bad_file(file, "binary_file", f"is {what}, not text.", fix)
+            raise bad_file("binary_file", f"is {what}, not text.", fix)
 
 
-def refuse_marked_up(text: bytes, file: str) -> None:
+def refuse_marked_up(text: bytes) -> None:
     """Raise `BadFile` for text of a format that is not a table: HTML, XML or JSON."""
     begin = text[:256].lstrip().lower()
     for mark, what in _MARKED_UP.items():
         if begin.startswith(mark):
-            raise bad_file(file, "no_table", f"is {what}, not a table.", "Export the trace as CSV.")
+            raise bad_file("no_table", f"is {what}, not a table.", "Export the trace as CSV.")
 
 
-def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
+def find_layout(text: bytes, settings: TraceFormat) -> Layout:
     """Return where the data of a trace file begin.
 
     Raises
@@ -249,7 +266,7 @@ def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
         As `found_by`.
     """
     lines = text[:HEAD_BYTES].decode("utf-8", "ignore").split("\n")
-    count = _header_lines(lines, settings, file)
+    count = _header_lines(lines, settings)
     parts = text.split(b"\n", count)
     start = len(text) - len(parts[count]) if len(parts) > count else len(text)
     header = tuple(lines[:count])
@@ -259,7 +276,7 @@ def find_layout(text: bytes, settings: TraceFormat, file: str) -> Layout:
     if back > count:
         reason = f"has a header of {count} lines, and its names should stand {back} lines before the data."
         fix = "Check header_lines and names_line in the rig config."
-        raise bad_file(file, "header_not_found", reason, fix)
+        raise bad_file("header_not_found", reason, fix)
     cells = split_line(without_strays(header[-back], settings), settings.delimiter)
     names = tuple(name.strip() for name in cells)
     return Layout(header, names, count - back + 1, start, count + 1)
@@ -370,14 +387,14 @@ def without_footer(text: bytes, footer: str | None, start: int) -> bytes:
     return text if at < 0 else text[: at + 1]
 
 
-def _header_lines(lines: list[str], settings: TraceFormat, file: str) -> int:
+def _header_lines(lines: list[str], settings: TraceFormat) -> int:
     if settings.header_ends_at is not None:
         for number, line in enumerate(lines, start=1):
             if found_by(settings.header_ends_at, line):
                 return number
         reason = f"no line matches header_ends_at = {settings.header_ends_at!r}."
         fix = "Check header_ends_at in the rig config against the file."
-        raise bad_file(file, "header_not_found", reason, fix)
+        raise bad_file("header_not_found", reason, fix)
     if settings.header_lines is not None:
         return settings.header_lines
     if settings.names == "none":

@@ -61,8 +61,8 @@ def kind_of(file: str, settings: TraceFormat | None = None) -> str:
     return ENDINGS.get(PurePosixPath(file).suffix.lower(), "csv")
 
 
-def library(name: str, file: str) -> ModuleType:
-    """Return the library that reads `file`.
+def library(name: str) -> ModuleType:
+    """Return a library that reads files of some kind.
 
     Raises
     ------
@@ -72,21 +72,19 @@ def library(name: str, file: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError:
-        reason = f"{name}, which reads this file, is not installed."
+        reason = f"{name}, which reads such files, is not installed."
         fix = "Install it: pip install 'sealfit[formats]'"
-        raise CampaignError([Fault("missing_library", reason, file=file, fix=fix)]) from None
+        raise CampaignError([Fault("missing_library", reason, fix=fix)]) from None
 
 
 def require_libraries(files: Sequence[str], settings: TraceFormat) -> None:
     """Raise `CampaignError` if a library that some of the files need is not installed."""
-    for kind, name in _LIBRARIES.items():
-        file = next((file for file in files if kind_of(file, settings) == kind), None)
-        if file is not None:
-            library(name, file)
+    for kind in {kind_of(file, settings) for file in files} & _LIBRARIES.keys():
+        library(_LIBRARIES[kind])
 
 
 @contextmanager
-def damage_named(file: str, kind: str) -> Iterator[None]:
+def damage_named(kind: str) -> Iterator[None]:
     """Turn whatever a library raises into a fault of the file; damage causes any kind of exception."""
     try:
         with warnings.catch_warnings():
@@ -97,7 +95,7 @@ def damage_named(file: str, kind: str) -> Iterator[None]:
     except Exception as error:
         said = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
         fix = "It is damaged or of another format: export it again, or set trace.format in the rig config."
-        raise bad_file(file, "damaged_file", f"cannot be read as {CALLED[kind]} ({said}).", fix) from error
+        raise bad_file("damaged_file", f"cannot be read as {CALLED[kind]} ({said}).", fix) from error
 
 
 # ---------------------------------------------------------------- arrays
@@ -117,8 +115,8 @@ class Arrays:
     faults: tuple[Fault, ...] = ()
 
 
-def read_arrays(raw: bytes, file: str, settings: TraceFormat, *, head: bool = False) -> Arrays:
-    """Return what a file of one of the kinds `OF_ARRAYS` holds; with `head` its header lines at least.
+def read_arrays(raw: bytes, kind: str, settings: TraceFormat, *, head: bool = False) -> Arrays:
+    """Return what a file of a kind, one of `OF_ARRAYS`, holds; with `head` its header lines at least.
 
     Raises
     ------
@@ -127,11 +125,10 @@ def read_arrays(raw: bytes, file: str, settings: TraceFormat, *, head: bool = Fa
     CampaignError
         If the library that reads it is not installed.
     """
-    kind = kind_of(file, settings)
-    with damage_named(file, kind):
-        found = _READERS[kind](raw, file, settings, head)
+    with damage_named(kind):
+        found = _READERS[kind](raw, settings, head)
     if not head and not max((len(column) for column in found.columns), default=0):
-        raise bad_file(file, "no_rows", "holds no column of data.", "Export it again.")
+        raise bad_file("no_rows", "holds no column of data.", "Export it again.")
     return found
 
 
@@ -177,7 +174,7 @@ def _column(values: np.ndarray) -> np.ndarray | None:
     return None
 
 
-def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceFormat, file: str) -> Arrays:
+def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceFormat) -> Arrays:
     """Return named columns; those shorter than the longest, or of other things, are left out and named.
 
     Raises
@@ -197,9 +194,9 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
             reason = "holds neither numbers nor text"
         if name in needed:
             fix = "Export all channels at one rate." if column is not None else "Export it as numbers."
-            raise bad_file(file, "column_shape", f"{reason}.", fix, column=name)
+            raise bad_file("column_shape", f"{reason}.", fix, column=name)
         reason = f"{reason}; the column is not used."
-        faults.append(Fault("channel_left_out", reason, file=file, column=name, **NOTED))
+        faults.append(Fault("channel_left_out", reason, column=name, **NOTED))
     return Arrays(tuple(header), tuple(kept), tuple(kept.values()), tuple(faults))
 
 
@@ -207,7 +204,6 @@ def _chosen(
     options: Mapping[str, Collection[str]],
     key: str,
     settings: TraceFormat,
-    file: str,
     derived: str | int | None = None,
 ) -> str:
     """Return the one of several tables in a file that the config names, or the only one that fits it.
@@ -217,12 +213,12 @@ def _chosen(
     """
     wanted = getattr(settings, key)
     if not options:
-        raise bad_file(file, "no_rows", "holds no column of data.", "Export it again.")
+        raise bad_file("no_rows", "holds no column of data.", "Export it again.")
     if wanted is not None:
         if wanted in options:
             return wanted
         fix = suggestion(wanted, list(options)).replace("columns are", f"{key}s are")
-        raise bad_file(file, "missing_table", f"holds no {key} '{wanted}' (trace.{key}) with data.", fix)
+        raise bad_file("missing_table", f"holds no {key} '{wanted}' (trace.{key}) with data.", fix)
     names = {
         name
         for ours, name in settings.their_columns.items()
@@ -233,24 +229,24 @@ def _chosen(
         return [*fitting, *options][0]
     named = ", ".join(repr(option) for option in options)
     fix = f'Choose one in the rig config: {key} = "..." under [trace].'
-    raise bad_file(file, "several_tables", f"holds several {key}s with data: {named}.", fix)
+    raise bad_file("several_tables", f"holds several {key}s with data: {named}.", fix)
 
 
 # ---------------------------------------------------------------- TDMS
 
 
-def _tdms(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
-    nptdms = library("nptdms", file)
+def _tdms(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
+    nptdms = library("nptdms")
     nptdms.log.log_manager.set_level("ERROR")  # what it warns of is a fault below
     read = nptdms.TdmsFile.read_metadata if head else nptdms.TdmsFile.read
     tdms = read(io.BytesIO(raw))
     if tdms.file_status.incomplete_final_segment:
         reason = "is cut off: its last segment is not complete."
-        raise bad_file(file, "damaged_file", reason, "Copy it again from the rig.")
+        raise bad_file("damaged_file", reason, "Copy it again from the rig.")
     groups = {group.name: group for group in tdms.groups() if any(map(len, group.channels()))}
     time_name = settings.their_columns.get("time_s")
     names = {name: [channel.name for channel in group.channels()] for name, group in groups.items()}
-    group = groups[_chosen(names, "group", settings, file, derived=time_name)]
+    group = groups[_chosen(names, "group", settings, derived=time_name)]
     header = [_header_line(name, value) for name, value in tdms.properties.items()]
     header += [_header_line(f"{group.name}/{name}", value) for name, value in group.properties.items()]
     for channel in group.channels():
@@ -259,7 +255,7 @@ def _tdms(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     if head:
         return Arrays(tuple(header))
     filled = {channel.name: channel for channel in group.channels() if len(channel)}
-    made = _arrays(header, {name: np.asarray(channel[:]) for name, channel in filled.items()}, settings, file)
+    made = _arrays(header, {name: np.asarray(channel[:]) for name, channel in filled.items()}, settings)
     if not isinstance(time_name, str) or time_name in names[group.name]:
         return made
     return _with_time(made, time_name, [filled[name].properties for name in made.names])
@@ -281,9 +277,9 @@ VECTORS = "(vectors)"  # what `variable` calls the vectors that stand in the fil
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
+def _mat(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
     if raw.startswith(_HDF5) or raw[512:520] == _HDF5:  # version 7.3
-        with library("h5py", file).File(io.BytesIO(raw), "r") as opened:
+        with library("h5py").File(io.BytesIO(raw), "r") as opened:
             variables = _hdf5(opened)
     else:
         from scipy.io import loadmat
@@ -299,16 +295,16 @@ def _mat(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
     if not tables:
         fix = "Save the columns as vectors, as a matrix or as a struct: "
         fix += "s = table2struct(T, 'ToScalar', true)."
-        raise bad_file(file, "no_rows", "holds no vectors, matrix or struct of numbers.", fix)
+        raise bad_file("no_rows", "holds no vectors, matrix or struct of numbers.", fix)
     options = {name: table if isinstance(table, dict) else () for name, table in tables.items()}
-    name = _chosen(options, "variable", settings, file)
+    name = _chosen(options, "variable", settings)
     table = tables[name]
     if isinstance(table, dict):
-        return _arrays(header, table, settings, file)
+        return _arrays(header, table, settings)
     rows, columns = table.shape
     if rows < columns:
         reason = f"variable '{name}' has {rows} rows and {columns} columns; samples are rows."
-        raise bad_file(file, "column_shape", reason, "Save its transpose.")
+        raise bad_file("column_shape", reason, "Save its transpose.")
     return Arrays(tuple(header), (), tuple(table.T.astype(float)))
 
 
@@ -401,7 +397,7 @@ _OF_WRITERS = (b"pandas", b"ARROW:schema")  # what writers keep for themselves
 MOST_CELLS = 2 * 10**8
 
 
-def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays:
+def _parquet(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -413,12 +409,12 @@ def _parquet(raw: bytes, file: str, settings: TraceFormat, head: bool) -> Arrays
     rows, columns = opened.metadata.num_rows, opened.metadata.num_columns
     if rows * columns > MOST_CELLS:
         reason = f"has {rows} rows of {columns} columns; at most {MOST_CELLS:,} cells are read from one file."
-        raise bad_file(file, "too_large", reason, "Divide it into a file for each run.")
+        raise bad_file("too_large", reason, "Divide it into a file for each run.")
     table = opened.read(use_threads=False)
     names = [name for name in table.column_names if not name.startswith("__index_level_")]
     if len(set(names)) < len(names):
-        raise bad_file(file, "duplicate_column", "has two columns of one name.", "Rename one.")
-    return _arrays(header, {name: _from_arrow(table.column(name)) for name in names}, settings, file)
+        raise bad_file("duplicate_column", "has two columns of one name.", "Rename one.")
+    return _arrays(header, {name: _from_arrow(table.column(name)) for name in names}, settings)
 
 
 def _from_arrow(column) -> np.ndarray:

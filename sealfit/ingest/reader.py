@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from sealfit.config import MOST, Config, TraceFormat
 from sealfit.errors import KEPT, BadFile, ConfigError, Fault
-from sealfit.ingest.cells import Rows, array_cells, body_of, clean, read_cells, width_of
+from sealfit.ingest.cells import Trace, array_cells, body_of, clean, read_cells, width_of
 from sealfit.ingest.columns import (
     RESERVED,
     SLOTS,
@@ -32,6 +31,8 @@ from sealfit.ingest.files import (
     bad_file,
     find_layout,
     header_fields,
+    in_file,
+    placed,
     read_bytes,
     refuse_marked_up,
     split_line,
@@ -45,35 +46,11 @@ UNFILLED = ("", "Comment")  # last names without cells: a stray separator, and L
 MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
 
 
-@dataclass(frozen=True)
-class Trace:
-    """One trace as it was measured, in our columns and units.
-
-    `columns` holds time_s, displacement_mm and force_N (and load_N, where it was measured) as float64 and any
-    further channel as float64 or text, each of shape (n,); bad rows are left out. `line` is the 1-based line
-    in the file of every row, `rows_read` the number of data rows in the file, and `faults` what was found in
-    it.
-    """
-
-    ref: TraceRef
-    columns: Mapping[str, np.ndarray]
-    line: np.ndarray
-    rows_read: int
-    faults: tuple[Fault, ...]
-
-    def where(self, keep: np.ndarray, faults: Sequence[Fault]) -> Trace:
-        """Return the trace with some of its rows, and with further findings."""
-        columns = {name: values[keep] for name, values in self.columns.items()}
-        return replace(self, columns=columns, line=self.line[keep], faults=(*self.faults, *faults))
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """The columns as a table."""
-        return pd.DataFrame(self.columns)
-
-
 def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
     """Return one trace, with bad rows left out and named.
+
+    Its columns are time_s, displacement_mm and force_N (and load_N, where it was measured) as float64, and
+    any further channel as float64 or text.
 
     Raises
     ------
@@ -86,39 +63,40 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
 
 def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the bytes of a file hold; raises as `read_trace`."""
-    of_arrays = kind_of(ref.file, config.trace) in OF_ARRAYS
-    read = _read_arrays if of_arrays else _read_text
-    return _trace(*read(raw, ref, config.trace), ref, config)
+    read = _read_arrays if kind_of(ref.file, config.trace) in OF_ARRAYS else _read_text
+    with in_file(ref.file):
+        trace = _trace(*read(raw, ref, config.trace), ref, config)
+    return replace(trace, faults=placed(trace.faults, ref.file))
 
 
-def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Rows, Layout]:
+def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Trace, Layout]:
     """Return the rows of a file of arrays, and its layout."""
-    found = read_arrays(raw, ref.file, settings)
+    found = read_arrays(raw, kind_of(ref.file, settings), settings)
     layout = Layout(found.header, found.names, None, 0, 1)
-    ours = locate(layout, len(found.names) or len(found.columns), settings, ref.file)
-    rows = array_cells(found.columns, ours, numeric_names(settings), settings, ref.file)
+    ours = locate(layout, len(found.names) or len(found.columns), settings)
+    rows = array_cells(found.columns, ours, numeric_names(settings), settings)
     return replace(rows, faults=(*found.faults, *rows.faults)), layout
 
 
-def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Rows, Layout]:
+def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Trace, Layout]:
     """Return of a text file or workbook what `_read_arrays` returns."""
-    file, cut = ref.file, ()
-    text, layout, settings = _text(raw, file, settings)
+    cut = ()
+    text, layout, settings = _text(raw, kind_of(ref.file, settings), settings)
     text = without_footer(text, settings.footer, layout.start)
     if ref.cut:
-        text, *cut = whole_lines(text, file)
-    body = body_of(text, layout, settings, file)
+        text, *cut = whole_lines(text)
+    body = body_of(text, layout, settings)
     width = width_of(body, settings.delimiter)
-    _refuse_narrow(layout, width, settings, file)
+    _refuse_narrow(layout, width, settings)
     try:
-        ours = locate(layout, len(layout.names) or width, settings, file)
+        ours = locate(layout, len(layout.names) or width, settings)
     except BadFile as error:
         raise _names_elsewhere(error, layout, body, settings) from None
-    rows = read_cells(body, layout, settings, ours, numeric_names(settings), file)
+    rows = read_cells(body, layout, settings, ours, numeric_names(settings))
     return replace(rows, faults=(*cut, *rows.faults)), layout
 
 
-def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat, file: str) -> None:
+def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat) -> None:
     """Raise `BadFile` if columns go by name and the first line has fewer cells than there are names."""
     named = len(layout.names)
     while named and layout.names[named - 1] in UNFILLED:
@@ -127,7 +105,7 @@ def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat, file: str)
     if by_name and len(layout.names) > 1 and 1 < width < named:
         reason = f"the header names {named} columns, and the first line of data has {width} cells."
         fix = "Complete the header or the data: no cell can be told to be that of a name."
-        raise bad_file(file, "too_few_cells", reason, fix, line=layout.first_line)
+        raise bad_file("too_few_cells", reason, fix, line=layout.first_line)
 
 
 def _names_elsewhere(error: BadFile, layout: Layout, body: bytes, settings: TraceFormat) -> BadFile:
@@ -147,71 +125,65 @@ def _names_elsewhere(error: BadFile, layout: Layout, body: bytes, settings: Trac
 
 
 def _text(
-    raw: bytes, file: str, settings: TraceFormat, *, head: bool = False
+    raw: bytes, kind: str, settings: TraceFormat, *, head: bool = False
 ) -> tuple[bytes, Layout, TraceFormat]:
     """Return a text file or workbook sheet as UTF-8, its layout, and the settings with its delimiter."""
-    if kind_of(file, settings) == "csv":
-        text = as_utf8(raw, settings.encoding, file, head=head)
-        refuse_marked_up(text, file)
-        return text, find_layout(text, settings, file), settings
-    text = read_sheet(raw, file, settings.sheet, decimal=settings.decimal, head=head)
-    settings = settings.model_copy(update={"delimiter": "tab"})
-    return text, find_layout(text, settings, file), settings
+    if kind == "csv":
+        text = as_utf8(raw, settings.encoding, head=head)
+        refuse_marked_up(text)
+    else:
+        text = read_sheet(raw, settings.sheet, decimal=settings.decimal, head=head)
+        settings = settings.model_copy(update={"delimiter": "tab"})
+    return text, find_layout(text, settings), settings
 
 
 def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | str]:
-    """Return what the header lines of a trace file say.
-
-    Raises
-    ------
-    BadFile
-        If the file cannot be read.
-    """
-    settings = config.trace
-    raw = read_bytes(campaign, file, head=kind_of(file, settings) == "csv")
-    if kind_of(file, settings) in OF_ARRAYS:
-        header = read_arrays(raw, file, settings, head=True).header
+    """Return what the header lines of a trace file say; raises `BadFile` if it cannot be read."""
+    settings, kind = config.trace, kind_of(file, config.trace)
+    raw = read_bytes(campaign, file, head=kind == "csv")
+    if kind in OF_ARRAYS:
+        header = read_arrays(raw, kind, settings, head=True).header
     else:
-        header = _text(raw, file, settings, head=True)[1].header
+        header = _text(raw, kind, settings, head=True)[1].header
     return header_fields(header, config)
 
 
-def _trace(rows: Rows, layout: Layout, ref: TraceRef, config: Config) -> Trace:
+def _trace(rows: Trace, layout: Layout, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the rows of a file make; raises as `read_trace`."""
-    settings, file = config.trace, ref.file
+    settings = config.trace
     known: Mapping[str, object] = {}
     if settings.compute or settings.keep is not None or settings.rate_Hz is not None:
-        named = name_parts(file, config.files, config.conversions("names")) or {}
+        named = name_parts(ref.file, config.files, config.conversions("names")) or {}
         known = {**ref.channels, **named, **header_fields(layout.header, config), **settings.constants}
-    read = np.arange(len(rows.line))
-    rows = _in_our_units(channel_columns(rows, config, file), config, layout, file)
+    read = np.arange(rows.rows_read)
+    rows = _in_our_units(channel_columns(rows, config), config, layout)
     if settings.rate_Hz is not None:  # a row that is left out takes its time, too
-        rows = rows.having({"time_s": read / _rate_Hz(settings.rate_Hz, known, file)})
+        rows = rows.having({"time_s": read / _rate_Hz(settings.rate_Hz, known)})
     rows = rows.where(read >= settings.drop_first_rows)
     counted = len(rows.line)
-    rows = _derive(rows.where(~rows.bad), known, settings, layout, file)
-    _refuse_too_many(counted, rows, config, file)
+    rows = _derive(rows.where(~rows.bad), known, settings, layout)
+    _refuse_too_many(counted, rows, config)
     if settings.keep is not None:
-        keep = _evaluate(parse(settings.keep, condition=True), {**known, **rows.columns}, file)
+        keep = _evaluate(parse(settings.keep, condition=True), {**known, **rows.columns})
         rows = rows.where(np.broadcast_to(keep, rows.line.shape))
-    faults = [*rows.faults, *_not_computed(rows, settings, file)]
+    rows = rows.with_faults(_not_computed(rows, settings))
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(read)} data rows are left; a trace needs {MIN_ROWS}."
         fix = "Check drop_first_rows, keep and the export."
-        raise BadFile(*faults, bad_file(file, "no_rows", reason, fix).fault)
-    return Trace(ref, _named_beside(rows, ref, settings), rows.line, len(read), tuple(faults))
+        raise BadFile(*rows.faults, bad_file("no_rows", reason, fix).fault)
+    return replace(rows, columns=_named_beside(rows, ref, settings), channels=ref.channels)
 
 
-def _rate_Hz(rate: float | str, known: Mapping[str, object], file: str) -> float:
+def _rate_Hz(rate: float | str, known: Mapping[str, object]) -> float:
     """Return the rows per second of a file; raises `BadFile` where what is known of it gives none."""
-    value = float(_evaluate(parse(rate), known, file)) if isinstance(rate, str) else rate
+    value = float(_evaluate(parse(rate), known)) if isinstance(rate, str) else rate
     if not 0 < value <= MOST:
         reason = f'rate_Hz = "{rate}" gives {value:g} rows per second.'
-        raise bad_file(file, "rate", reason, "Correct what it reads, or the expression.")
+        raise bad_file("rate", reason, "Correct what it reads, or the expression.")
     return value
 
 
-def _in_our_units(rows: Rows, config: Config, layout: Layout, file: str) -> Rows:
+def _in_our_units(rows: Trace, config: Config, layout: Layout) -> Trace:
     """Return the rows with numbers of other units converted; raises `BadFile` where they are labels."""
     changed = {}
     for name, convert in config.conversions("trace").items():
@@ -220,31 +192,29 @@ def _in_our_units(rows: Rows, config: Config, layout: Layout, file: str) -> Rows
         if rows.columns[name].dtype.kind != "f":
             reason = "has a unit in the rig config and holds no numbers."
             fix = "Take its unit out of [trace.columns], or export numbers."
-            raise bad_file(file, "not_a_number", reason, fix, column=name, line=layout.names_line)
+            raise bad_file("not_a_number", reason, fix, column=name, line=layout.names_line)
         changed[name] = convert(rows.columns[name])
     return rows.having(changed)
 
 
-def _derive(
-    rows: Rows, known: Mapping[str, object], settings: TraceFormat, layout: Layout, file: str
-) -> Rows:
+def _derive(rows: Trace, known: Mapping[str, object], settings: TraceFormat, layout: Layout) -> Trace:
     """Return the good ones of rows, with computed columns and integrated displacement."""
     speed = settings.integrate_displacement
     compute = {name: parse(text) for name, text in settings.compute.items()}
     later = _after_integral(compute) if speed else []
-    rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known, file)
+    rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known)
     if not speed:
-        required(rows.columns, layout, file)
-        return clean(rows, list(SLOTS), file)
+        required(rows.columns, layout)
+        return clean(rows, SLOTS)
     # The integral needs its time and speed clean first: one bad row would shift every displacement after it.
     for name in (speed, "time_s"):
         if name not in rows.columns:
             fix = "Name it under [trace.columns], or compute it under [trace.compute]."
-            raise BadFile(missing_column(name, layout, file, fix))
-    rows = clean(rows, ["time_s", speed, "force_N"], file)
+            raise BadFile(missing_column(name, layout, fix))
+    rows = clean(rows, ["time_s", speed, "force_N"])
     rows = rows.having({"displacement_mm": _integral(rows, speed, settings)})
-    rows = _computed(rows, {name: compute[name] for name in later}, known, file)
-    required(rows.columns, layout, file)
+    rows = _computed(rows, {name: compute[name] for name in later}, known)
+    required(rows.columns, layout)
     return rows
 
 
@@ -257,50 +227,50 @@ def _after_integral(compute: Mapping[str, Expression]) -> list[str]:
     return later
 
 
-def _computed(rows: Rows, compute: Mapping[str, Expression], known: Mapping[str, object], file: str) -> Rows:
+def _computed(rows: Trace, compute: Mapping[str, Expression], known: Mapping[str, object]) -> Trace:
     for name, expression in compute.items():
-        value = _evaluate(expression, {**known, **rows.columns}, file)
+        value = _evaluate(expression, {**known, **rows.columns})
         rows = rows.having({name: np.broadcast_to(value, rows.line.shape).astype(float)})
     return rows
 
 
-def _not_computed(rows: Rows, settings: TraceFormat, file: str) -> list[Fault]:
+def _not_computed(rows: Trace, settings: TraceFormat) -> list[Fault]:
     """Return a warning for each computed channel that is no number in some rows."""
     faults = []
     for name in settings.compute.keys() - {*SLOTS, *settings.drop_columns}:
         if lacking := np.count_nonzero(~np.isfinite(rows.columns[name])):
             reason = f"is computed in the rig config, and is no number in {lacking} of {len(rows.line)} rows."
             fix = "Correct the expression, or the cells that it reads."
-            faults.append(Fault("not_finite", reason, file=file, column=name, fix=fix, **KEPT))
+            faults.append(Fault("not_finite", reason, column=name, fix=fix, **KEPT))
     return faults
 
 
-def _evaluate(expression: Expression, values: Mapping[str, object], file: str) -> np.ndarray:
+def _evaluate(expression: Expression, values: Mapping[str, object]) -> np.ndarray:
     try:
         return evaluate(expression, values)
     except ConfigError as error:
-        raise bad_file(file, "expression", error.message, error.fix, column=error.column) from error
+        raise bad_file("expression", error.message, error.fix, column=error.column) from error
 
 
-def _integral(rows: Rows, speed: str, settings: TraceFormat) -> np.ndarray:
+def _integral(rows: Trace, speed: str, settings: TraceFormat) -> np.ndarray:
     """Return the displacement by the trapezoid rule, starting at 0; a speed per minute is divided by 60."""
     v = rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
     steps = 0.5 * (v[1:] + v[:-1]) * np.diff(rows.columns["time_s"])
     return np.concatenate([[0.0], np.cumsum(steps)]) if len(v) else v
 
 
-def _refuse_too_many(counted: int, rows: Rows, config: Config, file: str) -> None:
+def _refuse_too_many(counted: int, rows: Trace, config: Config) -> None:
     """Raise `BadFile` if more of the rows are bad than the config allows; `rows` are those that are left."""
     bad = counted - len(rows.line)
     if bad > config.quality.max_bad_rows * counted:
         fixes = Counter(fault.fix for fault in rows.faults if fault.action == "row left out" and fault.fix)
         fix = fixes.most_common(1)[0][0] if fixes else ""
         reason = f"{bad} of {counted} rows are bad, more than {100 * config.quality.max_bad_rows:g} %."
-        too_many = bad_file(file, "too_many_bad_rows", reason, fix, value=float(bad))
+        too_many = bad_file("too_many_bad_rows", reason, fix, value=float(bad))
         raise BadFile(*rows.faults, too_many.fault)
 
 
-def _named_beside(rows: Rows, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
+def _named_beside(rows: Trace, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
     """Return slots first, then channels, without helper columns.
 
     A channel that `ref` has too is left out where it is constant (`ref` says it); one that varies is another

@@ -55,7 +55,7 @@ from sealfit.ingest.derived_columns import (
     with_day_0,
 )
 from sealfit.ingest.file_names import Listing, channels_of, fits_up_to, name_parts, unmatched
-from sealfit.ingest.files import as_number, bad_file, cut_files, read_bytes
+from sealfit.ingest.files import as_number, bad_file, cut_files, placed, read_bytes
 from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt
 from sealfit.ingest.reader import read_header, read_trace
@@ -364,7 +364,7 @@ def _from_traces(
                 span = f"{values.min()} to {values.max()}"
                 reason = f"varies within the file, {span}; a condition is one value."
                 fix = "Write the value that was set into runs.csv."
-                faults += bad_file(file, "condition_varies", reason, fix, column=name).faults
+                faults += placed(bad_file("condition_varies", reason, fix, column=name).faults, file)
                 left_out.add(i)
     whole = {**columns, **{name: put(columns.get(name, none), values) for name, values in added.items()}}
     return whole, measured, left_out, faults

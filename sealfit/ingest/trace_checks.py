@@ -10,8 +10,8 @@ from scipy.ndimage import median_filter
 
 from sealfit.config import Config, Quality
 from sealfit.errors import KEPT, ConfigError, Fault
+from sealfit.ingest.cells import Trace
 from sealfit.ingest.files import bad_file
-from sealfit.ingest.reader import Trace
 from sealfit.ingest.segments import weighted_median
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm
 from sealfit.units import Units, conversion
@@ -37,7 +37,7 @@ def _beyond(force_N: np.ndarray, suspects: np.ndarray) -> np.ndarray:
 
 
 def displacement_spikes(
-    file: str, displacement_mm: np.ndarray, line: np.ndarray, settings: Quality
+    displacement_mm: np.ndarray, line: np.ndarray, settings: Quality
 ) -> tuple[np.ndarray, list[Fault]]:
     """Return which rows to keep, shape (n,): none whose displacement jumps away and back; a finding for each.
 
@@ -60,11 +60,11 @@ def displacement_spikes(
     if len(spikes) > settings.max_bad_rows * len(off):
         return keep, []
     keep[spikes] = False
-    return keep, [_spike(file, None, "displacement_mm", displacement_mm[i], off[i], line[i]) for i in spikes]
+    return keep, [_spike(None, "displacement_mm", displacement_mm[i], off[i], line[i]) for i in spikes]
 
 
 def force_spikes(
-    file: str, force_N: np.ndarray, strokes: Sequence[Stroke], line: np.ndarray, settings: Quality
+    force_N: np.ndarray, strokes: Sequence[Stroke], line: np.ndarray, settings: Quality
 ) -> tuple[np.ndarray, list[Fault]]:
     """Return which rows to keep, shape (n,): no single force far off its neighbours; a finding for each.
 
@@ -92,15 +92,14 @@ def force_spikes(
     if count > settings.max_bad_rows * len(force_N):
         reason = f"{count} samples jump away from their neighbours: too many to be single wrong samples."
         fix = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
-        place = {"file": file, "column": "force_N", "value": float(count)}
-        return keep, [Fault("spikes", reason, fix=fix, **place, **KEPT)]
+        return keep, [Fault("spikes", reason, column="force_N", value=float(count), fix=fix, **KEPT)]
     keep[spikes] = False
     starts = np.array([stroke.start for stroke in strokes])
     several = len(strokes) > 1
     found = []
     for i in spikes:
         number = int(np.searchsorted(starts, i, side="right")) if several else None
-        found.append(_spike(file, number, "force_N", force_N[i], off[i], line[i]))
+        found.append(_spike(number, "force_N", force_N[i], off[i], line[i]))
     return keep, found
 
 
@@ -110,9 +109,9 @@ def resolution(values: np.ndarray) -> float:
     return float(np.diff(different).min()) if len(different) > 1 else 0.0
 
 
-def _spike(file: str, stroke: int | None, column: str, value: float, off: float, line: int) -> Fault:
+def _spike(stroke: int | None, column: str, value: float, off: float, line: int) -> Fault:
     reason = f"a single sample, {abs(off):.4g} off its neighbours."
-    place = {"file": file, "stroke": stroke, "line": int(line), "column": column, "value": float(value)}
+    place = {"stroke": stroke, "line": int(line), "column": column, "value": float(value)}
     return Fault("spike", reason, severity="warning", action="row left out", fix=FIX, **place)
 
 
@@ -132,7 +131,7 @@ def motion_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fau
     else:
         check, reason = "no_motion", f"nothing moves: displacement stays within {span:.3g} {unit}."
         fix = "Check the displacement column and its unit, or set strokes.min_travel_mm in the config."
-    return bad_file(trace.ref.file, check, reason, fix, column="displacement_mm").fault
+    return bad_file(check, reason, fix, column="displacement_mm").fault
 
 
 def _turn(unit: str) -> float | None:
@@ -174,7 +173,7 @@ def speed_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Faul
     of 1.5 the file is kept with a warning: every table holds the measured speed. Beyond, the file is left
     out, and the fix names the mix-up that fits the factor.
     """
-    commanded = trace.ref.channels.get("speed_set_mm_s")
+    commanded = trace.channels.get("speed_set_mm_s")
     if not isinstance(commanded, int | float) or not commanded > 0:
         return None
     speeds = measured_speeds(trace, strokes, config.units)
@@ -186,7 +185,7 @@ def speed_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Faul
         return None
     unit = config.units.unit("speed")
     reason = f"displacement over time gives {measured:.4g} {unit}, commanded are {commanded:.4g} {unit}."
-    place = {"file": trace.ref.file, "column": "displacement_mm", "value": float(measured)}
+    place = {"column": "displacement_mm", "value": float(measured)}
     if 1 / GROSS <= ratio <= GROSS:
         fix = "Check the commanded speed, or slip in the drive."
         return Fault("speed_disagreement", reason, fix=fix, **place, **KEPT)

@@ -26,7 +26,6 @@ _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
 
 def read_sheet(
     raw: bytes,
-    file: str,
     sheet: str | int | object | None,
     *,
     decimal: str = ".",
@@ -46,20 +45,20 @@ def read_sheet(
     CampaignError
         If openpyxl is not installed.
     """
-    with _book(raw, file, formulas=True, by_row=merged) as book:
-        title = _title(book, sheet, file)
-        lines, formulas = _lines(book[title], decimal, head, file)
+    with _book(raw, formulas=True, by_row=merged) as book:
+        title = _title(book, sheet)
+        lines, formulas = _lines(book[title], decimal, head)
         if not merged:
-            _refuse_merged(book[title], file)
+            _refuse_merged(book[title])
     if formulas:
-        with _book(raw, file, formulas=False) as book:
-            lines, _ = _lines(book[title], decimal, head, file, formulas)
+        with _book(raw, formulas=False) as book:
+            lines, _ = _lines(book[title], decimal, head, formulas)
     return "\n".join(lines).encode("utf-8", "replace")
 
 
-def rows_of_sheets(raw: bytes, file: str) -> dict[str, int]:
+def rows_of_sheets(raw: bytes) -> dict[str, int]:
     """Return the number of rows with cells of every sheet, the most first; errors as `read_sheet`."""
-    with _book(raw, file, formulas=True) as book:
+    with _book(raw, formulas=True) as book:
         return _rows(book)
 
 
@@ -69,33 +68,33 @@ def _rows(book) -> dict[str, int]:
 
 
 @contextmanager
-def _book(raw: bytes, file: str, *, formulas: bool, by_row: bool = True) -> Iterator:
+def _book(raw: bytes, *, formulas: bool, by_row: bool = True) -> Iterator:
     """Open a workbook with its formulas or with the values that Excel kept of them.
 
     Read `by_row` it takes little memory, and does not say which cells are merged.
     """
-    _refuse_others(raw, file)
-    openpyxl = library("openpyxl", file)
+    _refuse_others(raw)
+    openpyxl = library("openpyxl")
     options = {"read_only": by_row, "data_only": not formulas, "keep_links": False}
-    with damage_named(file, "xlsx"), closing(openpyxl.load_workbook(io.BytesIO(raw), **options)) as book:
+    with damage_named("xlsx"), closing(openpyxl.load_workbook(io.BytesIO(raw), **options)) as book:
         for sheet in book.worksheets if by_row else ():
             sheet.reset_dimensions()  # some writers note a size that is not so
         yield book
 
 
-def _refuse_others(raw: bytes, file: str) -> None:
+def _refuse_others(raw: bytes) -> None:
     if not raw.startswith(_OLE):
         if not raw.startswith(b"PK"):
             fix = "Export it again, or name it for what it is."
-            raise bad_file(file, "binary_file", "is not an Excel workbook (.xlsx).", fix)
+            raise bad_file("binary_file", "is not an Excel workbook (.xlsx).", fix)
         return
     if _ENCRYPTED in raw:
         fix = "Save it without (File > Info > Protect Workbook > Encrypt with Password)."
-        raise bad_file(file, "binary_file", "is protected by a password.", fix)
-    raise bad_file(file, "binary_file", "is a workbook of old Excel (.xls).", "Save it as .xlsx.")
+        raise bad_file("binary_file", "is protected by a password.", fix)
+    raise bad_file("binary_file", "is a workbook of old Excel (.xls).", "Save it as .xlsx.")
 
 
-def _title(book, wanted: str | int | object | None, file: str) -> str:
+def _title(book, wanted: str | int | object | None) -> str:
     """Return the name of the sheet that is meant."""
     if wanted is LONGEST:
         return next(iter(_rows(book)))
@@ -104,19 +103,19 @@ def _title(book, wanted: str | int | object | None, file: str) -> str:
         if 0 < wanted <= len(titles):
             return titles[wanted - 1]
         reason = f"there is no sheet {wanted}: it has {len(titles)}."
-        raise bad_file(file, "missing_sheet", reason, _listed(titles))
+        raise bad_file("missing_sheet", reason, _listed(titles))
     if wanted in titles:
         return wanted
     if wanted is not None:
         close = nearest(wanted, titles)
         fix = f"Did you mean '{close}'?" if close else _listed(titles)
-        raise bad_file(file, "missing_sheet", f"there is no sheet '{wanted}'.", fix)
+        raise bad_file("missing_sheet", f"there is no sheet '{wanted}'.", fix)
     filled = [s.title for s in book.worksheets if any(map(_has_cell, s.iter_rows(values_only=True)))]
     if not filled:
-        raise bad_file(file, "empty_file", "has no sheet with cells.", "Export it again.")
+        raise bad_file("empty_file", "has no sheet with cells.", "Export it again.")
     if len(filled) > 1:
         fix = f"Choose one in the rig config: sheet = {filled[0]!r} under [trace]. {_listed(filled)}"
-        raise bad_file(file, "several_tables", f"has {len(filled)} sheets with cells.", fix)
+        raise bad_file("several_tables", f"has {len(filled)} sheets with cells.", fix)
     return filled[0]
 
 
@@ -129,7 +128,7 @@ def _has_cell(row: Sequence[object]) -> bool:
 
 
 def _lines(
-    sheet, decimal: str, head: bool, file: str, saved: Collection[tuple[int, int]] = ()
+    sheet, decimal: str, head: bool, saved: Collection[tuple[int, int]] = ()
 ) -> tuple[list[str], set[tuple[int, int]]]:
     """Return the rows as lines, and row and column (from 1) of every formula.
 
@@ -148,7 +147,7 @@ def _lines(
                 reason = "the cell holds a formula whose value was not saved."
                 fix = "Open it in Excel and save it, or paste values over the formulas."
                 column = sheet.cell(number, place).column_letter
-                raise bad_file(file, "formula", reason, fix, line=number, column=column)
+                raise bad_file("formula", reason, fix, line=number, column=column)
             cells.append(_cell(value, decimal))
         while cells and not cells[-1]:
             cells.pop()
@@ -166,12 +165,12 @@ def _cell(value: object, decimal: str) -> str:
     return '"' + text.replace('"', '""') + '"' if '"' in text else text
 
 
-def _refuse_merged(sheet, file: str) -> None:
+def _refuse_merged(sheet) -> None:
     """Raise `BadFile` if cells are merged."""
     if merged := sorted(sheet.merged_cells.ranges, key=lambda cells: cells.min_row):
         fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
         reason = f"the cells {merged[0]} are merged."
-        raise bad_file(file, "merged_cells", reason, fix, line=merged[0].min_row)
+        raise bad_file("merged_cells", reason, fix, line=merged[0].min_row)
 
 
 # ---------------------------------------------------------------- tables of runs
@@ -191,15 +190,15 @@ def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]
     """
     raw, kind = read_bytes(campaign, file), kind_of(file)
     if kind == "csv":
-        return as_utf8(raw, "auto", file), ""
+        return as_utf8(raw, "auto"), ""
     if kind == "parquet":
-        with damage_named(file, kind):
+        with damage_named(kind):
             return _parquet_text(raw), "\t"
     if kind == "xlsx":
         sheet = 1 if config.files.runs_sheet is None else config.files.runs_sheet
-        return read_sheet(raw, file, sheet, merged=False), "\t"
+        return read_sheet(raw, sheet, merged=False), "\t"
     fix = "Save it as .csv, .xlsx or .parquet."
-    raise bad_file(file, "binary_file", f"is {CALLED[kind]}, which is no table of runs.", fix)
+    raise bad_file("binary_file", f"is {CALLED[kind]}, which is no table of runs.", fix)
 
 
 def _parquet_text(raw: bytes) -> bytes:

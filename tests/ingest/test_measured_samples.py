@@ -51,11 +51,11 @@ def test_pneuseal_reads_whole(pneuseal):
         list(t.table) == ["time_s", "displacement_mm", "force_N", "pressure_bar"] for t in traces.values()
     )
     assert (
-        len({trace.ref.channels["run_id"] for trace in traces.values()}) == 12
+        len({trace.channels["run_id"] for trace in traces.values()}) == 12
     )  # three mountings at four pressures
-    rerun = traces["raw/rerun/2_O-ring257_5bar.csv"].ref.channels
+    rerun = traces["raw/rerun/2_O-ring257_5bar.csv"].channels
     assert (rerun["mounting"], rerun["repeat"], rerun["set_pressure_bar"]) == ("rerun", 2, 5.0)
-    again = traces["raw/reconnected/3_O-ring257_5bar.csv"].ref.channels
+    again = traces["raw/reconnected/3_O-ring257_5bar.csv"].channels
     assert (again["mounting"], again["setup"], again["repeat"]) == ("reconnected3", "reconnected", 3)
 
 
@@ -104,11 +104,11 @@ def test_screwdrive_reads_whole_and_names_the_three_hand_edits(screwdrive):
 
 def test_screwdrive_speeds_agree_with_the_names_and_torques_with_the_percentages(screwdrive):
     traces, _ = screwdrive
-    for trace in traces.values():
-        table, commanded = trace.table, trace.ref.channels["speed_set_mm_s"]
+    for file, trace in traces.items():
+        table, commanded = trace.table, trace.channels["speed_set_mm_s"]
         turns, minutes = np.ptp(table["displacement_mm"]), np.ptp(table["time_s"]) / 60
         npt.assert_allclose(turns / minutes, commanded, rtol=0.15)
-        backward = trace.ref.file.rpartition("/")[2].startswith("n")
+        backward = file.rpartition("/")[2].startswith("n")
         assert table["displacement_mm"].iloc[-1] * (-1 if backward else 1) > 0
         assert table["displacement_mm"].iloc[0] == 0
     last = traces["raw/driveNo3/steady_state/0.096kg/n1.csv"]  # 127744.000;1;23.2,,
@@ -121,8 +121,8 @@ def test_screwdrive_speeds_agree_with_the_names_and_torques_with_the_percentages
 
 def test_screwdrive_header_gives_the_order_of_the_campaign(screwdrive):
     traces, _ = screwdrive
-    first = traces["raw/driveNo3/steady_state/0.096kg/200.csv"].ref.channels
+    first = traces["raw/driveNo3/steady_state/0.096kg/200.csv"].channels
     assert (first["started_at"], first["run_order"], first["elapsed_h"]) == ("2020-07-06 15:29:47", 1.0, 0.0)
     short = traces["raw/driveNo1/steady_state/0.096kg/n2.csv"]  # two header lines fewer
     assert short.line[0] == 12 + 1 + 50
-    assert short.ref.channels["drive"] == "lead screw"
+    assert short.channels["drive"] == "lead screw"

@@ -142,7 +142,7 @@ def test_a_stroke_too_short_says_what_is_needed():
 
 def spikes(time, x, force, **quality):
     found = find_strokes(time, x, force, Strokes())
-    return force_spikes("f.csv", force, found, 2 + np.arange(len(force)), Quality(**quality))
+    return force_spikes(force, found, 2 + np.arange(len(force)), Quality(**quality))
 
 
 @pytest.mark.parametrize("place", [0, 1, 500, 998, 999])
@@ -190,11 +190,11 @@ def test_spikes_name_their_stroke_where_there_are_several():
 def test_a_displacement_that_jumps_away_and_back_is_left_out_and_a_fast_turn_is_not():
     x = trace()[1]
     x[300] += 2.0
-    keep, (fault,) = displacement_spikes("f.csv", x, np.arange(1000), Quality())
+    keep, (fault,) = displacement_spikes(x, np.arange(1000), Quality())
     assert np.flatnonzero(~keep).tolist() == [300]
     assert (fault.column, fault.line) == ("displacement_mm", 300)
     triangle = np.abs(np.arange(1000) - 500) * 0.04
-    assert displacement_spikes("f.csv", triangle, np.arange(1000), Quality())[0].all()
+    assert displacement_spikes(triangle, np.arange(1000), Quality())[0].all()
 
 
 def test_resolution_is_the_smallest_step():

@@ -20,8 +20,8 @@ def rows_left_out(time, x, force):
     line = np.arange(len(x)) + 2
     strokes = find_strokes(time, x, force, Strokes())
     kept = (
-        displacement_spikes("f.csv", x, line, Quality())[0],
-        force_spikes("f.csv", force, strokes, line, Quality())[0],
+        displacement_spikes(x, line, Quality())[0],
+        force_spikes(force, strokes, line, Quality())[0],
     )
     return [np.flatnonzero(~keep).tolist() for keep in kept]
 
@@ -36,7 +36,7 @@ def test_a_sample_far_off_its_neighbours_is_found_with_its_line():
     force[40] += 5.0
     x[60] -= 3.0
     assert rows_left_out(time, x, force) == [[60], [40]]
-    _, (fault,) = displacement_spikes("f.csv", x, np.arange(80) + 2, Quality())
+    _, (fault,) = displacement_spikes(x, np.arange(80) + 2, Quality())
     assert (fault.line, fault.column) == (62, "displacement_mm")
     npt.assert_allclose(float(fault.value), x[60])
 
@@ -47,9 +47,9 @@ def test_the_ends_of_a_motion_that_does_not_rest_are_no_spikes(way):
     steps = np.r_[np.full(900, 0.01), np.full(100, 0.6)]
     displacement = np.cumsum(steps)[::way] * way
     line = np.arange(displacement.size) + 2
-    keep, faults = displacement_spikes("a.csv", displacement, line, Quality())
+    keep, faults = displacement_spikes(displacement, line, Quality())
     assert keep.all()
     assert faults == []
     displacement[-1] += 40.0
-    keep, (fault,) = displacement_spikes("a.csv", displacement, line, Quality())
+    keep, (fault,) = displacement_spikes(displacement, line, Quality())
     assert (np.flatnonzero(~keep).tolist(), fault.line) == ([999], 1001)
