@@ -91,10 +91,9 @@ def _row_faults(check: str, name: str, rows: Trace, wrong: np.ndarray) -> list[F
 
 
 def _out_of_order(time_s: np.ndarray) -> np.ndarray:
-    """Return a mask of the fewest rows whose removal leaves a time that rises from row to row.
+    """Return a mask of the rows outside a longest rising subsequence of the times (patience sorting).
 
-    They are the rows outside a longest rising subsequence (patience sorting), so one wrong time that lies far
-    ahead costs one row and not all that follow.
+    So one wrong time that lies far ahead costs one row and not all that follow.
     """
     if len(time_s) < 2 or (np.diff(time_s) > 0).all():
         return np.zeros(len(time_s), bool)
@@ -152,13 +151,7 @@ def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str
 
 
 def body_of(text: bytes, layout: Layout, settings: TraceFormat) -> bytes:
-    """Return the data lines of a file, without the line ends after the last one.
-
-    Raises
-    ------
-    BadFile
-        If it has none.
-    """
+    """Return the data lines of a file, without line ends after the last one; BadFile if it has none."""
     body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
     if not body.strip(b"\n \t,;"):
         reason = "has a header but no data." if len(layout.names) > 1 else "holds no table of numbers."

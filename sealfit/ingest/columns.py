@@ -195,12 +195,8 @@ def locate(layout: Layout, width: int, settings: TraceFormat) -> dict[int, str]:
     """Return our name for each position (from 0) of a file with `width` columns.
 
     Columns that the config does not list keep the file's name (`column_4` where it has none), or a name
-    beside it where the config gives that name to another column.
-
-    Raises
-    ------
-    BadFile
-        If a column is missing or its name stands twice; the nearest name is suggested.
+    beside it where the config gives that name to another column. BadFile if a column is missing or its name
+    stands twice; the nearest name is suggested.
     """
     found: dict[int, str] = {}
     faults = []

@@ -78,11 +78,7 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
     """Return the columns with the config's constants and computed columns, and faults of the computed ones.
 
     A constant stands where a file has no value. Helpers, columns whose name begins with "_", are left out.
-
-    Raises
-    ------
-    CampaignError
-        If an expression reads a column that is not there, or words as numbers.
+    CampaignError if an expression reads a column that is not there, or words as numbers.
     """
     columns, faults = dict(columns), []
     for name, value in config.runs.constants.items():
@@ -286,18 +282,8 @@ def add_runs(
     """Return the columns with a `run_id` for every file, and what is to be said of it.
 
     Where none is given there is one per condition, commanded speed, load (of several) and (named) specimen.
-
-    Parameters
-    ----------
-    columns : dict of str to list
-        What is known of the files; `speed_mm_s` is signed where a sign was given.
-    conditions : list of str
-        Condition of each file in words.
-    measured : sequence of float
-        Measured speeds, read where no speed is commanded (else nan): files within 5 % share a run. So do
-        strokes there and back of one record, a file each, as the column `stroke` tells them.
-    unit : str
-        Unit of the speeds.
+    Without a commanded speed it is that `measured`, in `unit` (nan where one is commanded): files within 5 %
+    share a run. So do strokes there and back of one record, a file each, as the column `stroke` tells them.
     """
     none = [None] * len(conditions)
     given = columns.get("run_id", none)

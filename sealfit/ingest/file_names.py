@@ -79,12 +79,8 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
 
     Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the
     map has one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty
-    parts say nothing. Numbers in other units than ours are converted, those of parts first.
-
-    Raises
-    ------
-    ConfigError
-        If a template or an expression reads a part that the pattern does not have, or as `found_by`.
+    parts say nothing. Numbers in other units than ours are converted, those of parts first. ConfigError if a
+    template or an expression reads a part that the pattern does not have, or as `found_by`.
 
     Examples
     --------

@@ -49,10 +49,7 @@ def read_marked(campaign: Path, file: str) -> tuple[bytes, Fingerprint]:
 def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
     """Return the file's bytes, or with `head` its first ones.
 
-    Raises
-    ------
-    BadFile
-        If it is missing, outside the campaign, no file, not readable or empty.
+    BadFile if it is missing, outside the campaign, no file, not readable or empty.
     """
     with in_file(file):
         return _read(campaign, file, HEAD_BYTES if head else None)[0]
@@ -201,12 +198,7 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
     """Return the text as UTF-8 bytes without byte-order mark, lines ended by a single line feed.
 
     `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then tries UTF-8, then takes
-    Latin-1.
-
-    Raises
-    ------
-    BadFile
-        If the bytes are not text in that encoding, or begin as files of other formats do.
+    Latin-1. BadFile if the bytes are not text in that encoding, or begin as files of other formats do.
     """
     _refuse_packed(raw)
     automatic = encoding == "auto"
@@ -256,14 +248,9 @@ def refuse_marked_up(text: bytes) -> None:
 
 
 def find_layout(text: bytes, settings: TraceFormat) -> Layout:
-    """Return where the data of a trace file begin.
+    """Return where the data of a trace file begin; ConfigError as `found_by`.
 
-    Raises
-    ------
-    BadFile
-        If no line matches `header_ends_at`, or the header is longer than the file.
-    ConfigError
-        As `found_by`.
+    BadFile if no line matches `header_ends_at`, or the header is shorter than the config says.
     """
     lines = text[:HEAD_BYTES].decode("utf-8", "ignore").split("\n")
     count = _header_lines(lines, settings)
@@ -304,12 +291,7 @@ _compiled = cache(regex.compile)
 def found_by(pattern: str, text: str, *, whole: bool = False, cut: bool = False) -> regex.Match | None:
     """Return the first place in a text where a pattern of the config matches; with `whole`, all of the text.
 
-    With `cut` the text may end before the match does.
-
-    Raises
-    ------
-    ConfigError
-        If that takes longer than `PATTERN_S`.
+    With `cut` the text may end before the match does. ConfigError if that takes longer than `PATTERN_S`.
     """
     match = _compiled(pattern).fullmatch if whole else _compiled(pattern).search
     try:

@@ -62,13 +62,7 @@ def kind_of(file: str, settings: TraceFormat | None = None) -> str:
 
 
 def library(name: str) -> ModuleType:
-    """Return a library that reads files of some kind.
-
-    Raises
-    ------
-    CampaignError
-        If it is not installed.
-    """
+    """Return a library that reads files of some kind; CampaignError if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -118,12 +112,8 @@ class Arrays:
 def read_arrays(raw: bytes, kind: str, settings: TraceFormat, *, head: bool = False) -> Arrays:
     """Return what a file of a kind, one of `OF_ARRAYS`, holds; with `head` its header lines at least.
 
-    Raises
-    ------
-    BadFile
-        If it is damaged, holds no columns or several tables of which none is chosen.
-    CampaignError
-        If the library that reads it is not installed.
+    BadFile if it is damaged, holds no columns or several tables of which none is chosen; CampaignError if the
+    library that reads it is not installed.
     """
     with damage_named(kind):
         found = _READERS[kind](raw, settings, head)
@@ -177,10 +167,7 @@ def _column(values: np.ndarray) -> np.ndarray | None:
 def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceFormat) -> Arrays:
     """Return named columns; those shorter than the longest, or of other things, are left out and named.
 
-    Raises
-    ------
-    BadFile
-        If one of these is a column that the config names.
+    BadFile if one of these is a column that the config names.
     """
     needed, kept, faults = set(settings.their_columns.values()), {}, []
     rows = max((len(values) for values in found.values()), default=0)
@@ -208,8 +195,8 @@ def _chosen(
 ) -> str:
     """Return the one of several tables in a file that the config names, or the only one that fits it.
 
-    `options` are the tables, and the names of their columns; `key` is that of the config, "group" or
-    "variable". The column `derived` need not be in the file.
+    `options` are the tables, and the names of their columns; `key` is "group" or "variable", as in the
+    config. The column `derived` need not be in the file.
     """
     wanted = getattr(settings, key)
     if not options:

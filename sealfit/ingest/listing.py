@@ -55,15 +55,9 @@ class Entry:
 def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, list[Fault]]:
     """Return the trace files of a campaign in order, what runs.csv says of them, and what was found amiss.
 
-    Cells are text, those that say that there is nothing left out; errors stop the run.
-
     The table of runs is read where there is one; otherwise the config's glob finds the files, in natural
-    order (2 before 10).
-
-    Raises
-    ------
-    CampaignError
-        If there is no folder, or neither runs.csv nor a glob, or runs.csv cannot be read as a table.
+    order (2 before 10). CampaignError if there is no folder, or neither runs.csv nor a glob, or runs.csv
+    cannot be read as a table.
     """
     if not campaign.is_dir():
         what = "is not a folder." if campaign.exists() else "does not exist."
@@ -117,12 +111,8 @@ def read_table(
     """Return the line of every row of a table, its cells by our names of the columns, and its faults.
 
     The table is a CSV, Excel or Parquet file. Cells are text, None where they say that there is nothing,
-    except in the column that is needed in every row.
-
-    Raises
-    ------
-    CampaignError
-        If it cannot be read as a table, or the needed column is not there.
+    except in the column that is needed in every row. CampaignError if it cannot be read as a table, or that
+    column is not there.
     """
     try:
         text, delimiter = text_of_runs(folder, table, config)
@@ -240,10 +230,7 @@ def _posix(campaign: Path, file: str) -> str:
 
 
 def _with_whole_paths(campaign: Path, entries: list[Entry], table: str) -> tuple[list[Entry], list[Fault]]:
-    """Return the entries, and notes of those whose file is the only one of that name, below or with a suffix.
-
-    A log often has the name of a test, without folders and suffix.
-    """
+    """Return the entries with folders and suffix where a log gives the name of a file only, and notes."""
     missing = {entry.file for entry in entries if not os.path.exists(campaign / entry.file)}
     named: dict[str, list[str]] = defaultdict(list)
     for path in campaign.rglob("*") if missing else ():

@@ -50,13 +50,8 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
     """Return one trace, with bad rows left out and named.
 
     Its columns are time_s, displacement_mm and force_N (and load_N, where it was measured) as float64, and
-    any further channel as float64 or text.
-
-    Raises
-    ------
-    BadFile
-        If the file must be left out: missing, empty, binary, a column missing, too many bad rows. It carries
-        every fault found, the deciding one last.
+    any further channel as float64 or text. BadFile if the file must be left out: missing, empty, binary, a
+    column missing, too many bad rows. It carries every fault found, the deciding one last.
     """
     return parse_trace(read_bytes(campaign, ref.file), ref, config)
 

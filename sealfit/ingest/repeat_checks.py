@@ -168,14 +168,8 @@ def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     """Return which strokes to keep, shape (n,), and findings on forces constant in the steady window.
 
     Where the other strokes show noise larger than the sensor's steps, the sensor is dead, or at the end of
-    its range if the value is the largest of the stroke. Where they do not, it is coarse (or without noise),
-    and they are kept.
-
-    Parameters
-    ----------
-    strokes : DataFrame
-        One row per stroke: file, stroke, several, equal (share of samples equal to the one before), extreme
-        (whether the window's largest force is the stroke's), force_N, used.
+    its range if the value is the largest of the stroke (`extreme`). Where they do not, it is coarse (or
+    without noise), and they are kept. `equal` is the share of samples equal to the one before.
     """
     used = strokes["used"].to_numpy(bool)
     nothing = np.abs(strokes["force_N"].to_numpy(float)) < NOTHING

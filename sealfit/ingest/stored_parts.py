@@ -113,10 +113,7 @@ _ABOUT = b"part"
 def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None) -> Part:
     """Read a part and store it below `folder`, or keep its tables in memory where there is none.
 
-    Raises
-    ------
-    OutError
-        If the disk is full or refuses.
+    OutError if the disk is full or refuses.
     """
     part = read_part(asked, campaign, config)
     if folder is None:

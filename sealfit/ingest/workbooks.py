@@ -36,14 +36,8 @@ def read_sheet(
 
     `LONGEST` is the one with the most rows. With `head`, `HEAD_ROWS` rows are enough. Numbers are written
     with the mark `decimal`. A merged cell has its value in its first place only; the others are empty.
-
-    Raises
-    ------
-    BadFile
-        If it is no workbook that can be read, has no such sheet, formulas without values, or merged cells
-        that may not be there.
-    CampaignError
-        If openpyxl is not installed.
+    BadFile if it is no workbook that can be read, has no such sheet, formulas without values, or merged cells
+    that may not be there; CampaignError if openpyxl is not installed.
     """
     with _book(raw, formulas=True, by_row=merged) as book:
         title = _title(book, sheet)
@@ -179,14 +173,8 @@ def _refuse_merged(sheet) -> None:
 def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]:
     """Return a table of runs as UTF-8 and the delimiter of its cells, "" where that is to be found out.
 
-    Of a sheet, and of a Parquet file, the names are the first line: rows count from 2.
-
-    Raises
-    ------
-    BadFile
-        If it cannot be read, or is of another format.
-    CampaignError
-        If the library that reads it is not installed.
+    Of a sheet, and of a Parquet file, the names are the first line: rows count from 2. BadFile if it cannot
+    be read, or is of another format; CampaignError if the library that reads it is not installed.
     """
     raw, kind = read_bytes(campaign, file), kind_of(file)
     if kind == "csv":
