@@ -20,7 +20,6 @@ from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, Part, Stroke,
 from sealfit.ingest.quality import improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import (
     constant_strokes,
-    copied_files,
     copied_strokes,
     outlying_files,
     reversed_strokes,
@@ -182,7 +181,6 @@ def ingest_campaign(
     used[files[strokes["used"].to_numpy(bool)]] = True
     for part in parts:
         marks |= part.marks
-    faults = copied_files(faults, {file: mark.sha256 for file, mark in marks.items()})
     inputs, marks = inputs_table(campaign, marks, plan, parts, used, faults)
     tables = {
         "inputs": inputs,

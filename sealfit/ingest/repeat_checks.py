@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -109,8 +106,6 @@ AGAINST = -0.5
 SAMPLES = ["n", "force_N", "force_sd_N", "displacement_from_mm", "displacement_to_mm"]
 # A smaller force was not measured; the square of its square would be 0.
 NOTHING = 1e-24
-_COPY = "{}: a copy is no second measurement."
-_NO_COPY = "Export the right test, or take the file out of the campaign."
 
 
 def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
@@ -218,27 +213,8 @@ def copied_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
 
 
 def _copied(row: pd.Series, what: str) -> Fault:
-    return Fault("copy", _COPY.format(what), **_place(row), fix=_NO_COPY, **STROKE_OUT)
-
-
-def copied_files(faults: Sequence[Fault], hashes: Mapping[str, str | None]) -> list[Fault]:
-    """Return the faults; a file left out for its speed that equals another byte by byte is a copy.
-
-    `hashes` are those of all files that were read.
-    """
-    alike = defaultdict(list)
-    for file, own in hashes.items():
-        alike[own].append(file)
-    made = []
-    for fault in faults:
-        others = ()
-        if fault.check == "speed_disagreement" and fault.action == "file left out":
-            others = [file for file in alike[hashes[fault.file]] if file != fault.file]
-        if others:
-            reason = _COPY.format(f"holds the samples of {others[0]}")
-            fault = replace(fault, check="copy", reason=reason, fix=_NO_COPY, column=None, value=None)
-        made.append(fault)
-    return made
+    fix = "Export the right test, or take the file out of the campaign."
+    return Fault("copy", f"{what}: a copy is no second measurement.", **_place(row), fix=fix, **STROKE_OUT)
 
 
 def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:

@@ -1,5 +1,4 @@
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -162,13 +161,6 @@ def test_repeats_are_averaged_with_the_standard_error_of_the_repeats(campaign):
     assert inside["force_N"].mean() == pytest.approx(30.4, abs=0.02)
     # Levels 0.2 N apart and noise of 0.1 N: SE = sqrt((0.04 + 0.01) / 3).
     assert np.sqrt((inside["force_se_N"] ** 2).mean()) == pytest.approx(np.sqrt(0.05 / 3), rel=0.1)
-
-
-def test_a_copy_of_a_file_of_another_speed_is_called_a_copy(campaign):
-    shutil.copy(campaign / "traces/1_1.csv", campaign / "traces/0_2.csv")
-    (fault,) = ingest_campaign(campaign, Config()).faults
-    assert (fault.file, fault.check, fault.action) == ("traces/0_2.csv", "copy", "file left out")
-    assert fault.reason == "holds the samples of traces/1_1.csv: a copy is no second measurement."
 
 
 def test_files_with_strokes_both_ways_are_two_runs(tmp_path):
