@@ -18,7 +18,6 @@ from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import placed, read_marked
 from sealfit.ingest.quality import (
     beginnings,
-    equal_neighbours,
     load_faults,
     rising_faults,
     speed_column_faults,
@@ -431,7 +430,7 @@ def _means(stroke: Stroke, samples: Mapping[str, np.ndarray]) -> dict[str, objec
         "displacement_from_mm": float(place[0]) if n else np.nan,
         "displacement_to_mm": float(place[-1]) if n else np.nan,
         "left": float(window["presliding_N"][-1]) if n else np.nan,
-        "equal": equal_neighbours(force),
+        "equal": float(np.mean(np.diff(force) == 0.0)) if n > 1 else 0.0,  # to the one before
         "extreme": bool(n and size[stroke.steady].max() >= size.max()),
         **beginnings(samples["force_N"][whole], samples["displacement_mm"][whole]),
     }

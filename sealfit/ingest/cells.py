@@ -232,18 +232,22 @@ def _fast(
 ) -> dict[int, np.ndarray] | None:
     """Return the columns as Arrow reads them; None where a cell, a line or the delimiter is beyond it."""
     table = _arrow(body, settings, numeric)
-    # Blank lines, or line ends inside quotes: the line numbers would be wrong.
-    columns = None if table is None or table.num_rows != rows else _named_columns(table, layout)
+    if table is None or table.num_rows != rows:  # blank lines, or line ends inside quotes
+        return None
+    columns = {i: _column(column) for i, column in enumerate(table.columns)}
+    for i in range(len(layout.names), len(columns)) if layout.names else ():
+        beyond = columns.pop(i)
+        if beyond.dtype.kind != "f" or not np.isnan(beyond).all():
+            return None
     # Empty cells, NaN and inf are to be named as they stand in the file.
-    finite = columns is not None and all(np.isfinite(columns[i]).all() for i in numeric)
-    return columns if finite else None
+    return columns if all(np.isfinite(columns[i]).all() for i in numeric) else None
 
 
 def _arrow(body: bytes, settings: TraceFormat, numeric: Mapping[int, str]) -> pa.Table | None:
     """Return the table that Arrow reads; None where a cell, a line or the delimiter is beyond it."""
     delimiter = settings.delimiter
     if delimiter == "whitespace":
-        body, delimiter = _single_tabs(body), "tab"
+        body, delimiter = re.sub(rb"(?m)^\t|\t$", b"", re.sub(rb"[ \t]+", b"\t", body)), "tab"
     mark = "\t" if delimiter == "tab" else delimiter
     width = width_of(body, delimiter)
     if width <= max(numeric, default=0) or len(mark.encode()) != 1:
@@ -264,25 +268,11 @@ def _arrow(body: bytes, settings: TraceFormat, numeric: Mapping[int, str]) -> pa
         return None
 
 
-def _named_columns(table: pa.Table, layout: Layout) -> dict[int, np.ndarray] | None:
-    """Return the columns by position; None where something stands beyond the last named one."""
-    columns = {i: _column(column) for i, column in enumerate(table.columns)}
-    for i in range(len(layout.names), len(columns)) if layout.names else ():
-        if columns[i].dtype.kind != "f" or not np.isnan(columns[i]).all():
-            return None
-        del columns[i]
-    return columns
-
-
 def _column(column: pa.ChunkedArray) -> np.ndarray:
     if pa.types.is_floating(column.type) or pa.types.is_integer(column.type) or pa.types.is_null(column.type):
         return column.cast(pa.float64(), safe=False).to_numpy()  # a whole number beyond 2**53 is rounded
     cells = column.cast(pa.string()).to_pylist()
     return np.array([(cell or "").strip() or None for cell in cells], dtype=object)
-
-
-def _single_tabs(body: bytes) -> bytes:
-    return re.sub(rb"(?m)^\t|\t$", b"", re.sub(rb"[ \t]+", b"\t", body))
 
 
 def _patient(

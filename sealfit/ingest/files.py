@@ -52,7 +52,7 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
     BadFile if it is missing, outside the campaign, no file, not readable or empty.
     """
     with in_file(file):
-        return _read(campaign, file, HEAD_BYTES if head else None)[0]
+        return _read(campaign, file, HEAD_BYTES if head else -1)[0]
 
 
 def cut_files(campaign: Path, texts: Sequence[str]) -> frozenset[str]:
@@ -87,48 +87,31 @@ def whole_lines(text: bytes) -> tuple[bytes, Fault]:
     return text[:end], Fault("cut_file", reason, line=line, fix=fix, **done)
 
 
-def _read(campaign: Path, file: str, size: int | None = None) -> tuple[bytes, os.stat_result]:
+def _read(campaign: Path, file: str, size: int = -1) -> tuple[bytes, os.stat_result]:
     path = inside(campaign, file)
     if path is None:
         fix = "Copy it into the folder of runs.csv."
         raise bad_file("path_outside", "lies outside the campaign folder.", fix)
     try:
-        # A pipe would be waited for forever, unless it is opened without waiting.
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    except OSError as error:
-        raise _not_opened(path, error) from None
-    try:
-        status = os.fstat(handle)
-        if not stat.S_ISREG(status.st_mode):
+        if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for
             raise bad_file("unreadable_file", "is not a file.", "Check the path.")
-        raw = os.read(handle, status.st_size + 1 if size is None else size)
-        # Short where it is the whole file; a network's file system, or a file above 2 GB, may give it piece
-        # by piece.
-        while size is None and len(raw) != status.st_size and (more := os.read(handle, 1 << 24)):
-            raw += more
+        with path.open("rb") as opened:
+            status, raw = os.fstat(opened.fileno()), opened.read(size)
+    except FileNotFoundError:
+        reason, fix = "does not exist.", did_you_mean(path, Path.is_file)
+        if path.is_symlink():
+            reason = f"is a link to '{path.readlink()}', which does not exist."
+            fix = "Copy the file itself into the campaign."
+        fix = fix or "Paths are relative to the folder of runs.csv."
+        raise bad_file("missing_file", reason, fix) from None
     except OSError as error:
-        raise _not_readable(error) from error
-    finally:
-        os.close(handle)
+        reason = f"cannot be read ({error.strerror})."
+        raise bad_file("unreadable_file", reason, "Check its rights.") from error
     marks = [len(mark) for mark, _ in _BOMS if raw.startswith(mark)]
     if not raw[max(marks, default=0) :].strip(_BLANK):
         fix = "Export it again, or leave it out: of runs.csv, or by files.exclude in the rig config."
         raise bad_file("empty_file", "is empty.", fix)
     return raw, status
-
-
-def _not_opened(path: Path, error: OSError) -> BadFile:
-    if isinstance(error, FileNotFoundError) and path.is_symlink():
-        reason = f"is a link to '{path.readlink()}', which does not exist."
-        return bad_file("missing_file", reason, "Copy the file itself into the campaign.")
-    if isinstance(error, FileNotFoundError):
-        fix = did_you_mean(path, Path.is_file) or "Paths are relative to the folder of runs.csv."
-        return bad_file("missing_file", "does not exist.", fix)
-    return _not_readable(error)
-
-
-def _not_readable(error: OSError) -> BadFile:
-    return bad_file("unreadable_file", f"cannot be read ({error.strerror}).", "Check its rights.")
 
 
 def bad_file(check: str, reason: str, fix: str, **place) -> BadFile:

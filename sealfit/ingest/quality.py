@@ -112,11 +112,6 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault
     return [Fault("gaps", reason, fix=fix, **place, **done)]
 
 
-def equal_neighbours(force_N: np.ndarray) -> float:
-    """Return the share of samples that equal the one before; near 0 if noise exceeds the sensor's steps."""
-    return float(np.mean(np.diff(force_N) == 0.0)) if len(force_N) > 1 else 0.0
-
-
 def beginnings(force_N: np.ndarray, displacement_mm: np.ndarray) -> dict[str, str | None]:
     """Return hashes of the first samples of a stroke, which a copy without its last rows has in common.
 
@@ -295,13 +290,11 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
     fine = [Fault("ok", "nothing found.", file=file, **NOTED) for file in files if file not in told]
     place = {file: i for i, file in enumerate(files)}
     rows = sorted([*faults, *fine], key=lambda one: (place.get(one.file, -1), one.stroke or 0, one.line or 0))
-    cells = [{**fault.as_dict(), "value": _as_text(fault.value)} for fault in rows]
+    cells = [fault.as_dict() for fault in rows]
+    for row in cells:
+        row["value"] = f"{row['value']:.6g}" if isinstance(row["value"], float) else row["value"]
     kinds = {name: "Int64" if name in ("stroke", "line") else "str" for name in QUALITY.names()}
     return pd.DataFrame({name: pd.array([row[name] for row in cells], kind) for name, kind in kinds.items()})
-
-
-def _as_text(value: str | float | None) -> str | None:
-    return None if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 # ---------------------------------------------------------------- incomplete
