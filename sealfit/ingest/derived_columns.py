@@ -80,6 +80,11 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
     A constant stands where a file has no value. Helpers, columns whose name begins with "_", are left out.
     CampaignError if an expression reads a column that is not there, or words as numbers.
     """
+
+    def as_array(column: Column) -> np.ndarray:
+        none = "" if any(isinstance(value, str) for value in column) else math.nan
+        return np.array([none if value is None else value for value in column])
+
     columns, faults = dict(columns), []
     for name, value in config.runs.constants.items():
         columns[name] = over(columns.get(name, [None] * len(entries)), [value] * len(entries))
@@ -88,7 +93,7 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
         read = {column: columns[column] for column in expression.names if column in columns}
         try:
             require_columns(expression, columns)
-            values = evaluate(expression, {column: _as_array(cells) for column, cells in read.items()})
+            values = evaluate(expression, {column: as_array(cells) for column, cells in read.items()})
         except ConfigError as error:
             _refuse_words(entries, error.column, read.get(error.column, ()), name)
             place = {"file": f"config '{config.name}'", "column": f"runs.compute.{name}"}
@@ -116,12 +121,6 @@ def _refuse_words(entries: list[Entry], column: str, cells: Sequence, computed: 
         reason = f"is not a number, and runs.compute.{computed} reads it."
         fault = entries[words[0]].fault("not_a_number", reason, column, value=cells[words[0]])
         raise CampaignError([replace(fault, action="stopped", fix="Correct the cell, or leave it empty.")])
-
-
-def _as_array(column: Column) -> np.ndarray:
-    """Return a column as an expression reads it: numbers with nan, or words with "", for no value."""
-    words = any(isinstance(value, str) for value in column)
-    return np.array([("" if words else math.nan) if value is None else value for value in column])
 
 
 def of_its_kind(name: str, value: float) -> float | str:
@@ -268,12 +267,6 @@ def _one_setting(column: Column) -> Column:
         group.append(value)
         usual.update(dict.fromkeys(group, max(group, key=count.__getitem__)))
     return mapped(column, lambda value: usual.get(value, value))
-
-
-def add_specimens(columns: Columns, conditions: list[str]) -> Columns:
-    """Return the columns with `specimen_id`: one per condition where none is named."""
-    given = columns.get("specimen_id", [None] * len(conditions))
-    return {**columns, "specimen_id": over(given, conditions)}
 
 
 def add_runs(

@@ -127,9 +127,13 @@ def read_table(
         fix = suggestion(needed, header)
         raise stopped("missing_column", NO_COLUMN, fix, file=table, line=1, column=needed)
     lines, columns, found = _rows(text, names, delimiter, table, needed)
+
+    def with_point(cell: str) -> str:
+        return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
+
     # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
     if delimiter != ",":
-        columns = {name: mapped(column, _decimal_point) for name, column in columns.items()}
+        columns = {name: mapped(column, with_point) for name, column in columns.items()}
     for name in columns.keys() - {needed}:
         columns[name] = [None if cell is None or cell.lower() in MISSING else cell for cell in columns[name]]
     return lines, columns, faults + found
@@ -146,10 +150,6 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in split_line(line, delimiter)]
 
 
-def _decimal_point(cell: str) -> str:
-    return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
-
-
 def _rows(
     text: bytes, names: list[str], delimiter: str, table: str, needed: str | None
 ) -> tuple[list[int], Columns, list[Fault]]:
@@ -160,7 +160,8 @@ def _rows(
         cells = _cells(line, delimiter)
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         place = {"file": table, "line": number}
-        if _left_open(line, delimiter):
+        # A cell that begins with a quotation mark which is not closed holds the end of the line.
+        if '"' in line and next(csv.reader([f"{line}\n"], delimiter=delimiter))[-1].endswith("\n"):
             check, reason, fix = "open_quote", "a quotation mark is left open.", "Close or delete it."
         elif any(cells[len(names) :]):
             reason = f"the line has {len(cells)} cells where {len(names)} are named."
@@ -177,11 +178,6 @@ def _rows(
             continue
         faults.append(Fault(check, reason, fix=fix, **place))
     return lines, {name: [row.get(name) for row in rows] for name in names if name}, faults
-
-
-def _left_open(line: str, delimiter: str) -> bool:
-    """Whether a cell begins with a quotation mark that is not closed: it then holds the end of the line."""
-    return '"' in line and next(csv.reader([f"{line}\n"], delimiter=delimiter))[-1].endswith("\n")
 
 
 def _our_names(header: list[str], table: str, config: Config) -> tuple[list[str], list[Fault]]:

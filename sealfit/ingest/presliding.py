@@ -147,8 +147,8 @@ def rise_of(start: Start) -> Rise:
 
 def _rise_or_fall(start: Start) -> Rise:
     """Return the rise of a start, or the fall from the peak that damping makes of it."""
-    if (peak := _early_peak(start)) is not None:
-        turned, peak_mm = _turned(start, peak), float(start.distance_mm[peak])
+    if found := _turned(start):
+        turned, peak_mm = found
         fall = _rise(turned)
         if _by_damping(start, turned, fall):
             left_N, length = _left_over(turned, fall.length_mm)
@@ -158,27 +158,22 @@ def _rise_or_fall(start: Start) -> Rise:
     return _rise(start)
 
 
-def _early_peak(start: Start) -> int | None:
-    """Return the row at which the force peaks in the first half of the stroke, or None.
+def _turned(start: Start) -> tuple[Start, float] | None:
+    """Return the fall from an early peak, turned upside down so that it comes up, and the distance of the peak.
 
-    It is None if the fall from the peak cannot be over soon enough (`_by_damping`), if the force is highest
-    at the end of that half, or if no row lies where its level is read.
+    None if the fall cannot be over soon enough (`_by_damping`), if the force is highest at the end of the
+    first half of the stroke, or if no row lies where its level is read.
     """
-    distance = start.distance_mm
+    distance, force = start.distance_mm, start.force_N
     early, half = (int(distance.searchsorted(share * distance[-1])) for share in EARLY)
     if half < 2 or early == half:
         return None
-    peak = int(start.force_N[:half].argmax())
-    soon = distance[peak] <= start.plateau_mm + SOON * distance[-1]
-    return peak if soon and peak < half - 1 else None
-
-
-def _turned(start: Start, peak: int) -> Start:
-    """Return the fall from a peak, turned upside down: it comes up as a rise does."""
-    distance, force = start.distance_mm, start.force_N
-    early, half = (int(distance.searchsorted(share * distance[-1])) for share in EARLY)
+    peak = int(force[:half].argmax())
+    if peak >= half - 1 or distance[peak] > start.plateau_mm + SOON * distance[-1]:
+        return None
     level = np.median(force[max(early, peak) : half])
-    return Start(distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0))
+    fall = Start(distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0))
+    return fall, float(distance[peak])
 
 
 def _by_damping(start: Start, turned: Start, fall: Rise) -> bool:

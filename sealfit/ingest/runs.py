@@ -33,6 +33,7 @@ from sealfit.ingest.columns import (
     keys_of,
     known,
     mapped,
+    over,
     overlaid,
     put,
     suggestion,
@@ -42,7 +43,6 @@ from sealfit.ingest.columns import (
 from sealfit.ingest.derived_columns import (
     add_repeats,
     add_runs,
-    add_specimens,
     as_set,
     disagreements,
     empty_cells,
@@ -117,8 +117,10 @@ def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[C
     texts = mapped(columns["started_at"], lambda value: str(value).strip())
     read = {text: time_of(text, formats) for text in set(texts) if text is not None}
     times = mapped(texts, read.__getitem__)
+    tried = ", ".join(repr(one) for one in formats)
+    reason = f"fits none of the formats tried: {tried}, ISO 8601." if formats else "is not an ISO 8601 time."
     faults = [
-        entries[i].fault("not_a_time", _reason(formats), "started_at", value=text, fix=_fix(text))
+        entries[i].fault("not_a_time", reason, "started_at", value=text, fix=_fix(text))
         for i, (text, time) in enumerate(zip(texts, times, strict=True))
         if text is not None and time is None
     ]
@@ -136,11 +138,9 @@ def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[C
         return columns, faults
     hours = (moments - moments.min()) / pd.Timedelta(hours=1)
     derived = {"run_order": moments.rank(method="min"), "elapsed_h": hours}
-    return columns | {name: _with_none(values) for name, values in derived.items()}, faults
-
-
-def _with_none(values: pd.Series) -> Column:
-    return [None if math.isnan(value) else value for value in values.tolist()]
+    return columns | {
+        name: values.astype(object).where(values.notna(), None).tolist() for name, values in derived.items()
+    }, faults
 
 
 def time_of(text: str, formats: Sequence[str] = ()) -> datetime | None:
@@ -178,11 +178,6 @@ def usual_formats(texts: Sequence[str]) -> list[str]:
     usual = (date + clock for clock in _CLOCKS for date in _USUAL)
     fits = (repr(one) for one in usual if all(_read(datetime.strptime, text, one) for text in texts))
     return list(islice(fits, 2))
-
-
-def _reason(formats: Sequence[str]) -> str:
-    tried = ", ".join(repr(one) for one in formats)
-    return f"fits none of the formats tried: {tried}, ISO 8601." if formats else "is not an ISO 8601 time."
 
 
 def _fix(text: str) -> str:
@@ -242,7 +237,9 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     conditions = keys_of(of_conditions, len(entries), config)["condition"]
     columns, found = add_runs(columns, conditions, measured, config.units.unit("speed"))
     faults += found
-    columns = add_repeats(add_specimens(columns, conditions))
+    # One specimen per condition where none is named.
+    specimens = over(columns.get("specimen_id", [None] * len(entries)), conditions)
+    columns = add_repeats(columns | {"specimen_id": specimens})
     faults += disagreements(entries, columns, conditions)
     _stop_at_errors(faults, campaign, files)
     cut = cut_files(campaign, [file for file in files if kind_of(file, config.trace) == "csv"])

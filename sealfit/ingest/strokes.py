@@ -139,10 +139,11 @@ def _stroke(motion: _Motion, settings: Strokes, rows: slice, begin: int, origin:
     time_s, displacement_mm, force_N = (values[begin : rows.stop] for values in motion[:3])
     along, noise, tolerance = way * displacement_mm, motion.noise_mm, settings.speed_tolerance
     window = steady_window(time_s, along, way * force_N, max(origin - begin, 0), noise, tolerance)
-    window = window.after(begin - rows.start)
+    before = np.zeros(begin - rows.start)  # it slides there, at another speed
+    steady, sliding = np.r_[before > 0.0, window.steady], np.r_[before == 0.0, window.sliding]
     time_s, displacement_mm = (values[rows] for values in motion[:2])
     along = way * displacement_mm
-    speed = slope(time_s, displacement_mm, window.steady)
+    speed = slope(time_s, displacement_mm, steady)
     return Stroke(
         1,
         rows.start,
@@ -150,11 +151,11 @@ def _stroke(motion: _Motion, settings: Strokes, rows: slice, begin: int, origin:
         origin,
         way,
         speed,
-        window.steady,
-        window.sliding,
-        way * window.left_N,
-        speed_along(time_s, displacement_mm, window, speed, noise),
-        _too_short(along, window.steady, settings),
+        steady,
+        sliding,
+        way * np.r_[before, window.left_N],
+        speed_along(time_s, displacement_mm, steady, window.rise_mm, speed, noise),
+        _too_short(along, steady, settings),
         window.settles,
     )
 

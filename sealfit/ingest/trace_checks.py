@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -27,13 +28,6 @@ APART = 4.0
 # Usual steps by which a spike of displacement is off, at least: see `displacement_spikes`.
 STEPS = 5.0
 FIX = "Correct the cell if the true value is known."
-
-
-def _beyond(force_N: np.ndarray, suspects: np.ndarray) -> np.ndarray:
-    """Return which samples reach beyond their trace without its suspects by half of its range, shape (n,)."""
-    rest = np.where(suspects, 0.0, force_N)  # at rest the force may be zero
-    low, high = min(rest.min(), 0.0), max(rest.max(), 0.0)
-    return np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
 
 
 def displacement_spikes(
@@ -87,7 +81,10 @@ def force_spikes(
     suspects = np.abs(off) > max(settings.spike_sigma * noise, apart)
     if not suspects.any():
         return keep, []
-    spikes = np.flatnonzero(suspects & (steady | _beyond(force_N, suspects)))
+    rest = np.where(suspects, 0.0, force_N)  # at rest the force may be zero
+    low, high = min(rest.min(), 0.0), max(rest.max(), 0.0)
+    beyond = np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
+    spikes = np.flatnonzero(suspects & (steady | beyond))
     count = len(spikes)
     if count > settings.max_bad_rows * len(force_N):
         reason = f"{count} samples jump away from their neighbours: too many to be single wrong samples."
@@ -122,7 +119,10 @@ def motion_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fau
     """Return a fault if nothing moves in a trace, or if its angle begins anew at each turn; else None."""
     place, unit = trace.columns["displacement_mm"], config.units.unit("displacement")
     span, step = np.ptp(place), np.abs(np.diff(place)).max(initial=0.0)
-    turn = _turn(unit) if step > 0.5 * span else None
+    turn = None
+    if step > 0.5 * span:
+        with suppress(ConfigError):  # no angle
+            turn = conversion("turn", unit).of_cell(1.0)
     if turn is not None and span <= turn < 2.0 * step:
         check, reason = "wrapped", "it stays within a turn and jumps from its one end to the other: it wraps."
         fix = f"Set turn = {turn:g} under [strokes]: the angle is then unwrapped, and each turn is a stroke."
@@ -132,14 +132,6 @@ def motion_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fau
         check, reason = "no_motion", f"nothing moves: displacement stays within {span:.3g} {unit}."
         fix = "Check the displacement column and its unit, or set strokes.min_travel_mm in the config."
     return bad_file(check, reason, fix, column="displacement_mm").fault
-
-
-def _turn(unit: str) -> float | None:
-    """Return a turn in the unit of an angle; None in any other unit."""
-    try:
-        return conversion("turn", unit).of_cell(1.0)
-    except ConfigError:
-        return None
 
 
 # ---------------------------------------------------------------- speed check

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -60,16 +60,6 @@ class Window:
     left_N: np.ndarray
     rise_mm: float
     settles: bool = True
-
-    def after(self, rows: int) -> Window:
-        """Return the window of a stroke that has so many rows more before this one, in which it slides."""
-        before = np.zeros(rows, bool)
-        return replace(
-            self,
-            steady=np.r_[before, self.steady],
-            sliding=np.r_[~before, self.sliding],
-            left_N=np.r_[0.0 * before, self.left_N],
-        )
 
 
 def steady_window(
@@ -275,7 +265,12 @@ def _settles(time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, toleranc
 
 
 def speed_along(
-    time_s: np.ndarray, displacement_mm: np.ndarray, window: Window, speed: float, noise_mm: float
+    time_s: np.ndarray,
+    displacement_mm: np.ndarray,
+    steady: np.ndarray,
+    rise_mm: float,
+    speed: float,
+    noise_mm: float,
 ) -> np.ndarray:
     """Return the speed that the friction at every row of a steady window follows, shape (n,).
 
@@ -288,10 +283,10 @@ def speed_along(
     many pieces it has.
     """
     made = np.full(len(time_s), speed)
-    parts = stretches(window.steady)
+    parts = stretches(steady)
     if len(parts) == 1 and abs(speed) > 0.0 and parts[0][1] - parts[0][0] >= SPEED_PIECES[0] * LEAST_ROWS:
         rows = slice(*parts[0])
-        lag_s = window.rise_mm / abs(speed)
+        lag_s = rise_mm / abs(speed)
         made[rows] += _off_speed(time_s[rows], displacement_mm[rows], speed, noise_mm, lag_s)
     return made
 
