@@ -16,7 +16,7 @@ from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.file_names import Listing
-from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, Part, Stroke, plan_parts, shaped
+from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, Part, plan_parts, shaped
 from sealfit.ingest.quality import improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import (
     constant_strokes,
@@ -175,7 +175,7 @@ def ingest_campaign(
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)
     strokes = strokes.assign(used=used)
-    again = read(_asked_again(listings, parts, _ruled_out(listings, strokes)))
+    again = read(_asked_again(listings, parts, strokes))
     parts = [again.get(i, part) for i, part in enumerate(parts)]
     used = np.zeros(len(listing), bool)
     used[files[strokes["used"].to_numpy(bool)]] = True
@@ -237,24 +237,20 @@ def _read(
 
 
 def _asked_again(
-    listings: Sequence[Listing], parts: Sequence[Part], unused: Sequence[frozenset[Stroke]]
+    listings: Sequence[Listing], parts: Sequence[Part], strokes: pd.DataFrame
 ) -> dict[int, Asked]:
     """Return the parts to make again: the whole campaign omits other strokes or has other columns."""
-    columns = common_columns(parts)
-    return {
-        i: Asked(listings[i], out, columns)
-        for i, (part, out) in enumerate(zip(parts, unused, strict=True))
-        if part.unused != out or not agrees(part, columns)
-    }
-
-
-def _ruled_out(listings: Sequence[Listing], strokes: pd.DataFrame) -> list[frozenset[Stroke]]:
-    """Return the strokes of each part that are not used although their own file shows nothing wrong."""
+    # A stroke whose own file shows something wrong is left out by its part anyway.
     gone = strokes[~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)]
     of_file = defaultdict(list)
     for file, stroke in zip(gone["file"], gone["stroke"].tolist(), strict=True):
         of_file[file].append((file, stroke))
-    return [frozenset(stroke for file in own.files for stroke in of_file.get(file, ())) for own in listings]
+    columns, again = common_columns(parts), {}
+    for i, (own, part) in enumerate(zip(listings, parts, strict=True)):
+        out = frozenset(stroke for file in own.files for stroke in of_file.get(file, ()))
+        if part.unused != out or not agrees(part, columns):
+            again[i] = Asked(own, out, columns)
+    return again
 
 
 def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:

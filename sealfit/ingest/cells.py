@@ -127,20 +127,6 @@ _DAY_S = 86400.0
 _NUMBER = re.compile(r"\s*[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?(?=[\s,;])")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ColumnOfFile:
-    """A column of a trace file as messages name it; `line` are the lines of its rows, shape (n,)."""
-
-    name: str
-    line: np.ndarray
-    decimal: str
-
-    def fault(self, row: int, check: str, reason: str, **more) -> Fault:
-        """Return a fault of the cell in a row, which is left out."""
-        line, action = int(self.line[row]), "row left out"
-        return Fault(check, reason, line=line, column=self.name, action=action, **more)
-
-
 def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str) -> list[Fault]:
     """Return a fault for each of the first rows, and one of `check` that counts the rest, `more`."""
     faults, rest = [make(int(row)) for row in rows[:LISTED]], len(rows) - LISTED
@@ -210,7 +196,7 @@ def array_cells(
         if name in must:
             wrong = ~np.isfinite(numbers)
             bad |= wrong
-            faults += cell_faults(ColumnOfFile(name, line, settings.decimal), wrong, values)
+            faults += cell_faults(name, values, wrong, line, settings.decimal)
         plain = name in must or not any(cell is not None for cell in values[np.isnan(numbers)])
         made[name] = numbers if plain else values
     return Trace(made, line, bad, len(line), tuple(faults))
@@ -296,8 +282,7 @@ def _patient(
         columns[i] = numbers_of(cells, settings.decimal) if times is None else times
         wrong = ~np.isfinite(columns[i])
         bad |= wrong
-        column = ColumnOfFile(name, line, settings.decimal)
-        faults += cell_faults(column, wrong, cells, rows)
+        faults += cell_faults(name, cells, wrong, line, settings.decimal, rows)
     beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows], dtype=bool)
     faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width)
     bad |= beyond
@@ -341,21 +326,27 @@ def numbers_of(cells: Iterable[str | None], decimal: str) -> np.ndarray:
 
 
 def cell_faults(
-    column: ColumnOfFile, wrong: np.ndarray, cells: Sequence, rows: Sequence[Sequence[str]] | None = None
+    name: str,
+    cells: Sequence,
+    wrong: np.ndarray,
+    line: np.ndarray,
+    decimal: str,
+    rows: Sequence[Sequence[str]] | None = None,
 ) -> list[Fault]:
     """Return the faults of cells that hold no number; None is one that its line of `rows` does not reach."""
+    place = {"column": name, "action": "row left out"}
 
     def make(i: int) -> Fault:
         cell = cells[i]
         if cell is None and rows is not None:
-            reason = f"the line ends after {len(rows[i])} cells."
-            return column.fault(i, "too_few_cells", reason, fix="Complete or delete the line.")
+            reason, fix = f"the line ends after {len(rows[i])} cells.", "Complete or delete the line."
+            return Fault("too_few_cells", reason, line=int(line[i]), fix=fix, **place)
         cell = "" if pd.isna(cell) else str(cell)  # as text: JSON has no inf
         value = cell.strip()
         check, reason, fix = "not_a_number", "is not a number.", ""
         if not value:
             check, reason, fix = "empty_cell", "the cell is empty.", "Fill it or delete the line."
-        elif as_number(value, column.decimal) is not None:
+        elif as_number(value, decimal) is not None:
             check, reason, fix = "not_finite", "is not a measured number.", "Delete the line."
         elif remark := _remark(cell):
             check, reason = "remark", f"a remark stands beside the number: {remark!r}."
@@ -364,8 +355,8 @@ def cell_faults(
             fix = "If this is a row of units, set units_row = true in the rig config; "
             fix += "otherwise delete the line."
         else:
-            fix = decimal_fix(cell, column.decimal) or "Put a number there or delete the line."
-        return column.fault(i, check, reason, value=value, fix=fix)
+            fix = decimal_fix(cell, decimal) or "Put a number there or delete the line."
+        return Fault(check, reason, line=int(line[i]), value=value, fix=fix, **place)
 
     return listed(np.flatnonzero(wrong), make, "not_a_number", "cells of this column that are not numbers.")
 

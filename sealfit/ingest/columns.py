@@ -10,7 +10,7 @@ import pandas as pd
 
 from sealfit.config import Config, TraceFormat
 from sealfit.errors import KEPT, NOTED, BadFile, Fault, SealfitError, nearest, shortened
-from sealfit.ingest.cells import OVERLOAD, ColumnOfFile, Trace, cell_faults, listed, numbers_of
+from sealfit.ingest.cells import OVERLOAD, Trace, cell_faults, listed, numbers_of
 from sealfit.ingest.expression import parse
 from sealfit.ingest.files import Layout, bad_file, split_line
 from sealfit.tables import BINS, RUNS
@@ -335,7 +335,7 @@ def channel_columns(rows: Trace, config: Config) -> Trace:
             del kept[name]
         elif share:
             drop |= missing
-            faults += cell_faults(ColumnOfFile(name, rows.line, config.trace.decimal), missing, values)
+            faults += cell_faults(name, values, missing, rows.line, config.trace.decimal)
     return replace(rows, columns=kept, bad=rows.bad | drop).with_faults(faults)
 
 

@@ -159,7 +159,7 @@ def _rise_or_fall(start: Start) -> Rise:
 
 
 def _turned(start: Start) -> tuple[Start, float] | None:
-    """Return the fall from an early peak, turned upside down so that it comes up, and the distance of the peak.
+    """Return the fall from an early peak, turned upside down so that it comes up, and the peak's distance.
 
     None if the fall cannot be over soon enough (`_by_damping`), if the force is highest at the end of the
     first half of the stroke, or if no row lies where its level is read.
@@ -231,7 +231,8 @@ def _rise_from_rest(start: Start) -> Rise:
     scale = _scale_mm(start, level)
     if not scale > 0.0:
         return Rise(0.0)
-    slow = _slow(start, level, scale)
+    # A rise that takes so much of the stroke: no law is asked.
+    slow = scale > LONG * float(start.distance_mm[-1]) and float(start.force_N[0]) <= HALF_WAY * level
     length = _rise_length_mm(start, 12.0 * scale, scale * LENGTHS, not slow)
     end = MARGIN * _arrival_mm(start) if slow else _settled_mm(start, level, length)
     if not end > 0.0:
@@ -320,11 +321,6 @@ def _level_N(start: Start) -> float | None:
     level, begin = np.median(plateau), float(force[0])
     below = _below(plateau, begin) or (begin < FAR_BELOW * level and _below(force[slice(*late)], begin))
     return level if level - begin > 0.02 * abs(level) and below else None
-
-
-def _slow(start: Start, level_N: float, scale_mm: float) -> bool:
-    """Return whether the rise takes so much of the stroke that no law is asked."""
-    return scale_mm > LONG * float(start.distance_mm[-1]) and float(start.force_N[0]) <= HALF_WAY * level_N
 
 
 def _settled_mm(start: Start, level_N: float, fitted_mm: float) -> float:

@@ -196,7 +196,10 @@ def _derive(rows: Trace, known: Mapping[str, object], settings: TraceFormat, lay
     """Return the good ones of rows, with computed columns and integrated displacement."""
     speed = settings.integrate_displacement
     compute = {name: parse(text) for name, text in settings.compute.items()}
-    later = _after_integral(compute) if speed else []
+    later: list[str] = []  # computed columns that need the integral, directly or through another one
+    for name, expression in compute.items() if speed else ():
+        if expression.names & {"displacement_mm", *later}:
+            later.append(name)
     rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known)
     if not speed:
         required(rows.columns, layout)
@@ -207,19 +210,12 @@ def _derive(rows: Trace, known: Mapping[str, object], settings: TraceFormat, lay
             fix = "Name it under [trace.columns], or compute it under [trace.compute]."
             raise BadFile(missing_column(name, layout, fix))
     rows = clean(rows, ["time_s", speed, "force_N"])
-    rows = rows.having({"displacement_mm": _integral(rows, speed, settings)})
+    v = rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
+    steps = 0.5 * (v[1:] + v[:-1]) * np.diff(rows.columns["time_s"])
+    rows = rows.having({"displacement_mm": np.cumsum(np.r_[0.0, steps])[: len(v)]})  # by the trapezoid rule
     rows = _computed(rows, {name: compute[name] for name in later}, known)
     required(rows.columns, layout)
     return rows
-
-
-def _after_integral(compute: Mapping[str, Expression]) -> list[str]:
-    """Return the computed columns that need the displacement, directly or through another one."""
-    later: list[str] = []
-    for name, expression in compute.items():
-        if expression.names & {"displacement_mm", *later}:
-            later.append(name)
-    return later
 
 
 def _computed(rows: Trace, compute: Mapping[str, Expression], known: Mapping[str, object]) -> Trace:
@@ -245,13 +241,6 @@ def _evaluate(expression: Expression, values: Mapping[str, object]) -> np.ndarra
         return evaluate(expression, values)
     except ConfigError as error:
         raise bad_file("expression", error.message, error.fix, column=error.column) from error
-
-
-def _integral(rows: Trace, speed: str, settings: TraceFormat) -> np.ndarray:
-    """Return the displacement by the trapezoid rule, starting at 0; a speed per minute is divided by 60."""
-    v = rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
-    steps = 0.5 * (v[1:] + v[:-1]) * np.diff(rows.columns["time_s"])
-    return np.concatenate([[0.0], np.cumsum(steps)]) if len(v) else v
 
 
 def _refuse_too_many(counted: int, rows: Trace, config: Config) -> None:

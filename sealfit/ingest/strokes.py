@@ -335,17 +335,15 @@ def _bounds(smooth_mm: np.ndarray, turns: list[int], near_mm: float, samples: in
 
     A rest at a turn belongs to the stroke before it: a stroke begins with the last row of rest.
     """
-    starts = [_last_at_rest(smooth_mm, here, after, near_mm, samples) for here, after in pairwise(turns)]
+    starts = []
+    for turn, after in pairwise(turns):
+        away = np.abs(smooth_mm[turn : after + 1] - smooth_mm[turn])
+        rest = max(int((away > near_mm).argmax()) - 1, 0)
+        per_row = float(away[-1]) / (after - turn)
+        # That many rows are as near as that to any turn without a rest.
+        starts.append(turn + rest if rest > 3.0 * near_mm / per_row + samples else turn)
     origin = 0 if starts[0] < samples else starts[0]  # noise at the first rows is not a rest
     return [0, *starts[1:], len(smooth_mm)], origin
-
-
-def _last_at_rest(smooth_mm: np.ndarray, turn: int, after: int, near_mm: float, samples: int) -> int:
-    far = np.abs(smooth_mm[turn : after + 1] - smooth_mm[turn]) > near_mm
-    rest = max(int(far.argmax()) - 1, 0)
-    per_row = float(abs(smooth_mm[after] - smooth_mm[turn])) / (after - turn)
-    # That many rows are as near as that to any turn without a rest.
-    return turn + rest if rest > 3.0 * near_mm / per_row + samples else turn
 
 
 def _too_short(along_mm: np.ndarray, steady: np.ndarray, settings: Strokes) -> str | None:

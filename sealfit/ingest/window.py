@@ -173,22 +173,15 @@ def local_speed(
     if wanted > most:
         # Of means of `half` samples each, `half` apart, it is sqrt(2 / half) noise over `half` steps.
         half = int(min(np.ceil((2.0 * wanted) ** (2.0 / 3.0)), most))
-        return _speed_of_means(time_s, along_mm, half), half, True
+        # Near the ends it is that of the nearest row which has so many.
+        place = np.clip(np.arange(n), half, n - half)
+        sums = [np.concatenate(([0.0], np.cumsum(values - values[0]))) for values in (along_mm, time_s)]
+        moved, lasted = (total[place + half] - 2.0 * total[place] + total[place - half] for total in sums)
+        return moved / lasted, half, True
     half = max(int(np.ceil(wanted)), 1)
     rows = np.arange(n)
     low, high = np.maximum(rows - half, 0), np.minimum(rows + half, n - 1)
     return (along_mm[high] - along_mm[low]) / (time_s[high] - time_s[low]), half, False
-
-
-def _speed_of_means(time_s: np.ndarray, along_mm: np.ndarray, half: int) -> np.ndarray:
-    """Return the speed at every row of a stroke from the means of `half` rows before and after it.
-
-    Near the ends it is that of the nearest row which has so many.
-    """
-    sums = [np.concatenate(([0.0], np.cumsum(values - values[0]))) for values in (along_mm, time_s)]
-    place = np.clip(np.arange(len(time_s)), half, len(time_s) - half)
-    moved, lasted = (total[place + half] - 2.0 * total[place] + total[place - half] for total in sums)
-    return moved / lasted
 
 
 def acceleration(
@@ -282,19 +275,11 @@ def speed_along(
     is elsewhere, and where the window is short or has rests. `noise_mm` of a displacement sample decides how
     many pieces it has.
     """
-    made = np.full(len(time_s), speed)
-    parts = stretches(steady)
-    if len(parts) == 1 and abs(speed) > 0.0 and parts[0][1] - parts[0][0] >= SPEED_PIECES[0] * LEAST_ROWS:
-        rows = slice(*parts[0])
-        lag_s = rise_mm / abs(speed)
-        made[rows] += _off_speed(time_s[rows], displacement_mm[rows], speed, noise_mm, lag_s)
-    return made
-
-
-def _off_speed(
-    time_s: np.ndarray, displacement_mm: np.ndarray, speed: float, noise_mm: float, lag_s: float
-) -> np.ndarray:
-    """Return how much the speed `lag_s` before each row of a window differs from the stroke's, shape (n,)."""
+    made, parts = np.full(len(time_s), speed), stretches(steady)
+    if len(parts) != 1 or not abs(speed) > 0.0 or parts[0][1] - parts[0][0] < SPEED_PIECES[0] * LEAST_ROWS:
+        return made
+    window = slice(*parts[0])
+    time_s, displacement_mm = time_s[window], displacement_mm[window]
     n, error = len(time_s), SAME_SPEED * abs(speed)
     # k slopes of n / k samples over 1/k of the time have errors of sqrt(12 k^3 / n) noise over the whole of
     # it.
@@ -314,15 +299,16 @@ def _off_speed(
     variance = (residual**2).mean() * max(alike, 1.0) / square + error**2
     scatter = float(((slope - slope.mean()) ** 2 / variance).sum())
     if chdtrc(pieces - 1, scatter) > CLEAR:
-        return np.zeros(n)
+        return made
     straight = np.polynomial.Polynomial.fit(middle, place.mean(axis=1), 1)
     if np.ptp(place.mean(axis=1) - straight(middle)) < DEPARTURE * np.abs(np.diff(displacement_mm, 2)).max():
-        return np.zeros(n)
+        return made
     off = slope - speed
     # A whole piece further at either end, along a straight line.
     at = np.r_[2.0 * middle[0] - middle[1], middle, 2.0 * middle[-1] - middle[-2]]
     off = np.r_[2.0 * off[0] - off[1], off, 2.0 * off[-1] - off[-2]]
-    return np.interp(time_s - lag_s, at, off)
+    made[window] += np.interp(time_s - rise_mm / abs(speed), at, off)
+    return made
 
 
 @dataclass(frozen=True, slots=True, eq=False)
