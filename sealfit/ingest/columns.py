@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -140,7 +141,8 @@ def keys_of(
     columns: Mapping[str, Sequence[object]], rows: int, config: Config
 ) -> dict[str, list[str | None]]:
     """Return `condition`, `series` and `rubber` of every row, as `add_keys`, from all condition columns."""
-    texts = {name: _spelled(columns[name]) for name in condition_columns(config)}
+    spelled = cache(_spell)
+    texts = {name: [spelled(value) for value in columns[name]] for name in condition_columns(config)}
     words = {name: [t if t is None else f"{name}={t}" for t in own] for name, own in texts.items()}
     condition = _joined(words.values(), rows)
     rubber = _joined([texts[name] for name in config.rubber], rows) if config.rubber else [ONE_RUBBER] * rows
@@ -157,13 +159,10 @@ def keys_of(
     return {"condition": condition, "series": series, "rubber": rubber}
 
 
-def _spelled(values: Sequence[object]) -> list[str | None]:
-    """Return every value as text: numbers with %g, so 60, 60.0 and "60" are one condition; null as None."""
-    texts = {value: None if pd.isna(value) else _spell(value) for value in set(values)}
-    return [texts[value] for value in values]
-
-
 def _spell(value: object) -> str | None:
+    """Return a value as text: numbers with %g, so 60, 60.0 and "60" are one condition; null as None."""
+    if pd.isna(value):
+        return None
     try:
         return f"{float(value):g}"  # type: ignore[arg-type]
     except (TypeError, ValueError):

@@ -121,7 +121,7 @@ def read_table(
         raise stopped(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
     _, head = next(_lines(text), (1, ""))
     delimiter = delimiter or max(",;\t", key=head.count)
-    header = _cells(head, delimiter) if head else []
+    header = [cell.strip() for cell in split_line(head, delimiter)] if head else []
     names, faults = _our_names(header, table, config)
     if needed and needed not in names:
         fix = suggestion(needed, header)
@@ -146,10 +146,6 @@ def _lines(text: bytes) -> Iterator[tuple[int, str]]:
             yield number, line.decode().removesuffix("\n")
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
-    return [cell.strip() for cell in split_line(line, delimiter)]
-
-
 def _rows(
     text: bytes, names: list[str], delimiter: str, table: str, needed: str | None
 ) -> tuple[list[int], Columns, list[Fault]]:
@@ -157,7 +153,7 @@ def _rows(
     lines, rows, faults = [], [], []
     named = max((i for i, name in enumerate(names, start=1) if name), default=0)
     for number, line in islice(_lines(text), 1, None):
-        cells = _cells(line, delimiter)
+        cells = [cell.strip() for cell in split_line(line, delimiter)]
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         place = {"file": table, "line": number}
         # A cell that begins with a quotation mark which is not closed holds the end of the line.

@@ -306,19 +306,15 @@ def _bins(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config
         made["load_N"] = np.where(np.isnan(made["load_N"]), declared, made["load_N"])
     kinds = {column.name: column.dtype for column in BINS.columns}
     left_out = {*INNER, *STEADY_ONLY, "used", *kinds}
-    columns = {name: _typed(known.get(name, [None] * len(binned)), kind) for name, kind in kinds.items()}
-    columns |= {name: _array(values) for name, values in known.items() if name not in left_out}
-    spread = {name: _spread(values, place) for name, values in columns.items() if name not in made}
+    columns = {name: _array(values) for name, values in known.items() if name not in left_out}
+    for name, kind in kinds.items():
+        values = known.get(name, [None] * len(binned))
+        if kind == FLOAT:  # null where a word stands for a number
+            values = [as_number(value) if isinstance(value, str) else value for value in values]
+        columns[name] = _array(values).cast(kind)
+    spread = {  # words as dictionaries
+        name: as_dictionary(values, place) if values.type == TEXT else values.take(pa.array(place))
+        for name, values in columns.items()
+        if name not in made
+    }
     return to_arrow(spread | made, BINS, config.units)
-
-
-def _typed(values: Sequence[object], kind: pa.DataType) -> pa.Array:
-    """Return the values in the type of their column; null where a word stands for a number."""
-    if kind == FLOAT:
-        values = [as_number(value) if isinstance(value, str) else value for value in values]
-    return _array(values).cast(kind)
-
-
-def _spread(values: pa.Array, row: np.ndarray) -> pa.Array:
-    """Return the value of every row, words as dictionaries."""
-    return as_dictionary(values, row) if values.type == TEXT else values.take(pa.array(row))

@@ -67,19 +67,17 @@ def stroke_faults(
         if not stroke.settles:
             reason, fix = f"the speed never settles: {reason}", "Drive at a constant speed."
         return [Fault("too_short", f"{reason}.", value=samples, fix=fix, **STROKE_OUT)]
-    found = [] if stroke.settles else [_unsettled(stroke)]
+    found = []
+    if not stroke.settles:
+        reason = "the speed never settles: where it is highest it still changes by more than the tolerance. "
+        reason += "Its steady force is a mean over these speeds; bins have a speed each."
+        fix = "Drive at a constant speed; lower strokes.speed_tolerance where steps of the speed are smaller."
+        speed = float(stroke.speed_mm_s)
+        found = [Fault("no_plateau", reason, column="speed_mm_s", value=speed, fix=fix, **KEPT)]
     whole, steady = slice(stroke.start, stroke.stop), stroke.rows
     found += _gaps(time_s[whole], line[whole], settings)
     force_N, line = force_N[steady], line[steady]
     return found + (_saturated(force_N, line, settings) or _stuck(force_N, line, settings))
-
-
-def _unsettled(stroke: Stroke) -> Fault:
-    reason = "the speed never settles: where it is highest it still changes by more than the tolerance. "
-    reason += "Its steady force is a mean over these speeds; bins have a speed each."
-    fix = "Drive at a constant speed; lower strokes.speed_tolerance where steps of the speed are smaller."
-    speed = float(stroke.speed_mm_s)
-    return Fault("no_plateau", reason, column="speed_mm_s", value=speed, fix=fix, **KEPT)
 
 
 def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:

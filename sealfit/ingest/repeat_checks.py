@@ -64,7 +64,10 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
         tests = int((kept & (fit.share > ALONE)).sum())
         if fit.scatter.df < 4 or not tests:
             break
-        rows = _furthest(layout, fit, kept)
+        furthest = int(np.argmax(np.where(kept & (fit.share > ALONE), np.abs(fit.t), -1.0)))
+        rows = np.flatnonzero(kept & (layout.run == layout.run[furthest]))
+        if len(rows) != 2:  # with its only peer: which of the two is wrong cannot be known
+            rows = np.array([furthest])
         kept[rows] = False
         apart = fit_scatter(layout, force, kept)
         found.append(_judged(fit, apart, rows, tests, tiny))
@@ -78,13 +81,6 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
         for one in found[:last]
     ]
     return pd.concat([none, *each])
-
-
-def _furthest(layout: Layout, fit: ScatterFit, kept: np.ndarray) -> np.ndarray:
-    """Return the rows to take out next: the most extreme repeat, alone or with its only peer."""
-    row = int(np.argmax(np.where(kept & (fit.share > ALONE), np.abs(fit.t), -1.0)))
-    of_run = np.flatnonzero(kept & (layout.run == layout.run[row]))
-    return of_run if len(of_run) == 2 else np.array([row])
 
 
 def _judged(fit: ScatterFit, apart: ScatterFit, rows: np.ndarray, tests: int, tiny: float) -> _Judged:
@@ -245,6 +241,7 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
     """
     flagged = outlying_repeats(repeat_means(steady), config.quality.outlier_p)
     outlier, dropped, found = np.zeros(len(steady), bool), np.zeros(len(steady), bool), []
+    unit = config.units.unit("force")
     near = np.flatnonzero(steady["file"].isin(flagged["file"]))
     places = steady.iloc[near].groupby(["file", "run_id"], sort=False).indices
     for row in flagged.itertuples(index=False):
@@ -252,18 +249,14 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
         out = config.quality.drop_outliers and not row.alone
         outlier[rows] = True
         dropped[rows] |= out
-        reason = _disagreement(row, config.units.unit("force"))
+        others = "its only other repeat gives" if row.alone else "the other repeats of its run give"
+        reason = (
+            f"repeat {row.repeat} of run {row.run_id} is {row.force_N:.4g} {unit}; "
+            f"{others} {row.run_mean_N:.4g} {unit}, their common pattern removed: "
+            f"{abs(row.t):.1f} SDs of the scatter pooled over runs (p = {row.p:.1g})."
+        )
         fix = "Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out."
         place = {"file": row.file, "column": "force_N", "value": float(row.force_N), "severity": "warning"}
         action = "file left out" if out else "kept"
         found.append(Fault("outlier", reason, action=action, fix=fix, **place))
     return steady.assign(outlier=outlier, used=steady["used"].to_numpy(bool) & ~dropped), found
-
-
-def _disagreement(row, unit: str) -> str:
-    others = "its only other repeat gives" if row.alone else "the other repeats of its run give"
-    return (
-        f"repeat {row.repeat} of run {row.run_id} is {row.force_N:.4g} {unit}; "
-        f"{others} {row.run_mean_N:.4g} {unit}, their common pattern removed: "
-        f"{abs(row.t):.1f} SDs of the scatter pooled over runs (p = {row.p:.1g})."
-    )

@@ -35,7 +35,6 @@ from sealfit.ingest.columns import (
     mapped,
     over,
     overlaid,
-    put,
     suggestion,
     taken,
     where,
@@ -334,7 +333,7 @@ def _from_traces(
     refs = Listing([entry.file for entry in entries], _set_speed(columns), [])
     lacking = _lacking(columns, len(entries), config)
     runs = known(columns.get("run_id", none)) | known(columns.get("speed_mm_s", none))
-    added: dict[str, dict[int, float | str]] = {}
+    whole = {name: list(column) for name, column in columns.items()}
     measured = [math.nan] * len(entries)
     left_out: set[int] = set()
     faults: list[Fault] = []
@@ -356,14 +355,13 @@ def _from_traces(
             if (values == values.iloc[0]).all():
                 value = values.iloc[0]
                 constant = value if isinstance(value, str) else of_its_kind(name, float(value))
-                added.setdefault(name, {})[i] = constant
+                whole.setdefault(name, list(none))[i] = constant
             elif name in wanted:
                 span = f"{values.min()} to {values.max()}"
                 reason = f"varies within the file, {span}; a condition is one value."
                 fix = "Write the value that was set into runs.csv."
                 faults += placed(bad_file("condition_varies", reason, fix, column=name).faults, file)
                 left_out.add(i)
-    whole = {**columns, **{name: put(columns.get(name, none), values) for name, values in added.items()}}
     return whole, measured, left_out, faults
 
 
