@@ -115,11 +115,6 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- cells
-# Data lines to columns of numbers: Arrow's CSV reader, and a patient one for what it cannot read.
-#
-# Both give the same columns and the line number of every row; the patient one also names what stands in the
-# way: text where a number belongs, remarks typed beside a number, lines with too few or too many cells.
-
 OVERLOAD = 1e24  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
 _CLOCK = re.compile(r"(?:.*[\sT])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:\s*([ap])\.?m\.?)?Z?", re.IGNORECASE)
@@ -152,53 +147,67 @@ def width_of(body: bytes, delimiter: str) -> int:
 
 
 def read_cells(
-    body: bytes,
-    layout: Layout,
-    settings: TraceFormat,
-    ours: Mapping[int, str],
-    must: Collection[str],
+    body: bytes, layout: Layout, settings: TraceFormat, ours: Mapping[int, str], must: Collection[str]
 ) -> Trace:
-    """Return the data of a trace file.
+    """Return the data of a text file, whose data lines are `body` (`body_of`); the others as `checked_cells`.
 
-    `body` are its data lines as clean UTF-8 (`body_of`); `ours` are our names of the positions (from 0), and
-    `must` those of them that must hold numbers.
+    Arrow reads the lines if all is as it should be; what it cannot read is split line by line.
     """
     rows = body.count(b"\n") + 1
-    numeric = {i: name for i, name in ours.items() if name in must}
-    line, bad, faults = np.arange(layout.first_line, layout.first_line + rows), np.zeros(rows, bool), []
+    numeric = [i for i, name in ours.items() if name in must]
     columns = _fast(body, rows, layout, settings, numeric)
-    if columns is None:
-        columns, line, bad, faults = _patient(body, layout, settings, numeric)
-    columns = {name: columns[i] for i, name in ours.items() if i in columns}
-    return Trace(columns, line, bad, len(line), tuple(faults))
+    if columns is not None:
+        line = np.arange(layout.first_line, layout.first_line + rows)
+        return checked_cells(columns, line, ours, must, settings.decimal)
+    lines = list(enumerate(body.decode("utf-8", "replace").split("\n"), start=layout.first_line))
+    line = np.array([number for number, text in lines if text.strip()], dtype=np.int64)
+    cells = [
+        split_line(without_strays(text, settings), settings.delimiter) for _, text in lines if text.strip()
+    ]
+    count = np.array([len(row) for row in cells])
+    width = len(layout.names) or count.max(initial=0)
+    columns = {
+        i: np.array([row[i] if i < len(row) else None for row in cells], dtype=object) for i in range(width)
+    }
+    trace = checked_cells(columns, line, ours, must, settings.decimal, count)
+    beyond = np.array([any(cell.strip() for cell in row[width:]) for row in cells], dtype=bool)
+    found = _beyond_faults(np.flatnonzero(beyond & ~trace.bad), cells, line, width)
+    return replace(trace, bad=trace.bad | beyond).with_faults(found)
 
 
-def array_cells(
-    columns: Sequence[np.ndarray],
+def checked_cells(
+    columns: Mapping[int, np.ndarray],
+    line: np.ndarray,
     ours: Mapping[int, str],
     must: Collection[str],
-    settings: TraceFormat,
+    decimal: str,
+    count: np.ndarray | None = None,
 ) -> Trace:
-    """Return the columns of a file that is not text, a row of each sample; their numbers count from 1.
+    """Return columns of cells, by position (from 0), by our names; `must` are those that must hold numbers.
 
-    Times of day, as datetime64, are seconds since the first where a number is needed, and else text in ISO
-    8601. `ours` and `must` as for `read_cells`.
+    A column holds numbers, text as objects, or datetime64: times of day are seconds since the first where a
+    number is needed, and else text in ISO 8601. A row without a needed number is bad, and is named. `count`
+    is the number of cells of each line of a text, in which None stands for a cell beyond its end.
     """
-    line = np.arange(1, len(columns[0]) + 1)
-    bad = np.zeros(len(line), bool)
-    made: dict[str, np.ndarray] = {}
-    faults: list[Fault] = []
+    bad, made, faults = np.zeros(len(line), bool), {}, []
     for i, name in ours.items():
+        if i not in columns:
+            continue
         values = columns[i]
         if values.dtype.kind == "M":
             values = _seconds(values) if name in must else _iso(values)
-        numbers = values if values.dtype.kind == "f" else numbers_of(values, settings.decimal)
         if name in must:
+            numbers = seconds_of_day(values) if name == "time_s" and values.dtype.kind == "O" else None
+            if numbers is None:
+                numbers = values if values.dtype.kind == "f" else numbers_of(values, decimal)
             wrong = ~np.isfinite(numbers)
             bad |= wrong
-            faults += cell_faults(name, values, wrong, line, settings.decimal)
-        plain = name in must or not any(cell is not None for cell in values[np.isnan(numbers)])
-        made[name] = numbers if plain else values
+            faults += cell_faults(name, values, wrong, line, decimal, count)
+            made[name] = numbers
+        elif values.dtype.kind == "O":
+            made[name] = np.array([(cell or "").strip() or None for cell in values], dtype=object)
+        else:
+            made[name] = values
     return Trace(made, line, bad, len(line), tuple(faults))
 
 
@@ -214,7 +223,7 @@ def _iso(times: np.ndarray) -> np.ndarray:
 
 
 def _fast(
-    body: bytes, rows: int, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
+    body: bytes, rows: int, layout: Layout, settings: TraceFormat, numeric: Sequence[int]
 ) -> dict[int, np.ndarray] | None:
     """Return the columns as Arrow reads them; None where a cell, a line or the delimiter is beyond it."""
     table = _arrow(body, settings, numeric)
@@ -229,7 +238,7 @@ def _fast(
     return columns if all(np.isfinite(columns[i]).all() for i in numeric) else None
 
 
-def _arrow(body: bytes, settings: TraceFormat, numeric: Mapping[int, str]) -> pa.Table | None:
+def _arrow(body: bytes, settings: TraceFormat, numeric: Sequence[int]) -> pa.Table | None:
     """Return the table that Arrow reads; None where a cell, a line or the delimiter is beyond it."""
     delimiter = settings.delimiter
     if delimiter == "whitespace":
@@ -259,38 +268,6 @@ def _column(column: pa.ChunkedArray) -> np.ndarray:
         return column.cast(pa.float64(), safe=False).to_numpy()  # a whole number beyond 2**53 is rounded
     cells = column.cast(pa.string()).to_pylist()
     return np.array([(cell or "").strip() or None for cell in cells], dtype=object)
-
-
-def _patient(
-    body: bytes, layout: Layout, settings: TraceFormat, numeric: Mapping[int, str]
-) -> tuple[dict[int, np.ndarray], np.ndarray, np.ndarray, list[Fault]]:
-    """Return columns, lines, bad rows and faults, cell by cell: one for all that is not as it should be."""
-    lines = body.decode("utf-8", "replace").split("\n")
-    rows, number = [], []
-    for i, line in enumerate(lines):
-        if line.strip():
-            rows.append(split_line(without_strays(line, settings), settings.delimiter))
-            number.append(layout.first_line + i)
-    line = np.array(number, dtype=np.int64)
-    width = len(layout.names) or max((len(row) for row in rows), default=0)
-    columns: dict[int, np.ndarray] = {}
-    bad = np.zeros(len(rows), bool)
-    faults: list[Fault] = []
-    for i, name in numeric.items():
-        cells = [row[i] if i < len(row) else None for row in rows]
-        times = seconds_of_day(cells) if name == "time_s" else None
-        columns[i] = numbers_of(cells, settings.decimal) if times is None else times
-        wrong = ~np.isfinite(columns[i])
-        bad |= wrong
-        faults += cell_faults(name, cells, wrong, line, settings.decimal, rows)
-    beyond = np.array([any(cell.strip() for cell in row[width:]) for row in rows], dtype=bool)
-    faults += _beyond_faults(np.flatnonzero(beyond & ~bad), rows, line, width)
-    bad |= beyond
-    for i in set(range(width)) - columns.keys():
-        cells = [(row[i].strip() or None) if i < len(row) else None for row in rows]
-        words = any(cell is not None and as_number(cell, settings.decimal) is None for cell in cells)
-        columns[i] = np.array(cells, dtype=object) if words else numbers_of(cells, settings.decimal)
-    return columns, line, bad, faults
 
 
 def seconds_of_day(cells: Sequence[str | None]) -> np.ndarray | None:
@@ -331,15 +308,15 @@ def cell_faults(
     wrong: np.ndarray,
     line: np.ndarray,
     decimal: str,
-    rows: Sequence[Sequence[str]] | None = None,
+    count: np.ndarray | None = None,
 ) -> list[Fault]:
-    """Return the faults of cells that hold no number; None is one that its line of `rows` does not reach."""
+    """Return the faults of cells that hold no number; `count` as for `checked_cells`."""
     place = {"column": name, "action": "row left out"}
 
     def make(i: int) -> Fault:
         cell = cells[i]
-        if cell is None and rows is not None:
-            reason, fix = f"the line ends after {len(rows[i])} cells.", "Complete or delete the line."
+        if cell is None and count is not None:
+            reason, fix = f"the line ends after {count[i]} cells.", "Complete or delete the line."
             return Fault("too_few_cells", reason, line=int(line[i]), fix=fix, **place)
         cell = "" if pd.isna(cell) else str(cell)  # as text: JSON has no inf
         value = cell.strip()

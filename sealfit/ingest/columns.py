@@ -315,7 +315,7 @@ def channel_columns(rows: Trace, config: Config) -> Trace:
         if values.dtype.kind != "f":
             full = np.array([cell is not None for cell in values])
             numbers = numbers_of(values, config.trace.decimal)
-            if np.isfinite(numbers).sum() <= 0.5 * full.sum():
+            if full.any() and np.isfinite(numbers).sum() <= 0.5 * full.sum():
                 found = _label_faults(name, values, full, rows.line)
                 faults += found
                 if found:

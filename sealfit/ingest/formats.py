@@ -12,6 +12,7 @@ import io
 import re
 import struct
 import warnings
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -267,15 +268,15 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 def _mat(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
     if raw.startswith(_HDF5) or raw[512:520] == _HDF5:  # version 7.3
         with library("h5py").File(io.BytesIO(raw), "r") as opened:
-            variables = _hdf5(opened)
+            variables = dict(_variables(opened))
     else:
         from scipy.io import loadmat
 
         if raw[124:128] in _BYTE_ORDER:
             _refuse_damage(raw, 128, len(raw), _BYTE_ORDER[raw[124:128]])
-        loaded = loadmat(io.BytesIO(raw), simplify_cells=True)
-        variables = {name: value for name, value in loaded.items() if not name.startswith("__")}
-    header = [_header_line(name, value) for name, value in _scalars(variables)]
+        variables = dict(_variables(loadmat(io.BytesIO(raw), simplify_cells=True)))
+    single = str | bool | int | float | np.number
+    header = [_header_line(path, value) for path, value in variables.items() if isinstance(value, single)]
     if head:
         return Arrays(tuple(header))
     tables = _tables(variables)
@@ -328,43 +329,31 @@ def _refuse_damage(raw: bytes, at: int, end: int, order: str) -> list[tuple[int,
     return found
 
 
-def _tables(
-    variables: Mapping[str, object], inside: str = ""
-) -> dict[str, dict[str, np.ndarray] | np.ndarray]:
-    """Return every matrix, and the vectors of every struct and of the file itself, by their names."""
-    found: dict[str, dict[str, np.ndarray] | np.ndarray] = {}
-    arrays = {name: value for name, value in variables.items() if isinstance(value, np.ndarray)}
-    vectors = {name: value for name, value in arrays.items() if value.ndim == 1 and value.size > 1}
-    if any(_column(value) is not None for value in vectors.values()):
-        found[inside or VECTORS] = vectors
-    for name, value in variables.items():
-        path = f"{inside}.{name}" if inside else name
-        if isinstance(value, dict):
-            found |= _tables(value, path)
-        elif name in arrays and value.ndim == 2 and value.size and value.dtype.kind in "fiub":
-            found[path] = value
-    return found
-
-
-def _scalars(variables: Mapping[str, object], inside: str = "") -> Iterator[tuple[str, object]]:
-    """Yield name and value of every number and text, those in structs as `struct.field`."""
-    for name, value in variables.items():
-        if isinstance(value, dict):
-            yield from _scalars(value, f"{inside}{name}.")
-        elif isinstance(value, str | bool | int | float | np.number):
-            yield f"{inside}{name}", value
-
-
-def _hdf5(folder: Mapping) -> dict[str, object]:
-    """Return the variables of a file of version 7.3 as `loadmat` gives those of earlier ones."""
-    found: dict[str, object] = {}
-    for name, item in folder.items():
-        if name.startswith("#"):  # where cells and objects are kept
+def _variables(folder: Mapping, inside: str = "") -> Iterator[tuple[str, object]]:
+    """Yield path and value of every variable, those in structs as `struct.field`, of both versions alike."""
+    for name, value in folder.items():
+        if name.startswith(("#", "__")):  # where cells and objects are kept; what `loadmat` says of the file
             continue
-        value = _hdf5(item) if hasattr(item, "items") else _hdf5_value(item)
-        if value is not None:
-            found[name] = value
-    return found
+        if hasattr(value, "items"):
+            yield from _variables(value, f"{inside}{name}.")
+        else:
+            yield f"{inside}{name}", _hdf5_value(value) if hasattr(value, "attrs") else value
+
+
+def _tables(variables: Mapping[str, object]) -> dict[str, dict[str, np.ndarray] | np.ndarray]:
+    """Return every matrix, and the vectors of every struct and of the file itself, by their names."""
+    vectors: dict[str, dict[str, np.ndarray]] = defaultdict(dict)
+    matrices = {}
+    for path, value in variables.items():
+        struct, _, name = path.rpartition(".")
+        if isinstance(value, np.ndarray) and value.ndim == 1 and value.size > 1:
+            vectors[struct or VECTORS][name] = value
+        elif isinstance(value, np.ndarray) and value.ndim == 2 and value.size and value.dtype.kind in "fiub":
+            matrices[path] = value
+    tables = {
+        name: table for name, table in vectors.items() if any(_column(v) is not None for v in table.values())
+    }
+    return tables | matrices
 
 
 def _hdf5_value(item) -> np.ndarray | float | str | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sealfit.config import MOST, Config, TraceFormat
 from sealfit.errors import KEPT, BadFile, ConfigError, Fault
-from sealfit.ingest.cells import Trace, array_cells, body_of, clean, read_cells, width_of
+from sealfit.ingest.cells import Trace, body_of, checked_cells, clean, read_cells, width_of
 from sealfit.ingest.columns import (
     RESERVED,
     SLOTS,
@@ -69,7 +69,9 @@ def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Trac
     found = read_arrays(raw, kind_of(ref.file, settings), settings)
     layout = Layout(found.header, found.names, None, 0, 1)
     ours = locate(layout, len(found.names) or len(found.columns), settings)
-    rows = array_cells(found.columns, ours, numeric_names(settings), settings)
+    line = np.arange(1, len(found.columns[0]) + 1)  # of a file without lines: the number of the sample
+    columns = dict(enumerate(found.columns))
+    rows = checked_cells(columns, line, ours, numeric_names(settings), settings.decimal)
     return replace(rows, faults=(*found.faults, *rows.faults)), layout
 
 
