@@ -255,10 +255,10 @@ INSTEAD = {
 }
 
 
-def required(table: Mapping[str, object], layout: Layout) -> None:
-    """Raise `BadFile` if, after everything is computed, a slot that every trace needs is not there."""
+def required(table: Mapping[str, object], layout: Layout, names: Sequence[str] = SLOTS[:3]) -> None:
+    """Raise `BadFile` if, after everything is computed, a column that a trace needs is not there."""
     found = []
-    for name in SLOTS[:3]:
+    for name in names:
         if name not in table:
             fix = "Name it under [trace.columns], or compute it under [trace.compute]."
             if other := INSTEAD.get(name):

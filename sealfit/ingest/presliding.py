@@ -386,16 +386,13 @@ def _rise_length_mm(
     0 where the start is not `sloped`; with a `power`, the exponential is that of `_shape`.
     """
     n = _rows_within(start, reach_mm)
-    distance, force = start.distance_mm[:n], start.force_N[:n]
-    force = force - force.mean()
-    shapes = _shape(distance, lengths_mm[:, None], power)
+    beside = _Beside(start.distance_mm[:n], sloped)
+    force = beside.free(start.force_N[:n])
+    shapes = _shape(start.distance_mm[:n], lengths_mm[:, None], power)
     whole = np.einsum("ij,ij->i", shapes, shapes)
     rest = whole - shapes.sum(axis=1) ** 2 / n
     if sloped:
-        x = distance - distance.mean()
-        square = float(x @ x)
-        force = force - float(x @ force) / square * x
-        rest -= (shapes @ x) ** 2 / square
+        rest -= (shapes @ beside.x) ** 2 / float(beside.x @ beside.x)
     # Of two different distances only (a coarse sensor), a straight line explains all that an exponential can.
     explained = np.divide((shapes @ force) ** 2, rest, out=np.zeros(len(rest)), where=rest > 1e-12 * whole)
     return _at_most(lengths_mm, explained)

@@ -18,7 +18,6 @@ from sealfit.ingest.columns import (
     beside,
     channel_columns,
     locate,
-    missing_column,
     numeric_names,
     required,
 )
@@ -207,10 +206,7 @@ def _derive(rows: Trace, known: Mapping[str, object], settings: TraceFormat, lay
         required(rows.columns, layout)
         return clean(rows, SLOTS)
     # The integral needs its time and speed clean first: one bad row would shift every displacement after it.
-    for name in (speed, "time_s"):
-        if name not in rows.columns:
-            fix = "Name it under [trace.columns], or compute it under [trace.compute]."
-            raise BadFile(missing_column(name, layout, fix))
+    required(rows.columns, layout, (speed, "time_s"))
     rows = clean(rows, ["time_s", speed, "force_N"])
     v = rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
     steps = 0.5 * (v[1:] + v[:-1]) * np.diff(rows.columns["time_s"])
