@@ -194,16 +194,15 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
             decoder = codecs.getincrementaldecoder(encoding)()
             text = decoder.decode(raw, final=not head)  # a head may end in the middle of a character
         except UnicodeError as error:
-            if encoding == "utf-8":  # guessed
-                text = raw.decode("latin-1")
-            elif not isinstance(error, UnicodeDecodeError):  # UTF-16 or UTF-32 without its mark
-                reason = f"is not {encoding}: there is no byte-order mark."
-                raise bad_file("wrong_encoding", reason, 'Set encoding = "auto".') from error
-            else:
-                line = raw[: error.start].count(b"\n") + 1
-                reason = f"is not {encoding}: byte {error.start} cannot be read."
+            if encoding != "utf-8":
+                start = getattr(error, "start", 0)  # none is said of UTF-16 without its byte-order mark
+                reason, line = (
+                    f"is not {encoding}: byte {start} cannot be read.",
+                    raw[:start].count(b"\n") + 1,
+                )
                 fix = "Export it again." if automatic else 'Set encoding = "auto".'
                 raise bad_file("wrong_encoding", reason, fix, line=line) from error
+            text = raw.decode("latin-1")  # UTF-8 was guessed
         raw = text.encode("utf-8", "replace").removeprefix(codecs.BOM_UTF8)
     if raw.translate(None, _CONTROL) != raw:
         place = next(i for i, byte in enumerate(raw) if byte in _CONTROL)

@@ -38,7 +38,7 @@ from sealfit.ingest.files import (
     whole_lines,
     without_footer,
 )
-from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays
+from sealfit.ingest.formats import OF_ARRAYS, Arrays, kind_of, read_arrays
 from sealfit.ingest.workbooks import read_sheet
 
 UNFILLED = ("", "Comment")  # last names without cells: a stray separator, and LabVIEW's column of comments
@@ -57,29 +57,52 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
 
 def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the bytes of a file hold; raises as `read_trace`."""
-    read = _read_arrays if kind_of(ref.file, config.trace) in OF_ARRAYS else _read_text
     with in_file(ref.file):
-        trace = _trace(*read(raw, ref, config.trace), ref, config)
+        layout, content, settings = _content(raw, ref.file, config.trace)
+        if isinstance(content, Arrays):
+            rows = _read_arrays(content, layout, settings)
+        else:
+            rows = _read_text(content, layout, settings, ref.cut)
+        trace = _trace(rows, layout, ref, config)
     return replace(trace, faults=placed(trace.faults, ref.file))
 
 
-def _read_arrays(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Trace, Layout]:
-    """Return the rows of a file of arrays, and its layout."""
-    found = read_arrays(raw, kind_of(ref.file, settings), settings)
-    layout = Layout(found.header, found.names, None, 0, 1)
-    ours = locate(layout, len(found.names) or len(found.columns), settings)
+def _content(
+    raw: bytes, file: str, settings: TraceFormat, *, head: bool = False
+) -> tuple[Layout, bytes | Arrays, TraceFormat]:
+    """Return a file's layout, its text as UTF-8 or its arrays, and the settings with its delimiter."""
+    kind = kind_of(file, settings)
+    if kind in OF_ARRAYS:
+        found = read_arrays(raw, kind, settings, head=head)
+        return Layout(found.header, found.names, None, 0, 1), found, settings
+    if kind == "csv":
+        text = as_utf8(raw, settings.encoding, head=head)
+        refuse_marked_up(text)
+    else:
+        text = read_sheet(raw, settings.sheet, decimal=settings.decimal, head=head)
+        settings = settings.model_copy(update={"delimiter": "tab"})
+    return find_layout(text, settings), text, settings
+
+
+def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | str]:
+    """Return what the header lines of a trace file say; raises `BadFile` if it cannot be read."""
+    raw = read_bytes(campaign, file, head=kind_of(file, config.trace) == "csv")
+    return header_fields(_content(raw, file, config.trace, head=True)[0].header, config)
+
+
+def _read_arrays(found: Arrays, layout: Layout, settings: TraceFormat) -> Trace:
+    ours = locate(layout, len(found.columns), settings)
     line = np.arange(1, len(found.columns[0]) + 1)  # of a file without lines: the number of the sample
-    columns = dict(enumerate(found.columns))
-    rows = checked_cells(columns, line, ours, numeric_names(settings), settings.decimal)
-    return replace(rows, faults=(*found.faults, *rows.faults)), layout
+    rows = checked_cells(
+        dict(enumerate(found.columns)), line, ours, numeric_names(settings), settings.decimal
+    )
+    return replace(rows, faults=(*found.faults, *rows.faults))
 
 
-def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Trace, Layout]:
-    """Return of a text file or workbook what `_read_arrays` returns."""
+def _read_text(text: bytes, layout: Layout, settings: TraceFormat, may_be_cut: bool) -> Trace:
     cut = ()
-    text, layout, settings = _text(raw, kind_of(ref.file, settings), settings)
     text = without_footer(text, settings.footer, layout.start)
-    if ref.cut:
+    if may_be_cut:
         text, *cut = whole_lines(text)
     body = body_of(text, layout, settings)
     width = width_of(body, settings.delimiter)
@@ -89,7 +112,7 @@ def _read_text(raw: bytes, ref: TraceRef, settings: TraceFormat) -> tuple[Trace,
     except BadFile as error:
         raise _names_elsewhere(error, layout, body, settings) from None
     rows = read_cells(body, layout, settings, ours, numeric_names(settings))
-    return replace(rows, faults=(*cut, *rows.faults)), layout
+    return replace(rows, faults=(*cut, *rows.faults))
 
 
 def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat) -> None:
@@ -118,30 +141,6 @@ def _names_elsewhere(error: BadFile, layout: Layout, body: bytes, settings: Trac
             reason = "the names of the columns do not stand in this line."
             return BadFile(replace(error.fault, reason=reason, column=None, fix=fix))
     return error
-
-
-def _text(
-    raw: bytes, kind: str, settings: TraceFormat, *, head: bool = False
-) -> tuple[bytes, Layout, TraceFormat]:
-    """Return a text file or workbook sheet as UTF-8, its layout, and the settings with its delimiter."""
-    if kind == "csv":
-        text = as_utf8(raw, settings.encoding, head=head)
-        refuse_marked_up(text)
-    else:
-        text = read_sheet(raw, settings.sheet, decimal=settings.decimal, head=head)
-        settings = settings.model_copy(update={"delimiter": "tab"})
-    return text, find_layout(text, settings), settings
-
-
-def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | str]:
-    """Return what the header lines of a trace file say; raises `BadFile` if it cannot be read."""
-    settings, kind = config.trace, kind_of(file, config.trace)
-    raw = read_bytes(campaign, file, head=kind == "csv")
-    if kind in OF_ARRAYS:
-        header = read_arrays(raw, kind, settings, head=True).header
-    else:
-        header = _text(raw, kind, settings, head=True)[1].header
-    return header_fields(header, config)
 
 
 def _trace(rows: Trace, layout: Layout, ref: TraceRef, config: Config) -> Trace:

@@ -65,10 +65,8 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 def smoothed(values: np.ndarray, samples: int) -> np.ndarray:
     """Return `values` as a running mean of running medians over `samples` samples, shape (n,)."""
-    values = np.asarray(values, float)
-    if samples == 1:
-        return values
-    return uniform_filter1d(median_filter(values, samples, mode="nearest"), samples, mode="nearest")
+    middle = median_filter(np.asarray(values, float), samples, mode="nearest")
+    return uniform_filter1d(middle, samples, mode="nearest")
 
 
 def strong_wave(x: np.ndarray, values: np.ndarray, late: int) -> np.ndarray:

@@ -140,16 +140,12 @@ def _distance(time_s: np.ndarray, along_mm: np.ndarray, ramp_end: int, averaged:
     if not averaged:
         return speed * (time_s - time_s[0])
     line = speed * time
-    line = middle - along_mm[0] + line + _averaged(along - line, averaged)
+    off, place = np.concatenate(([0.0], np.cumsum(along - line))), np.arange(len(line))
+    # Over so many rows to either side, or as many as there are.
+    low, high = np.maximum(place - averaged, 0), np.minimum(place + averaged + 1, len(line))
+    line = middle - along_mm[0] + line + (off[high] - off[low]) / (high - low)
     ramp = np.maximum.accumulate(along_mm[:ramp_end]) - along_mm[0]
     return np.maximum.accumulate(np.r_[np.clip(ramp, 0.0, max(line[0], 0.0)), line])
-
-
-def _averaged(values: np.ndarray, rows: int) -> np.ndarray:
-    """Return the mean over `rows` rows to either side of each, or as many as there are."""
-    sums, place = np.concatenate(([0.0], np.cumsum(values))), np.arange(len(values))
-    low, high = np.maximum(place - rows, 0), np.minimum(place + rows + 1, len(values))
-    return (sums[high] - sums[low]) / (high - low)
 
 
 def local_speed(
