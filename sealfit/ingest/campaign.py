@@ -154,8 +154,8 @@ def ingest_campaign(
         made |= read(asked)
         part.rows, part.of = sum(len(one.refs) for one in asked.values()), "files"
     parts = [made[i] for i in range(len(plan))]
-    order = {file: i for i, file in enumerate(listing.files)}
-    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: order[fault.file])
+    number = {file: i for i, file in enumerate(listing.files)}
+    faults += sorted((fault for part in parts for fault in part.faults), key=lambda fault: number[fault.file])
     files = np.concatenate([np.repeat(rows, part.found) for rows, part in zip(plan, parts, strict=True)])
     order = np.argsort(files, kind="stable")
     strokes = strokes_of([stored_strokes(part, place.folder) for part in parts])
@@ -169,8 +169,8 @@ def ingest_campaign(
         raise CampaignError(turned)
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
-    asked = steady.drop(columns=config.loop.ignore_channels, errors="ignore")
-    faults += incomplete_columns(asked, config.series_columns if config.aging else ())
+    seen = steady.drop(columns=config.loop.ignore_channels, errors="ignore")
+    faults += incomplete_columns(seen, config.series_columns if config.aging else ())
     faults += improbable_loads(steady, config)
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)

@@ -104,19 +104,7 @@ def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
     condition without days ("all" when no other column is left). Rows with aging_days = 0 are "unaged" in both
     ("unaged, <rubber>" where the config names rubber columns), whatever stands in their other condition
     cells. Without days, series and condition are equal. A row with an empty condition cell has null for both,
-    unless it is unaged.
-
-    Parameters
-    ----------
-    table : DataFrame
-        With the config's condition and rubber columns, numbers or text; not changed.
-    config : Config
-        Says which columns they are.
-
-    Raises
-    ------
-    SealfitError
-        If a condition or rubber column is missing.
+    unless it is unaged. SealfitError if one of the config's condition or rubber columns is missing.
 
     Examples
     --------

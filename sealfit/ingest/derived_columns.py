@@ -299,7 +299,8 @@ def add_runs(
             groups[", ".join(words)].append(i)
     stroke = columns.get("stroke", none)
     for words, members in groups.items():
-        settings = _of_one_speed(members, measured)
+        speeds = np.array([measured[i] for i in members])
+        settings = [[members[k] for k in own] for own in of_one_speed(speeds, SAME_SPEED)]
         if _there_and_back([[stroke[i] for i in own] for own in settings]):
             settings = [[i for own in settings for i in own]]
         for own in settings:
@@ -314,15 +315,11 @@ def add_runs(
     return added, [Fault("run_id_derived", reason, fix="Give run_id or speed_mm_s.", **NOTED)]
 
 
-def _of_one_speed(members: Sequence[int], measured: Sequence[float]) -> list[list[int]]:
-    """Return files by speed, slowest first: those within 5 % of the next together."""
-    found: list[list[int]] = []
-    for i in sorted(members, key=lambda i: measured[i]):
-        if found and measured[i] <= measured[found[-1][-1]] * (1 + SAME_SPEED):
-            found[-1].append(i)
-        else:
-            found.append([i])
-    return found
+def of_one_speed(speeds: np.ndarray, tolerance: float) -> list[np.ndarray]:
+    """Return the places of speeds, slowest first: those within a share of the next one together."""
+    order = np.argsort(speeds, kind="stable")
+    ordered = speeds[order]
+    return np.split(order, np.flatnonzero(~(ordered[1:] <= ordered[:-1] * (1.0 + tolerance))) + 1)
 
 
 def _there_and_back(strokes: Sequence[Sequence[int | None]]) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ast
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, reduce
 
@@ -38,6 +38,7 @@ _OPERATORS = {
     ast.UAdd: np.positive,
     ast.And: np.logical_and,
     ast.Or: np.logical_or,
+    ast.Not: np.logical_not,
     ast.Lt: np.less,
     ast.LtE: np.less_equal,
     ast.Gt: np.greater,
@@ -97,8 +98,11 @@ def parse(text: str, *, condition: bool = False) -> Expression:
         reason = getattr(error, "msg", None) or "it is nested too deeply"
         raise ConfigError(f"{text!r} is not an expression: {reason}.", fix=_FIX) from error
     checked = _Checked(text)
-    compute = checked.truth(tree, 0) if condition else checked.number(tree, 0)
-    return Expression(text, frozenset(checked.names), compute)
+    compute = checked.number(tree, 0)
+    if not condition:
+        return Expression(text, frozenset(checked.names), compute)
+    checked.require_conditions([tree])
+    return Expression(text, frozenset(checked.names), lambda values: compute(values) != 0.0)
 
 
 def require_columns(expression: Expression, known: Collection[str]) -> None:
@@ -115,12 +119,7 @@ def evaluate(expression: Expression, values: Values) -> np.ndarray:
 
     Arithmetic is in double precision; what is undefined (0/0, the root of a negative number) gives NaN and
     what is too large gives infinity, without a warning: the rows concerned are reported where cells are
-    checked.
-
-    Raises
-    ------
-    ConfigError
-        If a name is not in `values`, or stands for text where a number is wanted.
+    checked. ConfigError if a name is not in `values`, or stands for text where a number is wanted.
     """
     require_columns(expression, values)
     with np.errstate(all="ignore"):
@@ -138,72 +137,59 @@ class _Checked:
         if depth > MAX_DEPTH:
             raise self.refusal(f"nesting deeper than {MAX_DEPTH}")
         match node:
-            case ast.Constant(value=value) if isinstance(value, int | float) and not isinstance(value, bool):
-                return self.constant(value)
+            case ast.Constant(value=float() as known):
+                return lambda values: np.float64(known)
+            case ast.Constant(value=int() as known) if not isinstance(known, bool) and abs(known) < 2**1023:
+                return lambda values: np.float64(known)  # never a Python int: 9**9**9 is infinity at once
             case ast.Name(id="pi"):
-                return self.constant(np.pi)
+                return lambda values: np.float64(np.pi)
             case ast.Name(id=name) if not name.startswith("__"):
                 self.names.add(name)
                 return lambda values: _as_number(values[name], name, self.text)
-            case ast.UnaryOp(op=op, operand=part) if type(op) in _OPERATORS:
-                inner = self.number(part, depth + 1)
-                return lambda values: _OPERATORS[type(op)](inner(values))
-            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-                one, other = self.number(left, depth + 1), self.number(right, depth + 1)
-                return lambda values: _OPERATORS[type(op)](one(values), other(values))
-            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
-                return self.call(name, arguments, depth)
-            case ast.Compare() | ast.BoolOp() | ast.UnaryOp(op=ast.Not()):
-                inner = self.truth(node, depth + 1)
-                return lambda values: np.asarray(inner(values), dtype=float)
-        raise self.refusal(f"'{ast.unparse(node)}'")
-
-    def truth(self, node: ast.expr, depth: int) -> Computed:
-        """Return what computes a condition."""
-        if depth > MAX_DEPTH:
-            raise self.refusal(f"nesting deeper than {MAX_DEPTH}")
-        match node:
-            case ast.BoolOp(op=op, values=parts):
-                inner = [self.truth(part, depth + 1) for part in parts]
-                return lambda values: reduce(_OPERATORS[type(op)], [part(values) for part in inner])
-            case ast.UnaryOp(op=ast.Not(), operand=part):
-                only = self.truth(part, depth + 1)
-                return lambda values: np.logical_not(only(values))
             case ast.Compare(
                 left=ast.Name(id=name),
                 ops=[ast.Eq() | ast.NotEq() as op],
                 comparators=[ast.Constant(value=str() as label)],
             ) if not name.startswith("__"):
                 self.names.add(name)
-                return lambda values: _OPERATORS[type(op)](np.asarray(values[name]).astype(str), label)
-            case ast.Compare(left=left, ops=ops, comparators=rights) if all(
-                type(op) in _OPERATORS for op in ops
+                compared = _OPERATORS[type(op)]
+                return lambda values: compared(np.asarray(values[name]).astype(str), label).astype(float)
+        function, parts = self.operation(node)
+        inner = [self.number(part, depth + 1) for part in parts]
+        return lambda values: np.asarray(function(*(part(values) for part in inner)), float)
+
+    def operation(self, node: ast.expr) -> tuple[Callable, list[ast.expr]]:
+        """Return the function that a node computes, and its arguments."""
+        match node:
+            case ast.UnaryOp(op=op, operand=part) if type(op) in _OPERATORS:
+                if isinstance(op, ast.Not):
+                    self.require_conditions([part])
+                return _OPERATORS[type(op)], [part]
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+                return _OPERATORS[type(op)], [left, right]
+            case ast.BoolOp(op=op, values=parts):
+                self.require_conditions(parts)
+                return lambda *values: reduce(_OPERATORS[type(op)], values), parts
+            case ast.Compare(left=left, ops=ops, comparators=sides) if all(
+                type(o) in _OPERATORS for o in ops
             ):
-                sides = [self.number(part, depth + 1) for part in (left, *rights)]
-                return lambda values: _compared(ops, [side(values) for side in sides])
-            case ast.Compare():
-                raise self.refusal(f"'{ast.unparse(node)}'")
-        self.number(node, depth + 1)  # refuses with its own words what is not even a number
-        reason = f"in \"{self.text}\": '{ast.unparse(node)}' compares nothing."
-        raise ConfigError(reason, fix="Write for example load_N > 4.9.")
+                return lambda *values: _compared(ops, values), [left, *sides]
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
+                function, fewest, most = FUNCTIONS[name]
+                if not fewest <= len(arguments) <= most:
+                    wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
+                    reason = f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.'
+                    raise ConfigError(reason, fix=_FIX)
+                return function, arguments
+        raise self.refusal(f"'{ast.unparse(node)}'")
 
-    def call(self, name: str, arguments: list[ast.expr], depth: int) -> Computed:
-        """Return what computes a call of a function."""
-        function, fewest, most = FUNCTIONS[name]
-        if not fewest <= len(arguments) <= most:
-            wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
-            reason = f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.'
-            raise ConfigError(reason, fix=_FIX)
-        inner = [self.number(part, depth + 1) for part in arguments]
-        return lambda values: function(*(part(values) for part in inner))
-
-    def constant(self, value: float) -> Computed:
-        """Return what gives a constant: never a Python int, so that 9**9**9 is infinity at once."""
-        try:
-            known = np.float64(value)
-        except OverflowError as error:
-            raise self.refusal("so large a number") from error
-        return lambda values: known
+    def require_conditions(self, nodes: Sequence[ast.expr]) -> None:
+        """Raise ConfigError for a number where a condition is wanted."""
+        for node in nodes:
+            negated = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)
+            if not (negated or isinstance(node, ast.Compare | ast.BoolOp)):
+                reason = f"in \"{self.text}\": '{ast.unparse(node)}' compares nothing."
+                raise ConfigError(reason, fix="Write for example load_N > 4.9.")
 
     def refusal(self, piece: str) -> ConfigError:
         """Return the error that names what is not allowed."""
@@ -218,6 +204,6 @@ def _as_number(value: object, name: str, text: str) -> np.ndarray:
     return array.astype(float, copy=False)
 
 
-def _compared(ops: list[ast.cmpop], sides: list[np.ndarray]) -> np.ndarray:
+def _compared(ops: Sequence[ast.cmpop], sides: Sequence[np.ndarray]) -> np.ndarray:
     tests = [_OPERATORS[type(op)](a, b) for op, a, b in zip(ops, sides, sides[1:], strict=False)]
     return reduce(np.logical_and, tests)

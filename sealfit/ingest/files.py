@@ -325,10 +325,9 @@ def _guess(raw: bytes) -> str:
     """Return "utf-16-le" or "-be" if every other byte is zero, as in UTF-16 of Latin text; else "utf-8"."""
     sample = raw[:4096]
     half = len(sample) // 2
-    if half > 1 and sample[1::2].count(0) > 0.8 * half and sample[::2].count(0) < 0.1 * half:
-        return "utf-16-le"
-    if half > 1 and sample[::2].count(0) > 0.8 * half and sample[1::2].count(0) < 0.1 * half:
-        return "utf-16-be"
+    zeros = sample[::2].count(0), sample[1::2].count(0)
+    if half > 1 and max(zeros) > 0.8 * half and min(zeros) < 0.1 * half:
+        return "utf-16-le" if zeros[1] > zeros[0] else "utf-16-be"
     return "utf-8"
 
 

@@ -17,6 +17,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.averages import ALONG, FileStrokes, bin_table, mean_traces, read_strokes
 from sealfit.ingest.columns import columns_of, condition_columns, keys_of
+from sealfit.ingest.derived_columns import of_one_speed
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.files import as_number
 from sealfit.store import parquet
@@ -217,8 +218,7 @@ def _at_speeds(strokes: Mapping[str, list], tolerance: float) -> dict[str, list]
     several, known = np.array(strokes["several_speeds"], bool), np.array(strokes["used"], bool)
     for run in dict.fromkeys(names[several]):
         own = np.flatnonzero((names == run) & known)
-        own = own[np.argsort(speed[own])]
-        for part in np.split(own, np.flatnonzero(np.diff(np.log(speed[own])) > np.log1p(tolerance)) + 1):
+        for part in (own[places] for places in of_one_speed(speed[own], tolerance)):
             for i in part:
                 commanded[i] = float(f"{np.median(speed[part]):.3g}")
                 names[i] = f"{run} at {commanded[i]:g}"

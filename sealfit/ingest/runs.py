@@ -194,11 +194,8 @@ def _fix(text: str) -> str:
 def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     """Return every trace file of a campaign with its channels, and what was found that does not stop the run.
 
-    Raises
-    ------
-    CampaignError
-        With every fault of the campaign at once: a missing folder or column, a path outside, cells that are
-        no numbers, doubled files or repeats, repeats that differ from their run.
+    CampaignError has every fault of the campaign at once: a missing folder or column, a path outside, cells
+    that are no numbers, doubled files or repeats, repeats that differ from their run.
     """
     entries, cells, faults = list_entries(campaign, config)
     if any(fault.check in ("path_outside", "missing_file") for fault in faults):

@@ -125,15 +125,9 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
             (file := f"{of}{PARQUET}/{name}"): _written(folder / file, table, parquet.write_arrow)
             for of, table in part.tables.items()
         }
-        about = {
-            "unused": sorted(asked.unused),
-            "wanted": asked.columns,
-            "columns": part.columns,
-            "rows": part.rows,
-            "found": part.found,
-            "faults": [fault.as_dict() for fault in part.faults],
-            "stored": stored,
-        }
+        about = {name: getattr(part, name) for name in ("wanted", "columns", "rows", "found")}
+        faults = [fault.as_dict() for fault in part.faults]
+        about |= {"unused": sorted(part.unused), "faults": faults, "stored": stored}
         metadata = {**(part.strokes.schema.metadata or {}), _ABOUT: json.dumps(about)}
         file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
         strokes = part.strokes.replace_schema_metadata(metadata)
