@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
@@ -32,7 +31,7 @@ KNOWN = (
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
 PASSED_OVER = {"severity": "info", "action": "file left out"}
 FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
-_BLANK = b" \t,;\n"  # a line of nothing else is none
+_BLANK = " \t,;"  # a line of nothing else is none
 
 # Ending of the files that LabVIEW writes beside its traces.
 INDEX = ".tdms_index"
@@ -119,14 +118,16 @@ def read_table(
     except BadFile as error:
         place = {"file": table, "line": error.fault.line, "column": error.fault.column}
         raise stopped(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
-    _, head = next(_lines(text), (1, ""))
+    whole = text.decode().split("\n")
+    numbered = [(number, line) for number, line in enumerate(whole, start=1) if line.strip(_BLANK)]
+    head = numbered[0][1] if numbered else ""
     delimiter = delimiter or max(",;\t", key=head.count)
     header = [cell.strip() for cell in split_line(head, delimiter)] if head else []
     names, faults = _our_names(header, table, config)
     if needed and needed not in names:
         fix = suggestion(needed, header)
         raise stopped("missing_column", NO_COLUMN, fix, file=table, line=1, column=needed)
-    lines, columns, found = _rows(text, names, delimiter, table, needed)
+    lines, columns, found = _rows(numbered[1:], names, delimiter, table, needed)
 
     def with_point(cell: str) -> str:
         return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
@@ -139,20 +140,13 @@ def read_table(
     return lines, columns, faults + found
 
 
-def _lines(text: bytes) -> Iterator[tuple[int, str]]:
-    """Yield number and text of every line that is not blank."""
-    for number, line in enumerate(io.BytesIO(text), start=1):
-        if line.strip(_BLANK):
-            yield number, line.decode().removesuffix("\n")
-
-
 def _rows(
-    text: bytes, names: list[str], delimiter: str, table: str, needed: str | None
+    numbered: list[tuple[int, str]], names: list[str], delimiter: str, table: str, needed: str | None
 ) -> tuple[list[int], Columns, list[Fault]]:
     """Return the line of every row, the columns that have a name, and the faults of lines left out."""
     lines, rows, faults = [], [], []
     named = max((i for i, name in enumerate(names, start=1) if name), default=0)
-    for number, line in islice(_lines(text), 1, None):
+    for number, line in numbered:
         cells = [cell.strip() for cell in split_line(line, delimiter)]
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         place = {"file": table, "line": number}

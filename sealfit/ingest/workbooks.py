@@ -42,8 +42,9 @@ def read_sheet(
     with _book(raw, formulas=True, by_row=merged) as book:
         title = _title(book, sheet)
         lines, formulas = _lines(book[title], decimal, head)
-        if not merged:
-            _refuse_merged(book[title])
+        if not merged and (ranges := sorted(book[title].merged_cells.ranges, key=lambda one: one.min_row)):
+            fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
+            raise bad_file("merged_cells", f"the cells {ranges[0]} are merged.", fix, line=ranges[0].min_row)
     if formulas:
         with _book(raw, formulas=False) as book:
             lines, _ = _lines(book[title], decimal, head, formulas)
@@ -157,14 +158,6 @@ def _cell(value: object, decimal: str) -> str:
     if isinstance(value, int | float | timedelta):
         return text.replace(".", decimal)
     return '"' + text.replace('"', '""') + '"' if '"' in text else text
-
-
-def _refuse_merged(sheet) -> None:
-    """Raise `BadFile` if cells are merged."""
-    if merged := sorted(sheet.merged_cells.ranges, key=lambda cells: cells.min_row):
-        fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
-        reason = f"the cells {merged[0]} are merged."
-        raise bad_file("merged_cells", reason, fix, line=merged[0].min_row)
 
 
 # ---------------------------------------------------------------- tables of runs
