@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from matplotlib.figure import Figure
 
@@ -14,6 +15,11 @@ from sealfit.report.page import answered
 from sealfit.report.style import compose
 from sealfit.store import Store
 
+FIGURES = (
+    "finding", "before_after", "effect_shapes", "refused", "residual_channels", "variance_levels",
+    "force_speed", "aging", "master_curve", "starts", "traces_mean",
+)  # fmt: skip
+
 
 class ShownFigure(Figure):
     """A figure that a notebook shows as it is, without pyplot; its axes are there to be changed."""
@@ -23,7 +29,18 @@ class ShownFigure(Figure):
 
 
 class Plots:
-    """The report's figures by name: each method returns a matplotlib Figure in the report's look.
+    """The report's figures in its look: `results.plot.aging()` returns a matplotlib Figure.
+
+    - finding: the residual along the variable of the largest effect, and the errors, before and after
+    - before_after: the errors with the noise floor, and the distribution of the run means' errors
+    - effect_shapes: every effect along its channels, with its 95 % band
+    - refused: the residual along the variables of effects that were significant, but not accepted
+    - residual_channels, variance_levels: the residual along every channel, and its variance at every level
+    - force_speed: force against speed of every condition, the model and the run means
+    - aging: the coefficients over aging time, a panel per series, the law with its band
+    - master_curve: all series over aging time at one temperature, with the law for them all
+    - starts: the mean force over the distance slid from rest, and the model's
+    - traces_mean: some of the averaged traces
 
     Raises
     ------
@@ -36,49 +53,13 @@ class Plots:
     def __init__(self, answered: Callable[[], Store]):
         self._answered = answered  # gives the store if its answer is current, else raises
 
-    def finding(self) -> Figure:
-        """Return the residual along the variable of the largest effect, and the errors, before and after."""
-        return self._drawn("finding")
+    def __dir__(self) -> tuple[str, ...]:
+        return FIGURES
 
-    def before_after(self) -> Figure:
-        """Return the errors before and after with the noise floor, and the spread of run means' errors."""
-        return self._drawn("before_after")
-
-    def effect_shapes(self) -> Figure:
-        """Return the shape of every effect along its channels, with its 95 % band."""
-        return self._drawn("effect_shapes")
-
-    def refused(self) -> Figure:
-        """Return the residual along the variables of effects that were significant, but not accepted."""
-        return self._drawn("refused")
-
-    def residual_channels(self) -> Figure:
-        """Return the mean residual along every channel, before and after."""
-        return self._drawn("residual_channels")
-
-    def variance_levels(self) -> Figure:
-        """Return the variance of the residual at every level, before and after."""
-        return self._drawn("variance_levels")
-
-    def force_speed(self) -> Figure:
-        """Return force against speed of every condition: the model and the run means."""
-        return self._drawn("force_speed")
-
-    def aging(self) -> Figure:
-        """Return the coefficients over aging time, a panel per series: law with band, and each condition."""
-        return self._drawn("aging")
-
-    def master_curve(self) -> Figure:
-        """Return the values of all series over aging time at one temperature, with the law for them all."""
-        return self._drawn("master_curve")
-
-    def starts(self) -> Figure:
-        """Return how strokes begin: the mean force over the distance slid, and the model's."""
-        return self._drawn("starts")
-
-    def traces_mean(self) -> Figure:
-        """Return some of the averaged traces, spread over conditions and speeds."""
-        return self._drawn("traces_mean")
+    def __getattr__(self, name: str) -> Callable[[], Figure]:
+        if name not in FIGURES:
+            raise AttributeError(f"there is no figure '{name}'; there are {', '.join(FIGURES)}")
+        return partial(self._drawn, name)
 
     def _drawn(self, name: str) -> Figure:
         store = self._answered()

@@ -2,7 +2,6 @@
 
 import builtins
 import doctest
-import inspect
 import re
 import shutil
 import subprocess
@@ -19,15 +18,12 @@ import sealfit
 from sealfit import commands
 from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.errors import OutError, RequestError, StaleError
-from sealfit.notebook.plots import Plots
+from sealfit.notebook.plots import FIGURES
 from sealfit.report.summary_lines import lifetime_lines
 from sealfit.store import Store
 
 TUTORIAL = DOCS / "tutorial.ipynb"
 CONDITION = "temperature_C=60, compression_ratio_pct=80, aging_days=4"
-FIGURES = sorted(
-    name for name, _ in inspect.getmembers(Plots, inspect.isfunction) if not name.startswith("_")
-)
 KEYS = {
     "errors": ["error"],
     "effects": ["effect"],
