@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
-from sealfit.report import words
+from sealfit.report import notation, words
 from sealfit.report.drawing import Drawn, draw, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
@@ -27,11 +27,10 @@ from sealfit.report.notation import (
     channel_label,
     count,
     given,
-    symbol_html,
     true_units,
 )
 from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
-from sealfit.report.style import WIDTH, Plot
+from sealfit.report.style import WIDTH
 from sealfit.report.summary import by_gain, of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
 from sealfit.tables import FITTED, SCHEMAS
@@ -149,24 +148,35 @@ def build_report(
     panels.
     """
     tables, closure = answered(tables, closure)
-    content = _of_properties(tables) if closure is None else _of_loop(tables, closure, config)
-    content |= _of_fits(tables, config) | {"provenance": provenance_facts(provenance, config)}
+    opening = _of_properties(tables) if closure is None else _of_loop(tables, closure, config)
     plots = draw_all(tables, closure, config)
     with timed("plots", rows=len(plots), of="plots"):
         figures = {name: draw(plot) for name, plot in plots.items()}
-    images = {name: _images(plot, figures[name]) for name, plot in plots.items()}
+    images = {
+        name: list(zip(plot.panels, map(_source, figures[name].panels), strict=True))
+        for name, plot in plots.items()
+    }
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
-    vocabulary = words.vocabulary(closure, tables["shapes"], config)
     html = TEMPLATES.get_template("template.html").render(
-        style=Markup(_text("style.css")), script=Markup(_text("report.js")), plots=images, runs=Markup(runs),
-        script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(), **vocabulary, **content
+        style=Markup(_text("style.css")), script=Markup(_text("report.js")), runs=Markup(runs),
+        script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(),
+        plots=plots, images_of=images, css=CSS, width=WIDTH, most_channels=MOST_CHANNELS,
+        tables=tables, closure=closure, config=config, units=config.units,
+        unit=config.units.unit("force"), force=config.units.quantity("force"),
+        condition_key=ConditionNames.of(config).key, provenance=provenance_facts(provenance, config),
+        **opening, **_of_fits(tables, config),
     )  # fmt: skip
     return Report(html, figures)
 
 
+def _source(svg: str) -> str:
+    """Return a drawing as the source of an image."""
+    return "data:image/svg+xml;base64," + b64encode(svg.encode()).decode()
+
+
 def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
-    """Return what the page says of properties in place of the campaign and the loop."""
+    """Return the head of the page of properties."""
     properties = of_properties(tables["property_values"], tables["aging_fit"], tables["aging_laws"])
     known = [p for one in properties if (p := one["lack_of_fit_p"]) is not None]
     fits = not known or min(known) >= LACKING
@@ -218,32 +228,17 @@ def with_after_fits(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFram
 
 
 def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> dict:
-    """Return what the page says of the campaign and its loop."""
-    findings, findings_in_all = quality_findings(tables["quality"], config)
-    break_aways, break_aways_in_all = break_away_rows(tables["dynamic_fit"], config)
+    """Return the head of the page, and the effects at whose reference state the fits are."""
     added = [effect for effect in closure["effects"] if not effect["candidate"]]
     return {
         "of_properties": False,
-        "closure": closure,
         "badge": capital(closure["verdict"].replace("_", " ")),
         "tone": closure["verdict"],
         "fit": fit_badge(closure),
         "verdict": words.verdict(closure, tables["shapes"], config),
         "undecided": words.undecided(closure, config),
         "facts": campaign_facts(tables, config),
-        "errors": words.error_rows(closure, config),
-        "effects": by_gain(closure["effects"]),
-        "left": words.left_over(closure, config),
-        "tests": words.channel_tests(tables["levels"], tables["channels"]["channel"].dropna(), config),
-        "more_channels": max(0, tables["channels"]["channel"].nunique() - MOST_CHANNELS),
         "references": added if "steady_fit_before" in tables else [],
-        "break_aways": break_aways,
-        "break_aways_in_all": break_aways_in_all,
-        "speed_unit": config.units.unit("speed"),
-        "force": config.units.quantity("force"),
-        "counts": quality_counts(tables["quality"]),
-        "findings": findings,
-        "findings_in_all": findings_in_all,
     }
 
 
@@ -258,12 +253,7 @@ def _of_fits(tables: Mapping[str, pd.DataFrame], config: Config) -> dict:
         fitted += parameter_tables(fit, key, config, tables.get(f"{name}_before"))
     return {
         "parameter_tables": sorted(fitted, key=lambda table: table.single),  # goodness of fit comes last
-        "aging_fitted": len(tables["aging_fit"]) > 0,
-        "aging": config.aging,
         "laws": law_rows(tables["aging_laws"], tables.get("aging_laws_before")),
-        "condition_key": ConditionNames.of(config).key,
-        "sensor": config.sensor,
-        "unit": config.units.unit("force"),
     }
 
 
@@ -281,24 +271,11 @@ def fit_badge(closure: Mapping) -> tuple[str, str]:
     return quality["state"], badges[quality["state"]]
 
 
-def _images(plot: Plot, drawn: Drawn) -> dict:
-    """Return a plot for the template: every panel a separate image."""
-    panels = [
-        {
-            "src": "data:image/svg+xml;base64," + b64encode(svg.encode()).decode(),
-            "alt": panel.alt,
-            "effect": panel.effect,
-            "width": round(CSS * WIDTH),
-            "height": round(CSS * panel.height),
-        }
-        for panel, svg in zip(plot.panels, drawn.panels, strict=True)
-    ]
-    legend = [
-        {"label": symbol_html(key.label) if key.symbol else key.label, "colour": key.colour, "mark": key.mark}
-        for key in plot.legend
-    ]
-    return {"title": plot.title, "panels": panels, "legend": legend, "note": plot.note}
-
-
 def _text(name: str) -> str:
     return files("sealfit.report").joinpath(name).read_text("utf-8")
+
+
+# The template writes values, those of closure.json above all, by functions.
+WRITERS = (quality_counts, quality_findings, break_away_rows, by_gain)
+TEMPLATES.globals |= {function.__name__: function for function in WRITERS}
+TEMPLATES.globals |= {name: own for module in (notation, words) for name, own in vars(module).items()}

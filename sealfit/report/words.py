@@ -6,8 +6,7 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -23,7 +22,6 @@ from sealfit.report.notation import (
     capital,
     channel_label,
     channel_words,
-    count,
     effect_label,
     given,
     joined,
@@ -270,7 +268,7 @@ def _where(left: Mapping, config: Config) -> str:
     names, level = left["channels"], left["level"]
     text = "the residual varies"
     if names:
-        text += f" with {joined([channel_label(name, config.units) for name in names])}"
+        text += f" with {channel_labels(names, config)}"
     if level:
         text += f" {level_words(level)}"
     if not known(left["p_value"]):
@@ -297,23 +295,6 @@ def _sentences(*clauses: str | Markup) -> Markup:
 
 
 # ---------------------------------------------------------------- tables
-
-
-def vocabulary(closure: Mapping | None, shapes: pd.DataFrame, config: Config) -> dict[str, Callable]:
-    """Return the functions by which the template writes values, those of closure.json above all."""
-    plain = (
-        capital, count, given, known, level_words, number, of_unit, p_value, parameter_cells, sized,
-        with_symbols,
-    )  # fmt: skip
-    of_units = (channel_label, effect_label)
-    of_config = (acts, channel_labels, given_as, rivals_of, target_html, wanted)
-    return {
-        **{function.__name__: function for function in plain},
-        **{function.__name__: partial(function, units=config.units) for function in of_units},
-        **{function.__name__: partial(function, config=config) for function in of_config},
-        "curve_of": partial(curve_of, shapes=shapes, closure=closure, config=config),
-        "in_words": partial(in_words, closure=closure, config=config),
-    }
 
 
 def error_rows(closure: Mapping, config: Config) -> list[dict]:
@@ -366,18 +347,6 @@ def given_as(effect: Mapping, config: Config) -> str | Markup:
     if effect["acts_on"] == "force":
         return f"added {config.units.quantity('force')}"
     return Markup("added to {}").format(symbol_html(effect["acts_on"]))
-
-
-def parameter_cells(p: Mapping, effect: Mapping) -> dict:
-    """Return the cells of a parameter of an effect."""
-    value, interval = measured(p["value"], *p["ci95"])
-    return {
-        "symbol": symbol_html(p["name"]),
-        "meaning": meaning(effect["id"], p["name"]),
-        "value": value,
-        "interval": interval,
-        "unit": p["unit"] or "",
-    }
 
 
 def curve_of(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Config) -> dict | None:
