@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import pandas as pd
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from sealfit.config import Config
 from sealfit.report.notation import (
@@ -128,23 +128,21 @@ class ParameterTable:
 def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
     """Return the break-away forces above the sliding force, as rows for the page, and their number."""
     names, found = ConditionNames.of(config), []
-    keys = ("condition", "speed_set_mm_s", "direction")
-    groups: dict[tuple, dict[str, dict]] = {}
-    for row in _records(dynamic_fit[dynamic_fit["quantity"] == "break_away"], *keys):
-        groups.setdefault(tuple(row[name] for name in keys), {})[row["parameter"]] = row
-    ratios = [(by["F_ba/F"], by["F_ba"]) for by in groups.values()]
-    above = [(ratio, force) for ratio, force in ratios if ratio["identified"] and not ratio["reason"]]
-    for ratio, broken in spread(above, MOST_BREAK_AWAYS):
-        force, interval = measured(*(broken[name] for name in ENDS))
-        percents = (None if ratio[name] is None else 100.0 * (ratio[name] - 1.0) for name in ENDS)
-        share, share_interval = measured(*percents)
+    rows = dynamic_fit[dynamic_fit["quantity"] == "break_away"]
+    ratios, forces = (rows[rows["parameter"] == parameter] for parameter in ("F_ba/F", "F_ba"))
+    ratios = ratios[ratios["identified"].astype(bool) & (ratios["reason"].fillna("") == "")]
+    keys = ["condition", "speed_set_mm_s", "direction"]
+    above = ratios.merge(forces[[*keys, *ENDS]], on=keys, suffixes=("", "_N")).to_dict("records")
+    for row in spread(above, MOST_BREAK_AWAYS):
+        force, force_interval = measured(*(row[f"{name}_N"] for name in ENDS))
+        share, share_interval = measured(*(100.0 * (row[name] - 1.0) for name in ENDS))
         found.append(
             {
-                "condition": names(ratio["condition"]),
-                "speed": given(ratio["speed_set_mm_s"]),
-                "direction": "forward" if ratio["direction"] > 0 else "backward",
+                "condition": names(row["condition"]),
+                "speed": given(row["speed_set_mm_s"]),
+                "direction": "forward" if row["direction"] > 0 else "backward",
                 "force": force,
-                "force_interval": interval,
+                "force_interval": force_interval,
                 "share": share,
                 "share_interval": share_interval,
             }
@@ -163,20 +161,19 @@ def parameter_tables(
     """
     if fit.empty:
         return []
-    names = ConditionNames.of(config)
     of_quantity = {
         quantity: tuple(dict.fromkeys(zip(rows["parameter"], rows["unit"].fillna(""), strict=True)))
         for quantity, rows in fit.groupby("quantity", sort=False)
     }
-    fit, note = _readable(fit, key, names)
+    fit, note = _readable(fit, key, ConditionNames.of(config))
     tables = []
     for parameters in dict.fromkeys(of_quantity.values()):
         quantities = [quantity for quantity, own in of_quantity.items() if own == parameters]
         rows = fit[fit["quantity"].isin(quantities)]
         if quantities == ["statistics"]:
-            tables.append(_statistics(rows, key, names, config))
+            tables.append(_statistics(rows, key, config))
         else:
-            tables.append(_table(rows, key, parameters, config, before))
+            tables.append(_parameters(rows, key, parameters, config, before))
     return [replace(table, note=note) for table in tables]
 
 
@@ -192,7 +189,7 @@ def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.Da
     return fit[fit[key].isin(spread(every, MOST_ROWS))], f"{note}{stored}.parquet has all."
 
 
-def _table(
+def _parameters(
     fit: pd.DataFrame,
     key: str,
     parameters: Sequence[tuple[str, str]],
@@ -201,19 +198,22 @@ def _table(
 ) -> ParameterTable:
     names, quantities = ConditionNames.of(config), list(dict.fromkeys(fit["quantity"]))
     compared = before is not None
-    records = _records(before, key, "quantity") if compared else ()
+    records = _records(before, key) if compared else ()
     earlier = {(row[key], row["quantity"], row["parameter"]): row for row in records}
     several = len(quantities) > 1 or key == "series"
     found = []
-    for (name, quantity), by in _rows_of(fit, key, "quantity", names):
+    for name, quantity, by in _rows_of(fit, key, names):
         cells = tuple(_cell(by.get(p), earlier.get((name, quantity, p[0]))) for p in parameters)
-        keys = (names(name), symbol_html(quantity)) if several else (names(name),)
-        found.append((keys, cells, _note(by, config)))
-    heads = (key, "quantity") if several else (key,)
+        found.append((_heads(names(name), symbol_html(quantity), several), cells, _note(by, config)))
     groups = tuple((symbol_html(p), u) for p, u in parameters)
     title = _title(key, quantities, after=compared)
     rows, remarks = _said_once(found)
+    heads = _heads(key, "quantity", several)
     return ParameterTable(title, heads, groups, rows, compared=compared, remarks=remarks)
+
+
+def _heads(first: str, second: str | Markup, several: bool) -> tuple[str | Markup, ...]:
+    return (first, second) if several else (first,)
 
 
 def _said_once(rows: Sequence[tuple]) -> tuple[tuple[tuple, ...], tuple[Markup, ...]]:
@@ -239,40 +239,34 @@ def _range(numbers: Sequence[str]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _statistics(fit: pd.DataFrame, key: str, names: ConditionNames, config: Config) -> ParameterTable:
-    split = fit["parameter"].str.rpartition(":")  # "mu_s:lack_of_fit_p" is about mu_s alone
-    fit = fit.assign(of=split[0], parameter=split[2])
-    several = fit["of"].ne("").any()
-    present = set(zip(fit["parameter"], fit["unit"].fillna(""), strict=True))
-    shown = [(name, unit) for name in STATISTICS for found, unit in sorted(present) if found == name]
-    shown = shown or sorted(present)
+def _statistics(fit: pd.DataFrame, key: str, config: Config) -> ParameterTable:
+    names, parts = ConditionNames.of(config), fit["parameter"].str.rpartition(":")
+    fit = fit.assign(quantity=parts[0], parameter=parts[2])  # "mu_s:lack_of_fit_p" is about mu_s alone
+    several = fit["quantity"].ne("").any()
+    present = sorted(set(zip(fit["parameter"], fit["unit"].fillna(""), strict=True)))
+    shown = [p for name in STATISTICS for p in present if p[0] == name] or present
     found = []
-    for (name, of), by in _rows_of(fit, key, "of", names):
+    for name, quantity, by in _rows_of(fit, key, names):
         cells = tuple(Cell(_statistic(by[p]) if p in by else NOTHING) for p in shown)
         lack = {p: row for p, row in by.items() if p[0] == "lack_of_fit_p"}
-        keys = (names(name), symbol_html(of)) if several else (names(name),)
+        keys = _heads(names(name), symbol_html(quantity), several)
         found.append((keys, cells, _note(lack, config, named=False)))
-    words = {p: STATISTICS.get(p, p.removesuffix("_N").replace("_", " ")) for p, _ in shown}
-    groups = tuple((escape(words[p]), u) for p, u in shown)
+    groups = tuple((STATISTICS.get(p, p.removesuffix("_N").replace("_", " ")), u) for p, u in shown)
     title = f"Goodness of fit{' of the aging law' if key == 'series' else ''}, per {key}"
-    heads = (key, "quantity") if several else (key,)
-    return ParameterTable(title, heads, groups, tuple(found), single=True)
+    return ParameterTable(title, _heads(key, "quantity", several), groups, tuple(found), single=True)
 
 
-def _rows_of(
-    fit: pd.DataFrame, key: str, second: str, names: ConditionNames
-) -> list[tuple[tuple[str, str], Rows]]:
-    """Return ((key, second), rows by parameter and unit): unaged first, then by temperature, ..., days."""
+def _rows_of(fit: pd.DataFrame, key: str, names: ConditionNames) -> list[tuple[str, str, Rows]]:
+    """Return (name, quantity, rows by parameter and unit): unaged first, then by temperature, ..., days."""
     found: dict[tuple[str, str], Rows] = {}
-    for row in _records(fit, key, second):
-        found.setdefault((row[key], row[second]), {})[row["parameter"], row["unit"] or ""] = row
-    places = {name: names.place(name) for name, _ in found}
-    return sorted(found.items(), key=lambda entry: places[entry[0][0]])
+    for row in _records(fit, key):
+        found.setdefault((row[key], row["quantity"]), {})[row["parameter"], row["unit"] or ""] = row
+    return sorted(((*keys, by) for keys, by in found.items()), key=lambda entry: names.place(entry[0]))
 
 
-def _records(rows: pd.DataFrame, *keys: str) -> list[dict]:
+def _records(rows: pd.DataFrame, key: str) -> list[dict]:
     """Return rows as dictionaries, with None for missing values."""
-    columns = [*keys, "parameter", "unit", *ENDS, "u_sys", "identified", "reason"]
+    columns = [key, "quantity", "parameter", "unit", *ENDS, "u_sys", "identified", "reason"]
     plain = rows[columns].astype(object)
     return plain.where(plain.notna(), None).to_dict("records")
 
