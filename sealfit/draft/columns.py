@@ -226,6 +226,11 @@ class Roles:
     signed_files: int = 0
     strength: float = 0.0  # how well the force follows, of the best file that moves both ways
 
+    def dimension(self, role: str) -> str:
+        """Return what the unit of a role's column measures; "" where there is no column or no unit."""
+        column = getattr(self, role)
+        return column.unit.dimension if column is not None and column.unit is not None else ""
+
 
 def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
     """Return the columns that hold numbers.

@@ -7,7 +7,6 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from sealfit.draft.columns import Column
 from sealfit.draft.dialect import When
 from sealfit.draft.vocabulary import Unit
 from sealfit.units import Units
@@ -63,31 +62,12 @@ class Notes:
 
 
 # ---------------------------------------------------------------- lines for a column
-# The one place where a unit or a sign that is not the default, or a date that is not ISO 8601, becomes config
-# lines.
+# The one place where a unit that is not the default, or a date that is not ISO 8601, becomes config lines.
 
 
 def file_column(name: str | int, unit: Unit | None, ours: str) -> Value:
     """Return a column of a file as a config writes it: with its unit where that is not the unit of `ours`."""
     return name if unit is None or unit.name == Units().of(ours) else {"name": name, "unit": unit.name}
-
-
-def column_guesses(
-    slot: str, column: Column, unit: Unit | None, sign: int, evidence: str
-) -> tuple[list[Guess], str]:
-    """Return the config lines that bring a column into a slot, and the helper column they need, "" for none.
-
-    `slot` is `time_s`, `displacement_mm`, `force_N` or `load_N`; `unit` None is that of the slot. With `sign`
-    -1 the column is read under a helper's name and computed.
-    """
-    value = file_column(column.key, unit, slot)
-    if sign > 0:
-        return [Guess(f"trace.columns.{slot}", value, evidence)], ""
-    quantity, _, ours = slot.partition("_")
-    helper = f"{quantity}_raw_{ours}"
-    why = "with the sign of the motion" if slot == "force_N" else "as a load that presses counts above 0"
-    read = Guess(f"trace.columns.{helper}", value, evidence)
-    return [read, Guess(f"trace.compute.{slot}", f"-{helper}", why)], helper
 
 
 def date_lines(when: When) -> list[str]:

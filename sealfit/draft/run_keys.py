@@ -162,13 +162,19 @@ def _unaged_apart(names: Names, found: Found) -> Names:
     return replace(names, templates={**names.templates, "specimen_id": template})
 
 
-def with_rotation(names: Names, roles: Roles) -> Names:
-    """Return the names with their rpm as the speed where traces hold an angle or a rotational speed."""
-    own = roles.displacement or roles.speed
-    rotates = own is not None and own.unit is not None and own.unit.dimension in ("angle", "rotation")
-    part = next((part for part in names.parts if part.ours == "speed_rpm"), None)
-    taken = part is None or "speed_mm_s" in names.given
-    return names.changed(part, ours="speed_mm_s") if rotates and not taken else names
+def suited_to(names: Names, roles: Roles) -> Names:
+    """Return the names as the columns of traces ask for it.
+
+    Where these hold an angle or a rotational speed, rpm in names are the speed. Where they hold a torque, the
+    one load in names is matched only: their ratio is no friction coefficient.
+    """
+    ours = {part.ours: part for part in names.parts}
+    rotates = roles.dimension("speed" if roles.displacement is None else "displacement")
+    if rotates in ("angle", "rotation") and "speed_rpm" in ours and "speed_mm_s" not in names.given:
+        names = names.changed(ours["speed_rpm"], ours="speed_mm_s")
+    if roles.dimension("force") not in ("", "force") and "load_N" in ours and len(ours["load_N"].texts) == 1:
+        names = names.without(ours["load_N"])
+    return names
 
 
 # ---------------------------------------------------------------- keys
@@ -404,11 +410,3 @@ def _origin(name: str, names: Names, table: RunsTable | None) -> str:
     if table is not None and name in table.given:
         return table.file
     return "the names of files" if name in names.given else "the header"
-
-
-def needs_no_load(names: Names, roles: Roles) -> Names:
-    """Return the names without the one load of a torque: their ratio is no friction coefficient."""
-    if roles.force is None or roles.force.unit is None or roles.force.unit.dimension == "force":
-        return names
-    load = next((part for part in names.parts if part.ours == "load_N"), None)
-    return names if load is None or len(load.texts) > 1 else names.without(load)

@@ -18,7 +18,7 @@ from sealfit.draft.columns import (
     several_speeds,
     stroke_count,
 )
-from sealfit.draft.config_text import Notes, column_guesses, date_lines, file_column
+from sealfit.draft.config_text import Notes, date_lines, file_column
 from sealfit.draft.dialect import RATE, STRAYS, rate_in, settings_in, started_in
 from sealfit.draft.files_found import Found
 from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
@@ -28,16 +28,13 @@ from sealfit.ingest.formats import kind_of
 from sealfit.ingest.workbooks import rows_of_sheets
 from sealfit.units import Units, conversion
 
+# A trace without a time unit is not taken to last longer than an hour at a sample per second or slower.
 LONG_S = 3600.0
-"""A trace without a time unit is not taken to last longer than an hour at a sample per second or slower."""
-
-BAD_ROWS = 2
-"""Rows with a missing value that may stand above the first whole row of data."""
-
-AS_LONG = 0.5
-"""Share of the rows of a workbook's longest sheet above which another may be a recording, too."""
+BAD_ROWS = 2  # with a missing value, that may stand above the first whole row of data
+AS_LONG = 0.5  # share of the rows of a workbook's longest sheet above which another may be a recording
 
 SLOTS = {"time": "time_s", "displacement": "displacement_mm", "force": "force_N", "load": "load_N"}
+NEGATED = {"force": "with the sign of the motion", "load": "as a load that presses counts above 0"}
 CHANNELS = ("temperature", "humidity", "pressure")
 
 
@@ -170,24 +167,28 @@ def column_keys(
         column = getattr(roles, role)
         if column is None:
             continue
-        sign = roles.sign if role == "force" else 1
-        if role == "load" and np.mean([np.mean(values) for values in column.values]) < 0:
-            sign = -1
-        evidence = _evidence(column, role, roles, read)
-        guesses, helper = column_guesses(slot, column, units.get(role), sign, evidence)
-        notes.guesses += guesses
-        helpers += [helper] if helper else []
-        _column_doubts(column, role, guesses[0].key, roles, notes)
+        negated = role == "force" and roles.sign < 0
+        negated |= role == "load" and np.mean([np.mean(values) for values in column.values]) < 0
+        name = slot.replace("_", "_raw_") if negated else slot
+        value = file_column(column.key, units.get(role), slot)
+        notes.guess(f"trace.columns.{name}", value, _evidence(column, role, roles, read))
+        if negated:
+            why = (
+                "with the sign of the motion" if role == "force" else "as a load that presses counts above 0"
+            )
+            notes.guess(f"trace.compute.{slot}", f"-{name}", why)
+            helpers.append(name)
+        _column_doubts(column, role, f"trace.columns.{name}", roles, notes)
     if roles.displacement is None and roles.speed is not None:
-        helpers += _integrated(roles.speed, notes)
+        helpers.append(_integrated(roles.speed, notes))
     clock = _clock_or_rate(found, notes) if roles.time is None else None
     _missing_slots(roles, clock is not None, notes)
-    if roles.force is not None and roles.force.unit is not None:
-        unit, words = roles.force.unit, plain(roles.force.label)
-        if unit.dimension == "torque" or "torque" in words or "moment" in words:
-            torque = {"quantity": "torque", "unit": unit.name}
-            notes.guess("quantities.force", torque, f"{roles.force.place} is a torque")
-    if _turns(roles):
+    if roles.dimension("force") == "torque" or (
+        roles.dimension("force") and re.search("torque|moment", plain(roles.force.label))
+    ):
+        torque = {"quantity": "torque", "unit": roles.force.unit.name}
+        notes.guess("quantities.force", torque, f"{roles.force.place} is a torque")
+    if roles.dimension("displacement") == "angle":
         _rotation(roles.displacement.unit, f"{roles.displacement.place} is an angle", notes)
     if helpers:
         evidence = "read for the columns computed below, no channels of their own"
@@ -229,7 +230,7 @@ def _column_doubts(column: Column, role: str, key: str, roles: Roles, notes: Not
         notes.doubt(key, reason, "It looks like a magnitude: export the force with its sign.")
 
 
-def _integrated(speed: Column, notes: Notes) -> list[str]:
+def _integrated(speed: Column, notes: Notes) -> str:
     """Add what makes a displacement of a speed; return the helper column."""
     rotation = speed.unit is not None and speed.unit.dimension == "rotation"
     helper = "speed_rpm" if rotation else "speed_column_mm_s"
@@ -241,13 +242,7 @@ def _integrated(speed: Column, notes: Notes) -> list[str]:
         notes.guess("trace.integrate_per", "min", "rpm")
         _rotation(UNITS["turn"], f"from {speed.place}", notes)
         notes.guess("position_origin", "file", "an integral begins anew in every file")
-    return [helper]
-
-
-def _turns(roles: Roles) -> bool:
-    """Whether the displacement is an angle."""
-    own = roles.displacement
-    return own is not None and own.unit is not None and own.unit.dimension == "angle"
+    return helper
 
 
 def _rotation(angle: Unit, source: str, notes: Notes) -> None:
@@ -421,7 +416,7 @@ def motion_keys(
         reason = f"strokes in one direction have several speeds, {_shown_speeds(others, files)}."
         fix = "The strokes of a file in one direction are one run: write each speed into a file of its own."
         notes.doubt("strokes", reason, fix)
-    if _turns(roles):  # these speeds are not in mm/s
+    if roles.dimension("displacement") == "angle":  # these speeds are not in mm/s
         return {}
     one_speed = {file: found for file, found in speeds.items() if found and file not in several}
     signs = {file: -1 if max(found) < 0 else 1 for file, found in one_speed.items()}
