@@ -110,7 +110,7 @@ class Names:
 
     def without(self, part: Part) -> Names:
         """Return the names without what one of the parts says: it is matched only."""
-        return self.changed(part, ours="", doubt="")
+        return self.changed(part, ours="", unit="", doubt="")
 
 
 def tokens(name: str) -> list[Token]:
@@ -192,26 +192,25 @@ def settings_of(names: Names) -> Files:
             values[part.group] = {text: float(sign) for text, sign in (part.signs or signs).items()}
         elif part.expression:
             compute[part.ours] = part.expression.format(part.group)
-    columns = _date_template(pattern) | _specimen_template(names.parts) | dict(names.templates)
+    columns = _templates(names, pattern)
     units = {part.ours: part.unit for part in names.parts if part.unit}
     return Files(name_pattern=pattern, values=values, compute=compute, columns=columns, units=units)
 
 
-def _date_template(pattern: str) -> dict[str, str]:
-    if "_year" not in pattern:
-        return {}
-    text = "{_year}-{_month}-{_day}"
-    if "_hour" in pattern:
-        text += "T{_hour}:{_minute}" + (":{_second}" if "_second" in pattern else ":00")
-    return {"started_at": text}
+def _templates(names: Names, pattern: str) -> dict[str, str]:
+    """Return the columns that are put together from parts: the date, and the specimen.
 
-
-def _specimen_template(parts: Sequence[Part]) -> dict[str, str]:
-    """Return the template of specimen_id: numbers that start again in every condition name pieces of each."""
-    if not any(part.ours == "specimen_id" for part in parts):
-        return {}
-    settings = [part.group for part in parts if part.ours in ("rubber", *AGING_CONDITION)]
-    return {"specimen_id": " ".join("{" + name + "}" for name in [*settings, "_specimen"])}
+    Numbers of specimens that start again in every condition name pieces of each.
+    """
+    made = {}
+    if "_year" in pattern:
+        seconds = "{_second}" if "_second" in pattern else "00"
+        clock = f"T{{_hour}}:{{_minute}}:{seconds}" if "_hour" in pattern else ""
+        made["started_at"] = "{_year}-{_month}-{_day}" + clock
+    if any(part.ours == "specimen_id" for part in names.parts):
+        settings = [part.group for part in names.parts if part.ours in ("rubber", *AGING_CONDITION)]
+        made["specimen_id"] = " ".join("{" + name + "}" for name in [*settings, "_specimen"])
+    return {**made, **names.templates}
 
 
 def suffix_pattern(files: Sequence[str]) -> str:
