@@ -6,32 +6,26 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from sealfit.config import AGING_CONDITION, TraceFormat
+from sealfit.config import AGING_CONDITION, Config, TraceFormat
 from sealfit.draft.dialect import MIN_ROWS, SETTINGS, STRAYS, Dialect, sniff
 from sealfit.draft.file_names import shape_of, tokens
 from sealfit.draft.vocabulary import UNAGED, Unit, name_and_unit, setting
-from sealfit.errors import BadFile, RequestError
+from sealfit.errors import BadFile, CampaignError, RequestError
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
-from sealfit.ingest.listing import RUNS_CSV, natural
+from sealfit.ingest.listing import RUNS_CSV, natural, read_table
 from sealfit.ingest.runs import time_of
 from sealfit.ingest.workbooks import LONGEST, read_sheet
 
-# Files of one kind of name that are looked at, spread evenly: more would show the same.
-SNIFFED = 24
-# Files that are looked at, however many ways of naming them there are.
-MOST = 240
-# Trace files that are read whole, for how their columns behave.
-READ = 6
-# Larger files are looked at in their first 64 kB only, and their ends are not known.
-WHOLE_BYTES = 8_000_000
-# Rows of a trace that are read: enough for some strokes.
-ROWS = 20_000
+SNIFFED = 24  # files of one kind of name that are looked at, spread evenly: more would show the same
+MOST = 240  # files that are looked at, however many ways of naming them there are
+READ = 6  # trace files that are read whole, for how their columns behave
+WHOLE_BYTES = 8_000_000  # of larger files the first 64 kB are looked at, and their ends are not known
+ROWS = 20_000  # of a trace that are read: enough for some strokes
 FORMATS = {
     ".xls": "Excel workbooks before 2007", ".h5": "HDF5 files", ".hdf5": "HDF5 files", ".bin": "binary files",
 }  # fmt: skip
@@ -40,11 +34,8 @@ DOCUMENTS = {
     ".ini", ".xml", ".yml", ".yaml", ".zip", ".gz", ".docx", ".doc", ".pptx", ".exe", ".tex",
 }  # fmt: skip
 NO_TRACES = ("readme", "license", "licence", "notice", "sha256sums", "changelog")
-
-# Share of a column's cells that must be names of trace files: a log may list tests that were not kept.
-NAMING = 0.5
-# A larger file is no list of runs.
-MAX_BYTES = 4_000_000
+NAMING = 0.5  # share of a column's cells that must name traces: a log may list tests that were not kept
+MAX_BYTES = 4_000_000  # a larger file is no list of runs
 
 
 @dataclass(frozen=True)
@@ -97,7 +88,7 @@ def look(folder: Path) -> Found:
         raise RequestError(reason, file=folder, fix="Give the folder that holds the trace files.")
     files = _files(folder)
     formats = Counter(suffix for file in files if (suffix := PurePosixPath(file).suffix.lower()) in FORMATS)
-    texts = [file for file in files if _may_be_text(file)]
+    texts = [file for file in files if _may_be_trace(file)]
     dialects, unreadable = _sniffed(folder, texts)
     tables = {file: dialect for file, dialect in dialects.items() if dialect is not None and file != RUNS_CSV}
     if not tables:
@@ -127,7 +118,7 @@ def _files(folder: Path) -> list[str]:
     return sorted(found, key=natural)
 
 
-def _may_be_text(file: str) -> bool:
+def _may_be_trace(file: str) -> bool:
     path = PurePosixPath(file)
     if path.suffix.lower() in FORMATS or path.suffix.lower() in DOCUMENTS:
         return False
@@ -165,11 +156,10 @@ def evenly(items: Sequence[str], count: int) -> list[str]:
     return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
 
 
-def text_of(folder: Path, file: str, *, first_sheet: bool = False) -> str:
+def text_of(folder: Path, file: str) -> str:
     """Return a file as text: cells of sheets and arrays lie between tabs.
 
-    Of a large file it is the whole lines of the beginning, of a workbook the sheet with the most rows, or the
-    first.
+    Of a large file it is the whole lines of the beginning, of a workbook the sheet with the most rows.
 
     Raises
     ------
@@ -182,8 +172,7 @@ def text_of(folder: Path, file: str, *, first_sheet: bool = False) -> str:
     if kind in OF_ARRAYS:
         return _text_of_arrays(read_bytes(folder, file), kind)
     if kind == "xlsx":
-        sheet = 1 if first_sheet else LONGEST
-        return read_sheet(read_bytes(folder, file), sheet).decode()
+        return read_sheet(read_bytes(folder, file), LONGEST).decode()
     whole = (folder / file).stat().st_size <= WHOLE_BYTES if (folder / file).exists() else True
     raw = read_bytes(folder, file, head=not whole)
     text = as_utf8(raw, "auto", head=not whole).decode("utf-8", "replace")
@@ -302,21 +291,15 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
     try:
         if (folder / file).stat().st_size > MAX_BYTES:
             return None
-        text = text_of(folder, file, first_sheet=True)
-    except (BadFile, OSError):
+        _, columns, _ = read_table(folder, file, Config())
+    except (CampaignError, OSError):
         return None
-    lines = [line for line in text.split("\n") if line.strip(" \t,;")]
-    if len(lines) < 2:
-        return None
-    delimiter = max((",", ";", "\t"), key=lines[0].count)
-    names, *rows = ([cell.strip() for cell in split_line(line, delimiter)] for line in lines)
-    columns = zip_longest(names, *rows, fillvalue="")
-    cells = {name: column for name, *column in columns if name}
+    cells = {name: [cell or "" for cell in column] for name, column in columns.items()}
     naming = {name: _names_files(column, traces) for name, column in cells.items()}
     best = max(naming, key=lambda name: naming[name], default=None)
-    if best is None or naming[best] < NAMING * len(rows):
+    if best is None or not cells[best] or naming[best] < NAMING * len(cells[best]):
         return None
-    ours, units = _meanings(names, best, cells)
+    ours, units = _meanings(best, cells)
     return RunsTable(file, ours, units, cells, naming[best])
 
 
@@ -328,20 +311,18 @@ def _names_files(column: Sequence[str], traces: Sequence[str]) -> int:
     return sum(cell.replace("\\", "/") in known for cell in column if cell)
 
 
-def _meanings(
-    names: Sequence[str], file_column: str, cells: Mapping[str, Sequence[str]]
-) -> tuple[dict[str, str], dict[str, Unit]]:
+def _meanings(file_column: str, cells: Mapping[str, Sequence[str]]) -> tuple[dict[str, str], dict[str, Unit]]:
     """Return our name of each column that has one, the first of those that mean the same, and their units."""
     ours, units = {file_column: "file"}, {}
-    exact = [name for name in names if setting(name) == name]
-    for name in [*exact, *names]:
+    exact = [name for name in cells if setting(name) == name]
+    for name in [*exact, *cells]:
         base, unit = name_and_unit(name)
         meaning = setting(base) or setting(name)
         if unit is not None and unit.dimension != SETTINGS.get(meaning, unit.dimension):
             meaning = ""  # an oven's temperature is no time, whatever word stands beside it
         if not meaning and unit is not None and unit.dimension == "speed":
             meaning = "speed_mm_s"
-        if not meaning or name in ours or meaning in ours.values() or not _fits(meaning, cells.get(name, ())):
+        if not meaning or name in ours or meaning in ours.values() or not _fits(meaning, cells[name]):
             continue
         ours[name] = meaning
         if unit is not None:
@@ -355,10 +336,9 @@ def _fits(meaning: str, column: Sequence[str]) -> bool:
     if not full:
         return False
     if meaning == "started_at":
-        return all(time_of(cell.replace(",", ".")) for cell in full)
+        return all(map(time_of, full))
     if meaning in ("specimen_id", "run_id", "rubber", "file"):
         return True
     if meaning in AGING_CONDITION:  # the words for unaged rubber
         full = [cell for cell in full if cell.lower() not in UNAGED]
-    numbers = [cell for cell in full if as_number(cell) is not None or as_number(cell, ",") is not None]
-    return len(numbers) > 0.8 * len(full)
+    return sum(as_number(cell) is not None for cell in full) > 0.8 * len(full)

@@ -27,6 +27,12 @@ NO_CONDITION = {
     "repeat", "specimen_id", "speed_mm_s", "load_N", "started_at", "run_id", "direction", "direction_set",
     "rubber", "file", "stroke", "speed_rpm",
 }  # fmt: skip
+OF_NAMES = {
+    "columns": "made of parts of the name",
+    "values": "how these are written in the names",
+    "compute": "computed from parts of the name",
+    "units": "the unit of the number in the names",
+}
 AGREES = 0.2  # as `quality.speed_disagreement`
 MOSTLY = 0.75  # of the files read: the slowest may be steps of their resolution only
 SPEED_UNITS = ("mm/min", "m/s", "cm/s", "um/s", "in/min", "in/s")
@@ -277,15 +283,10 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         if part.doubt:
             reason = f"'{_example(part)}': {part.doubt}."
             notes.doubt("files.name_pattern", reason, "Check what it stands for.")
-    for name, template in settings.columns.items():
-        evidence = _specimens(names, notes) if name == "specimen_id" else "made of parts of the name"
-        notes.guess(f"files.columns.{name}", template, evidence)
-    for group, mapped in settings.values.items():
-        notes.guess(f"files.values.{group}", dict(mapped), "how these are written in the names")
-    for name, expression in settings.compute.items():
-        notes.guess(f"files.compute.{name}", expression, "computed from parts of the name")
-    for name, unit in settings.units.items():
-        notes.guess(f"files.units.{name}", unit, "the unit of the number in the names")
+    for table, evidence in OF_NAMES.items():
+        for name, value in getattr(settings, table).items():
+            specimens = (table, name) == ("columns", "specimen_id")
+            notes.guess(f"files.{table}.{name}", value, _specimens(names, notes) if specimens else evidence)
 
 
 def _specimens(names: Names, notes: Notes) -> str:
@@ -325,7 +326,7 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
         if value != ours:
             cell = next((cell for cell in table.cells[theirs] if cell), "")
             evidence = f"column '{theirs}' of {table.file}, such as '{cell}'"
-            if ours == "started_at" and (time := excel_time(cell.replace(",", "."))):
+            if ours == "started_at" and (time := excel_time(cell)):
                 evidence += f": Excel's serial number of {time.isoformat(' ', 'minutes')}"
             notes.guess(f"files.runs_columns.{ours}", value, evidence)
     told = {*table.ours, clock}
@@ -342,7 +343,7 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
 def _compressed(theirs: str, table: RunsTable, notes: Notes) -> bool:
     """Whether a column says how much the rubber was compressed; the height that is left is then computed."""
     cells = [cell for cell in table.cells[theirs] if cell]
-    numbers = [n for cell in cells if (n := as_number(cell) or as_number(cell, ",")) is not None]
+    numbers = [number for cell in cells if (number := as_number(cell)) is not None]
     if not numbers or max(numbers) >= HEIGHT_FROM:
         return False
     fix = "If it is the height that was left, name it compression_ratio_pct, and delete this line."

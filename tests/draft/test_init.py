@@ -453,7 +453,7 @@ def test_excel_serial_numbers_in_a_log_are_dates(mark, sign, tmp_path):
     made = draft(tmp_path)
     config = parse_config(made.text, "rig.toml")
     assert config.files.runs_columns["started_at"].name == "Datum"
-    example = f"such as '45987{sign}53': Excel's serial number of 2025-11-26 12:43"
+    example = "such as '45987.53': Excel's serial number of 2025-11-26 12:43"
     assert f"column 'Datum' of log.csv, {example}" in [guess.evidence for guess in made.guesses]
     runs = ingest_campaign(tmp_path, config).tables["runs"]
     assert list(runs["started_at"])[:2] == ["2025-11-26T12:43:12", "2025-11-27T12:43:12"]
