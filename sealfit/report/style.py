@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 import matplotlib as mpl
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -138,40 +139,6 @@ HEIGHT = 2.55
 DPI = 150  # of a figure on a screen
 _EDGE, _BOTTOM, _TOP = 0.14, 0.5, 0.32  # inches around the axes
 
-RC = {
-    "font.sans-serif": ["DejaVu Sans"],
-    "font.size": 8.5,
-    "axes.titlesize": 8.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.labelsize": 8.5,
-    "axes.labelcolor": "#333333",
-    "axes.edgecolor": "#8a9099",
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.limits": (-3, 5),
-    "grid.color": "#e6e8eb",
-    "grid.linewidth": 0.7,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "xtick.color": "#8a9099",
-    "ytick.color": "#8a9099",
-    "xtick.labelcolor": "#333333",
-    "ytick.labelcolor": "#333333",
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "xtick.minor.width": 0.5,
-    "lines.linewidth": 1.4,
-    "lines.markersize": 4,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
-    "pdf.fonttype": 42,  # TrueType: many publishers refuse Type 3
-    "svg.hashsalt": "sealfit",
-}
-
 Mark = Literal["line", "dotted", "dashed", "band", "point", "open", "left", "bar"]
 
 
@@ -209,13 +176,9 @@ class Plot:
     note: str = ""
 
 
-@contextmanager
-def look() -> Iterator[None]:
+def look() -> AbstractContextManager:
     """Draw in the report's style, independent of a matplotlibrc; the caller's settings are restored."""
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rcParams.update(RC)
-        yield
+    return mpl.style.context("sealfit.report.plots", after_reset=True)
 
 
 def shades(n: int) -> list[str]:
