@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.report.summary import STATISTICS, verdict_sentence
+from sealfit.report.summary import ERRORS, FLOORED, STATISTICS, verdict_sentence
 from sealfit.tables import Schema
 from sealfit.units import Units
 
@@ -15,15 +15,6 @@ OF_CONDITIONS = ("steady", "dynamic")  # `quantity` of the rows that are paramet
 # In the order of the equations.
 PARAMETERS = ("mu_s", "mu_c", "F_s", "F_c", "v_s", "sigma_2", "sigma_0", "sigma_1")
 ESTIMATE = ("value", "se", "lo95", "hi95", "u_sys", "unit", "before", "identified", "reason", "model")
-ERRORS = {
-    "rmse_N": "rms error of the bins, in sample",
-    "rmse_runs_N": "rms error of the run means, in sample",
-    "heldout_rmse_N": "rms error on {held}s that the fit did not see",
-    "heldout_extrapolated_rmse_N": "the same where a {held} lies beyond what the others cover",
-    "max_abs_N": "largest error of a bin, in sample",
-    "mean_abs_pct": "mean absolute error, of the measured run mean",
-}
-FLOORED = ("rmse_N", "heldout_rmse_N")  # errors that the noise floor is compared with
 EFFECT = [
     "effect", "id", "label", "channels", "level", "acts_on", "operation", "form", "named", "candidate",
     "p_value", "heldout_gain_N", "heldout_rmse_N", "reference",

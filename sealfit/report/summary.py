@@ -25,6 +25,15 @@ EFFECT_KEYS = (
     "id", "label", "form", "acts_on", "operation", "channels", "named", "candidate", "parameters",
     "reference",
 )  # fmt: skip
+ERRORS = {  # of closure.json, before and after; {held} is the unit that is held out
+    "heldout_rmse_N": "rms error, held-out {held}s",
+    "heldout_extrapolated_rmse_N": "rms error, held-out {held}s beyond what the others cover",
+    "rmse_N": "rms error of all bins, in sample",
+    "rmse_runs_N": "rms error of run means, in sample",
+    "max_abs_N": "largest error of a bin",
+    "mean_abs_pct": "mean absolute error, relative to the run mean",
+}
+FLOORED = ("rmse_N", "heldout_rmse_N")  # errors that the noise floor is compared with
 
 
 def of_steps(store: Store, steps: Iterable[str]) -> dict:

@@ -36,6 +36,8 @@ from sealfit.report.notation import (
     true_units,
 )
 from sealfit.report.summary import (
+    ERRORS,
+    FLOORED,
     by_gain,
     level_words,
     outlier_clause,
@@ -299,21 +301,15 @@ def _sentences(*clauses: str | Markup) -> Markup:
 
 def error_rows(closure: Mapping, config: Config) -> list[dict]:
     """Return the rows of the table before and after: label, note, before, after, change."""
-    unit, held = config.units.unit("force"), closure["heldout_unit"]
-    floor, stages = closure["noise_floor_N"], ("before", "after")
-    rows = (
-        ("heldout_rmse_N", f"rms error, held-out {held}s", unit),
-        ("rmse_N", "rms error of all bins, in sample", unit),
-        ("rmse_runs_N", "rms error of run means, in sample", unit),
-        ("max_abs_N", "largest error of a bin", unit),
-        ("mean_abs_pct", "mean absolute error, relative to the run mean", "%"),
-    )
-    found = []
-    for key, label, of in rows:
+    floor, stages, found = closure["noise_floor_N"], ("before", "after"), []
+    for key, label in ERRORS.items():
+        if key == "heldout_extrapolated_rmse_N":
+            continue
         before, after = (closure[stage][key] for stage in stages)
-        texts = together([before, after, floor if key in ("rmse_N", "heldout_rmse_N") else None])
+        texts = together([before, after, floor if key in FLOORED else None])
         change = _percent(before, after) if known(before) and known(after) and before else NOTHING
-        found.append({"label": label, "unit": of, "before": texts[0], "after": texts[1], "change": change})
+        label, unit = label.format(held=closure["heldout_unit"]), config.units.of(key)
+        found.append({"label": label, "unit": unit, "before": texts[0], "after": texts[1], "change": change})
     p = {stage: _p(closure[stage]["lack_of_fit_p"]) for stage in stages}
     return [*found, {"label": "lack of fit, p", "unit": "", **p, "change": ""}]
 

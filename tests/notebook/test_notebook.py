@@ -325,7 +325,7 @@ def test_results_show_verdict_errors_and_effects(results):
     shown = results._repr_html_()
     assert "<b>closed</b>: one effect was added; no significant residual remains" in shown
     assert shown.count("<table") == 3
-    assert "rms error on runs that the fit did not see" in shown
+    assert "rms error, held-out runs" in shown
     assert "warming by sliding (distance)" in shown
     assert repr(results).startswith("verdict     closed: one effect was added")
 
