@@ -325,12 +325,11 @@ def _life(part: Mapping) -> str:
 
 
 def _degrees(ends: list) -> str:
-    low, high = ends
-    if low is None and high is None:
+    low, high = ("" if end is None else f"{end:.1f}" for end in ends)
+    if not (low or high):
         return ", without a finite 95 % interval"
-    if low is None or high is None:
-        return f", 95 % below {high:.1f} degC" if low is None else f", 95 % above {low:.1f} degC"
-    return f", 95 % {low:.1f} to {high:.1f} degC"
+    between = f"{low} to {high}" if low and high else f"above {low}" if low else f"below {high}"
+    return f", 95 % {between} degC"
 
 
 def _days_between(ends: list) -> str:

@@ -40,6 +40,7 @@ MOST_CHANNELS = 18
 MANY_CATEGORIES = 24
 LOG_SPAN = 50.0
 Z95 = 1.959964
+BARS = (Key("before", style.BEFORE, "bar"), Key("after", style.AFTER, "bar"))
 STAGES = (Key("before", style.BEFORE, "open"), Key("after", style.AFTER, "point"))
 
 
@@ -116,9 +117,8 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: C
             alt += f"{number(float(np.std(a)))} before, {number(float(np.std(b)))} {unit} after."
             draw = partial(draw_histogram, before=a, after=b, units=config.units, held_out=held)
             panels.append(Panel("Errors of run means", alt, draw))
-    legend = [Key("before", style.BEFORE, "bar"), Key("after", style.AFTER, "bar")]
-    if closure["before"] == closure["after"]:
-        legend = [Key("declared model", style.BEFORE, "bar")]
+    same = closure["before"] == closure["after"]
+    legend = [Key("declared model", style.BEFORE, "bar")] if same else list(BARS)
     if known(floor):
         legend.append(Key("noise floor", style.FLOOR, "dashed"))
     return Plot("before_after", "Errors before and after", tuple(panels), tuple(legend))
@@ -223,8 +223,7 @@ def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot 
     height = max(0.82 + 0.42 * whole["level"].nunique(), 1.6)
     draw = partial(draw_levels, levels=levels, units=config.units)
     panel = Panel(f"Variance by level (labels: sd in {unit})", alt, draw, height, left=0.86)
-    legend = (Key("before", style.BEFORE, "bar"), Key("after", style.AFTER, "bar"))
-    return Plot("variance_levels", "Residual variance by level", (panel,), legend)
+    return Plot("variance_levels", "Residual variance by level", (panel,), BARS)
 
 
 # ---------------------------------------------------------------- residual by channel
@@ -329,15 +328,13 @@ def _channel_panel(
 
 
 def _span(channels: pd.DataFrame) -> tuple[float, float]:
-    ends = [
-        channels[f"{s}_N"] + sign * Z95 * channels[f"{s}_se_N"].fillna(0)
-        for s in ("before", "after")
-        for sign in (-1, 1)
-    ]
-    values = pd.concat([*ends, pd.Series([0.0])]).dropna()
-    means = pd.concat([channels["before_N"], channels["after_N"]]).abs().max()
-    # a wide bar does not flatten the rest
-    low, high = max(values.min(), -2.5 * means), min(values.max(), 2.5 * means)
+    """Return the ends of a scale for all means and intervals; a wide interval does not flatten the rest."""
+    means = channels[["before_N", "after_N"]]
+    half = Z95 * channels[["before_se_N", "after_se_N"]].fillna(0).to_numpy()
+    largest = 2.5 * means.abs().max().max()
+    low = max((means - half).min().min(), -largest)
+    high = min((means + half).max().max(), largest)
+    low, high = min(low, 0.0), max(high, 0.0)
     room = 0.07 * (high - low) or 1.0
     return low - room, high + room
 
