@@ -169,7 +169,8 @@ def _dialect(lines: list[str], block: _Block) -> Dialect:
     odd = sum(found is not None and core.isdisjoint(found) for found in numeric[:last])
     below = [line for line in lines[start + last + 1 :] if line.strip()]
     data = [line for line, good in zip(lines[start : start + SAMPLE_LINES], is_data, strict=False) if good]
-    trailing = _ends_in_separator(data, delimiter)
+    marks = ("\t" if delimiter == "tab" else delimiter, ",", ";")
+    ending = sum(line.rstrip(" ").endswith(marks) for line in data)
     header = lines[:start]
     width = max(len(split_line(line.rstrip(STRAYS), delimiter)) for line in data)
     rows = [_header_cells(line, delimiter, width) for line in header]
@@ -187,19 +188,13 @@ def _dialect(lines: list[str], block: _Block) -> Dialect:
         units_back=len(header) - units_at if units_at is not None else None,
         numbers=block.numbers,
         width=width,
-        trailing=trailing,
+        trailing=delimiter != "whitespace" and ending > 0.5 * len(data),
         first=data[0],
         names_are_cells=names_at is None or rows[names_at] == _cells_of(header[names_at], delimiter),
         odd_lines=odd,
         footer=tuple(below),
         grouped=next(in_groups, ""),
     )
-
-
-def _ends_in_separator(data: Sequence[str], delimiter: str) -> bool:
-    marks = ("\t" if delimiter == "tab" else delimiter, ",", ";")
-    ending = sum(line.rstrip(" ").endswith(marks) for line in data)
-    return delimiter != "whitespace" and ending > 0.5 * len(data)
 
 
 def _header_cells(line: str, delimiter: str, width: int) -> list[str]:

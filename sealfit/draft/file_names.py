@@ -157,7 +157,8 @@ def pattern_of(names: Names) -> str:
         inner = "".join(pieces[first:last])
         pieces[first:last] = [f"(?:{inner}|{'|'.join(map(re.escape, names.words))})"]
     pattern = "".join(pieces).replace(r"\ ", " ").replace(r"\-", "-").replace(r"\%", "%")
-    return pattern + suffix_pattern(names.files)
+    endings = sorted({re.escape(match.group()) for file in names.files if (match := SUFFIX.search(file))})
+    return pattern + ("".join(endings) if len(endings) < 2 else f"(?:{'|'.join(endings)})")
 
 
 def _date_pattern(text: str, kind: str) -> str:
@@ -211,12 +212,6 @@ def _templates(names: Names, pattern: str) -> dict[str, str]:
         settings = [part.group for part in names.parts if part.ours in ("rubber", *AGING_CONDITION)]
         made["specimen_id"] = " ".join("{" + name + "}" for name in [*settings, "_specimen"])
     return {**made, **names.templates}
-
-
-def suffix_pattern(files: Sequence[str]) -> str:
-    """Return the pattern of the suffixes of files."""
-    endings = sorted({re.escape(match.group()) for file in files if (match := SUFFIX.search(file))})
-    return "".join(endings) if len(endings) < 2 else f"(?:{'|'.join(endings)})"
 
 
 def read_names(files: Sequence[str]) -> Names:
