@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import warnings
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,7 @@ import pandas as pd
 from sealfit import commands, pipeline, progress
 from sealfit.engine import one_thread
 from sealfit.engine.run_map import cores
-from sealfit.errors import RequestError, SealfitError
+from sealfit.errors import RequestError, SealfitError, nearest
 from sealfit.notebook import frames
 from sealfit.report import summary, summary_lines
 from sealfit.store import Store
@@ -406,8 +405,8 @@ def _step_of(table: str) -> str:
 
 
 def _nearest(wanted: str, known: list[str] | tuple[str, ...]) -> str:
-    likely = get_close_matches(wanted, known, n=1)
-    return f"Did you mean '{likely[0]}'?" if likely else f"There are: {', '.join(known)}."
+    likely = nearest(wanted, known)
+    return f"Did you mean '{likely}'?" if likely else f"There are: {', '.join(known)}."
 
 
 def _table_html(frame: pd.DataFrame) -> str:

@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
-from sealfit.report import notation, words
+from sealfit.report import notation, parameter_tables, words
 from sealfit.report.drawing import Drawn, draw, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
@@ -29,9 +29,8 @@ from sealfit.report.notation import (
     given,
     true_units,
 )
-from sealfit.report.parameter_tables import break_away_rows, law_rows, parameter_tables
 from sealfit.report.style import WIDTH
-from sealfit.report.summary import by_gain, of_properties
+from sealfit.report.summary import of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
 from sealfit.tables import FITTED, SCHEMAS
 
@@ -106,22 +105,11 @@ def _finding(group: list[Fault], config: Config) -> dict:
     return row if one_reason(group) else {**row, "reason": ""}
 
 
-def provenance_facts(provenance: Mapping, config: Config) -> dict:
-    """Return provenance.json as the page shows it, and the config's name, or the table's or folder's."""
+def name_of(provenance: Mapping, config: Config) -> str:
+    """Return what the page is called: the config's name, or that of the table or the folder."""
     own = config.name if config.name != Config().name else ""
-    campaign, inputs = provenance["campaign"], provenance["inputs"]
-    return {
-        **provenance,
-        "name": own or provenance["table"] or PurePath(campaign).name or campaign,
-        "inputs": inputs[:MOST_INPUTS],
-        "inputs_in_all": len(inputs),
-        "bytes": sum(entry["size"] for entry in inputs),
-        "steps": [
-            {**step, "finished_at": step["finished_at"].replace("T", " ").replace("+00:00", " UTC")}
-            for step in provenance["steps"]
-            if step["step"] != "report"  # an earlier report is no part of this one
-        ],
-    }
+    campaign = provenance["campaign"]
+    return own or provenance["table"] or PurePath(campaign).name or campaign
 
 
 # ---------------------------------------------------------------- page
@@ -164,8 +152,9 @@ def build_report(
         plots=plots, images_of=images, css=CSS, width=WIDTH, most_channels=MOST_CHANNELS,
         tables=tables, closure=closure, config=config, units=config.units,
         unit=config.units.unit("force"), force=config.units.quantity("force"),
-        condition_key=ConditionNames.of(config).key, provenance=provenance_facts(provenance, config),
-        **opening, **_of_fits(tables, config),
+        names=ConditionNames.of(config), name=name_of(provenance, config), provenance=provenance,
+        most_inputs=MOST_INPUTS,
+        fitted=_fitted(tables, config), **opening,
     )  # fmt: skip
     return Report(html, figures)
 
@@ -242,40 +231,35 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
     }
 
 
-def _of_fits(tables: Mapping[str, pd.DataFrame], config: Config) -> dict:
-    """Return the tables of the page with fitted parameters and aging laws."""
+def _fitted(tables: Mapping[str, pd.DataFrame], config: Config) -> list[parameter_tables.ParameterTable]:
+    """Return the tables of fitted parameters; those of the goodness of fit come last."""
     dynamic = tables["dynamic_fit"]
     fits = {"steady_fit": tables["steady_fit"], "aging_fit": tables["aging_fit"]}
     fits["dynamic_fit"] = dynamic[dynamic["quantity"] == "dynamic"]
-    fitted = []
+    found = []
     for name, fit in fits.items():
         key = "series" if name == "aging_fit" else "condition"
-        fitted += parameter_tables(fit, key, config, tables.get(f"{name}_before"))
-    return {
-        "parameter_tables": sorted(fitted, key=lambda table: table.single),  # goodness of fit comes last
-        "laws": law_rows(tables["aging_laws"], tables.get("aging_laws_before")),
-    }
+        found += parameter_tables.parameter_tables(fit, key, config, tables.get(f"{name}_before"))
+    return sorted(found, key=lambda table: table.single)
 
 
 def fit_badge(closure: Mapping) -> tuple[str, str]:
     """Return how well the model fits: the state, and a few words."""
-    quality = closure["fit_quality"]
-    ratio = quality["ratio"] or 0
-    badges = {
-        "unknown": "Fit: not known",
-        "within_scatter": "Fit: within the scatter of repeats",
-        "above_scatter": f"Fit: {ratio:.2g} times the scatter of repeats"
-        if ratio >= 1
-        else "Fit: a lack of fit, below the scatter of repeats",
-    }
-    return quality["state"], badges[quality["state"]]
+    state, ratio = (closure["fit_quality"][name] for name in ("state", "ratio"))
+    if state == "unknown":
+        return state, "Fit: not known"
+    if state == "within_scatter":
+        return state, "Fit: within the scatter of repeats"
+    if (ratio or 0) < 1:
+        return state, "Fit: a lack of fit, below the scatter of repeats"
+    return state, f"Fit: {ratio:.2g} times the scatter of repeats"
 
 
 def _text(name: str) -> str:
     return files("sealfit.report").joinpath(name).read_text("utf-8")
 
 
-# The template writes values, those of closure.json above all, by functions.
-WRITERS = (quality_counts, quality_findings, break_away_rows, by_gain)
-TEMPLATES.globals |= {function.__name__: function for function in WRITERS}
-TEMPLATES.globals |= {name: own for module in (notation, words) for name, own in vars(module).items()}
+# The template writes values, those of closure.json above all, by the functions of these modules.
+for module in (notation, words, parameter_tables):
+    TEMPLATES.globals |= vars(module)
+TEMPLATES.globals |= {"quality_counts": quality_counts, "quality_findings": quality_findings}

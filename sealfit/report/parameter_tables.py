@@ -29,56 +29,39 @@ ROUNDING = 1e-12  # of coefficients of about 1 and forces of some N
 
 
 def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> list[dict]:
-    """Return each quantity's laws with the lowest BIC, and the separate laws, as plain values for the page.
+    """Return each quantity's laws with the lowest BIC, and the separate laws, a row of the page for each.
 
-    `before` is table `aging_laws` without the loop's effects; its best law follows that of `aging_laws`.
+    A row has what table `aging_laws` says of a law, and its parameters by name. `before` is that table
+    without the loop's effects; its best law follows that of `aging_laws`.
     """
     found = []
-    earlier = {} if before is None else {row["key"]: row for row in law_rows(before) if row["chosen"]}
-    several = aging_laws["rubber"].nunique() > 1
-    for (rubber, quantity), own in aging_laws.groupby(["rubber", "quantity"], sort=False):
+    earlier = {} if before is None else {row["key"]: row for row in law_rows(before) if row["rank"] == 1}
+    for key, own in aging_laws.groupby(["rubber", "quantity"], sort=False):
         last = own["rank"].max()
         for rank, law in own.groupby("rank", sort=True):
-            first = law.iloc[0]
+            first = law.iloc[0].to_dict()
             if rank > MOST_LAWS and not (rank == last and first["law"] == "separate"):
                 continue
-            by = law.dropna(subset=["parameter"]).set_index("parameter")
-            found.append(
-                {
-                    "rubber": rubber if several else "",
-                    "quantity": symbol_html(quantity),
-                    "form": with_symbols(first["form"], formula=True),
-                    "changes": f"the {first['way']}" if first["way"] else NOTHING,
-                    "criterion": number(first["criterion"]) if rank > 1 else "0",
-                    "energy": _with_interval(by, "E"),
-                    "kappa": _with_interval(by, "kappa"),
-                    "heldout_series": _error(first["heldout_series"]),
-                    "heldout_last_day": _error(first["heldout_last_day"]),
-                    "lack_of_fit": number(first["lack_of_fit_p"], 2) if known(first["lack_of_fit_p"]) else "",
-                    "chosen": rank == 1,
-                    "before": False,
-                    "key": (rubber, quantity),
-                }
-            )
-            if rank == 1 and (old := earlier.get((rubber, quantity))):
-                found.append({**old, "criterion": NOTHING, "chosen": False, "before": True})
+            parameters = law.dropna(subset=["parameter"]).set_index("parameter")
+            found.append({**first, "key": key, "before": False, "parameters": parameters})
+            if rank == 1 and key in earlier:
+                found.append({**earlier[key], "before": True})
     return found
 
 
-def _error(value: float) -> str:
+def error_text(value: float) -> str:
     """Return an error of coefficients; one that is rounding alone is zero."""
     return number(0.0 if value < ROUNDING else value)
 
 
-def _with_interval(by: pd.DataFrame, name: str) -> str:
-    """Return a parameter with its interval, or "not identified"."""
-    if name not in by.index:
+def with_interval(parameters: pd.DataFrame, name: str) -> str:
+    """Return a law's parameter with its interval, or "not identified"; a dash for one that it has not."""
+    if name not in parameters.index:
         return NOTHING
-    row = by.loc[name]
+    row = parameters.loc[name]
     if not row["identified"]:
         return "not identified"
-    value, interval = measured(row["value"], row["lo95"], row["hi95"])
-    return f"{value} {interval}"
+    return " ".join(measured(row["value"], row["lo95"], row["hi95"]))
 
 
 # ---------------------------------------------------------------- parameters
@@ -94,60 +77,39 @@ MOST_BREAK_AWAYS = 600
 
 SHARED = 3  # rows with one note, from which it is said once
 _NUMBERS = re.compile(r"(?<![\w<;&#.])\d+(?:\.\d+)?(?![\w.]*[<;])")  # not those in symbols or in markup
-Rows = dict[tuple[str, str], dict]  # of one condition or series, by parameter and unit
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One parameter of one row; `words` replaces the values where it is not identified."""
-
-    value: str = NOTHING
-    interval: str = NOTHING
-    u_sys: str = NOTHING
-    words: str = ""
-    before: str = NOTHING  # the value without the loop's effects
+Fitted = Mapping | None
+Rows = dict[tuple[str, str], Mapping]  # of one condition or series, by parameter and unit
 
 
 @dataclass(frozen=True)
 class ParameterTable:
     """A table for the page: heads of the key columns, (symbol, unit) of each parameter, rows, notes.
 
-    A row has keys, cells and a note: why a parameter is not identified, or a remark.
+    A row has keys, cells and a note: why a parameter is not identified, or a remark. A cell is the row of a
+    parameter in the table of fits, and that without the loop's effects; None where there is none.
     """
 
     title: str
     heads: tuple[str, ...]
     groups: tuple[tuple[Markup, str], ...]
-    rows: tuple[tuple[tuple[str | Markup, ...], tuple[Cell, ...], Markup], ...]
+    rows: tuple[tuple[tuple[str | Markup, ...], tuple[tuple[Fitted, Fitted], ...], Markup], ...]
     single: bool = False  # values only: statistics have neither interval nor u_sys
     note: str = ""  # the number of rows shown, where there are too many
     compared: bool = False  # whether cells have the value before
     remarks: tuple[Markup, ...] = ()  # notes that several rows share, below the table
 
 
-def break_away_rows(dynamic_fit: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
-    """Return the break-away forces above the sliding force, as rows for the page, and their number."""
-    names, found = ConditionNames.of(config), []
+def break_aways(dynamic_fit: pd.DataFrame) -> tuple[list[dict], int]:
+    """Return the break-away forces above the sliding force that the page has, and the number of all.
+
+    Each is the row of its ratio to the sliding force; the force itself has the suffix `_N`.
+    """
     rows = dynamic_fit[dynamic_fit["quantity"] == "break_away"]
     ratios, forces = (rows[rows["parameter"] == parameter] for parameter in ("F_ba/F", "F_ba"))
     ratios = ratios[ratios["identified"].astype(bool) & (ratios["reason"].fillna("") == "")]
     keys = ["condition", "speed_set_mm_s", "direction"]
     above = ratios.merge(forces[[*keys, *ENDS]], on=keys, suffixes=("", "_N")).to_dict("records")
-    for row in spread(above, MOST_BREAK_AWAYS):
-        force, force_interval = measured(*(row[f"{name}_N"] for name in ENDS))
-        share, share_interval = measured(*(100.0 * (row[name] - 1.0) for name in ENDS))
-        found.append(
-            {
-                "condition": names(row["condition"]),
-                "speed": given(row["speed_set_mm_s"]),
-                "direction": "forward" if row["direction"] > 0 else "backward",
-                "force": force,
-                "force_interval": force_interval,
-                "share": share,
-                "share_interval": share_interval,
-            }
-        )
-    return found, len(above)
+    return spread(above, MOST_BREAK_AWAYS), len(above)
 
 
 def parameter_tables(
@@ -203,7 +165,7 @@ def _parameters(
     several = len(quantities) > 1 or key == "series"
     found = []
     for name, quantity, by in _rows_of(fit, key, names):
-        cells = tuple(_cell(by.get(p), earlier.get((name, quantity, p[0]))) for p in parameters)
+        cells = tuple((by.get(p), earlier.get((name, quantity, p[0]))) for p in parameters)
         found.append((_heads(names(name), symbol_html(quantity), several), cells, _note(by, config)))
     groups = tuple((symbol_html(p), u) for p, u in parameters)
     title = _title(key, quantities, after=compared)
@@ -247,7 +209,7 @@ def _statistics(fit: pd.DataFrame, key: str, config: Config) -> ParameterTable:
     shown = [p for name in STATISTICS for p in present if p[0] == name] or present
     found = []
     for name, quantity, by in _rows_of(fit, key, names):
-        cells = tuple(Cell(_statistic(by[p]) if p in by else NOTHING) for p in shown)
+        cells = tuple((by.get(p), None) for p in shown)
         lack = {p: row for p, row in by.items() if p[0] == "lack_of_fit_p"}
         keys = _heads(names(name), symbol_html(quantity), several)
         found.append((keys, cells, _note(lack, config, named=False)))
@@ -271,20 +233,21 @@ def _records(rows: pd.DataFrame, key: str) -> list[dict]:
     return plain.where(plain.notna(), None).to_dict("records")
 
 
-def _statistic(row: Mapping) -> str:
+def statistic(row: Fitted) -> str:
     """Return a count without decimals, another statistic to three digits."""
+    if row is None:
+        return NOTHING
     whole = known(row["value"]) and float(row["value"]).is_integer() and abs(row["value"]) >= 1
     return given(row["value"], 9) if whole else number(row["value"])
 
 
-def _cell(row: Mapping | None, earlier: Mapping | None) -> Cell:
-    """Return the cell of a row; that without the loop's effects has the digits of its own interval."""
-    before = measured(*(earlier[name] for name in ENDS))[0] if earlier and earlier["identified"] else NOTHING
+def estimate(row: Fitted) -> tuple[str, str, str]:
+    """Return the value of a parameter or that it is not identified, its interval, and its u_sys."""
     if row is None:
-        return Cell(before=before)
+        return NOTHING, NOTHING, NOTHING
     if not row["identified"]:
-        return Cell(words="not identified", before=before)
-    return Cell(*measured(*(row[name] for name in ENDS)), number(row["u_sys"], 2), before=before)
+        return "not identified", NOTHING, NOTHING
+    return *measured(*(row[name] for name in ENDS)), number(row["u_sys"], 2)
 
 
 def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: bool = True) -> Markup:

@@ -10,7 +10,7 @@ from sealfit.report.drawing import draw
 from sealfit.report.figures.aging import aging
 from sealfit.report.figures.speed import force_speed
 from sealfit.report.page import build_report
-from sealfit.report.parameter_tables import break_away_rows, parameter_tables
+from sealfit.report.parameter_tables import break_aways, parameter_tables
 from sealfit.report.style import panels_of
 from sealfit.report.words import curve_of
 
@@ -121,23 +121,23 @@ def test_break_aways_are_cut_and_counted():
         for p in ("F_ba", "F_ba/F")
     ]
     frame = pd.DataFrame(rows).assign(speed_set_mm_s=5.0, u_sys=np.nan, reason="")
-    rows, in_all = break_away_rows(frame, Config())
+    rows, in_all = break_aways(frame)
     assert (len(rows), in_all) == (600, 700)
-    assert (rows[0]["share"], rows[0]["share_interval"]) == ("50", "[0, 100]")
+    assert [rows[0][name] for name in ("condition", "value", "value_N")] == ["c0", 1.5, 1.5]
 
 
 def test_inputs_are_cut_and_counted():
     every = [{"file": f"{k}.csv", "size": 10, "sha256": "ab"} for k in range(2500)]
-    found = page.provenance_facts({**PROVENANCE, "inputs": every}, Config())
-    assert (len(found["inputs"]), found["inputs_in_all"], found["bytes"]) == (2000, 2500, 25000)
     html = build_report({}, None, {**PROVENANCE, "inputs": every}, Config()).html
+    assert html.count(".csv</td>") == 2000
+    assert "2500 files, 0.0250 MB" in html
     assert "The first 2000 of 2500; inputs.parquet has all." in html
 
 
 def test_the_page_is_called_what_the_config_is():
     facts = {**PROVENANCE, "campaign": "/data/csv"}
-    assert page.provenance_facts(facts, Config(name="emps"))["name"] == "emps"
-    assert page.provenance_facts(facts, Config())["name"] == "csv"
+    assert page.name_of(facts, Config(name="emps")) == "emps"
+    assert page.name_of(facts, Config()) == "csv"
 
 
 def test_a_free_shape_is_a_table_of_its_curve_and_has_no_coefficients():
