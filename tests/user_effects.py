@@ -11,8 +11,7 @@ def shape(inputs, *, A, x_0):
 WORN_PATCH = Effect(
     id="worn_patch",
     label="worn patch of the track",
-    equation=r"h = A / (1 + (x - x_0)^2)",
-    form="A / (1 + (x - x_0)^2)",
+    equation="h = A / (1 + (x - x_0)^2)",
     reads=("displacement_mm",),
     acts_on=(("mu", "multiply"),),
     parameters=(

@@ -41,7 +41,7 @@ from sealfit.closure.criteria import (
 from sealfit.closure.multiplicity import adjust_all
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.small_sample_test import log_p_of
-from sealfit.effects.sensors import DAY_AND_NIGHT, DAY_H
+from sealfit.effects.sensors import DAY_H, day_and_night
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import POWER, Rows, open_columns
@@ -83,7 +83,7 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
     if channel.numeric and units >= FINE_UNITS and np.unique(channel.values).size > 2 * FINE_DF:
         yield from _shape_candidates(tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
-    if channel.name == "elapsed_h" and DAY_AND_NIGHT.shown_by(channel.values):
+    if channel.name == "elapsed_h" and day_and_night.effect.shown_by(channel.values):
         angle = 2 * np.pi * channel.values[:, None] / DAY_H
         yield from _shape_candidates(tests, channel, np.hstack([np.cos(angle), np.sin(angle)]), MAIN_TARGETS)
     if means := run_means(channel, rows):

@@ -6,10 +6,8 @@ describes an effect.
 """
 
 from sealfit.effects import aging_laws, closed_forms, sensors, sliding, warming
-from sealfit.effects.contract import Effect
+from sealfit.effects.contract import effects_in
 
 FAMILIES = (warming, sensors, sliding, aging_laws, closed_forms)
 
-EFFECTS = {
-    effect.id: effect for family in FAMILIES for effect in vars(family).values() if isinstance(effect, Effect)
-}
+EFFECTS = {effect.id: effect for family in FAMILIES for effect in effects_in(family)}

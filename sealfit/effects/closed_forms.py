@@ -18,6 +18,7 @@ from sealfit.effects.contract import (
     amplitude,
     closed_form,
     deviation,
+    effect,
     factors,
     log_ratio,
     log_ratio_from_zero,
@@ -28,7 +29,16 @@ from sealfit.effects.contract import (
 # ---------------------------------------------------------------- one channel
 
 
-def linear_shape(inputs, *, A):
+@effect(
+    closed_form,
+    label="linear in {x}",
+    equation="h = A (x - x_ref)",
+    parameters=(amplitude("A", "{y}/{x}", 0.01, "slope"),),
+    source="Form: ours. First order of any smooth dependence.",
+    # By hand: 0.5 * (7 - 3).
+    worked=({"x": 7.0, "x_ref": 3.0}, {"A": 0.5}, 2.0),
+)
+def linear(inputs, *, A):
     r"""Straight line in any channel, zero at its reference.
 
     Along `run_order` it is the drift along the campaign counted in runs.
@@ -36,20 +46,21 @@ def linear_shape(inputs, *, A):
     return A * deviation(inputs, CHANNEL)
 
 
-LINEAR = closed_form(
-    id="linear",
-    label="linear in {x}",
-    equation=r"h = A (x - x_{ref})",
-    form="A (x - x_ref)",
-    parameters=(amplitude("A", "{y}/{x}", 0.01, "slope"),),
-    shape=linear_shape,
-    source="Form: ours. First order of any smooth dependence.",
-    # By hand: 0.5 * (7 - 3).
-    worked=({"x": 7.0, "x_ref": 3.0}, {"A": 0.5}, 2.0),
+@effect(
+    closed_form,
+    label="linear in {x}, with its own slope in each direction",
+    equation="h = A_f (x - x_ref) forward, A_b (x - x_ref) backward",
+    reads=(CHANNEL, "direction"),
+    acts_on=factors("mu", "force"),
+    parameters=(
+        amplitude("A_f", "{y}/{x}", 0.01, "slope forward"),
+        amplitude("A_b", "{y}/{x}", 0.0, "slope backward"),
+    ),
+    source="Form: ours. First order of any smooth dependence, in each direction by itself.",
+    # By hand: backward, 0.25 * (7 - 3).
+    worked=({"x": 7.0, "x_ref": 3.0, "direction": -1.0}, {"A_f": 0.5, "A_b": 0.25}, 1.0),
 )
-
-
-def linear_each_way_shape(inputs, *, A_f, A_b):
+def linear_each_way(inputs, *, A_f, A_b):
     r"""Straight line in any channel with a separate slope in each direction.
 
     A lip that turns over or wears on one side changes the friction in one direction only. The interval of the
@@ -58,48 +69,35 @@ def linear_each_way_shape(inputs, *, A_f, A_b):
     return np.where(np.asarray(inputs["direction"]) > 0, A_f, A_b) * deviation(inputs, CHANNEL)
 
 
-LINEAR_EACH_WAY = closed_form(
-    id="linear_each_way",
-    label="linear in {x}, with its own slope in each direction",
-    equation=r"h = A_f (x - x_{ref}) \text{ forward}, \; A_b (x - x_{ref}) \text{ backward}",
-    form="A_f (x - x_ref) forward, A_b (x - x_ref) backward",
-    reads=(CHANNEL, "direction"),
-    acts_on=factors("mu", "force"),
-    parameters=(
-        amplitude("A_f", "{y}/{x}", 0.01, "slope forward"),
-        amplitude("A_b", "{y}/{x}", 0.0, "slope backward"),
-    ),
-    shape=linear_each_way_shape,
-    source="Form: ours. First order of any smooth dependence, in each direction by itself.",
-    # By hand: backward, 0.25 * (7 - 3).
-    worked=({"x": 7.0, "x_ref": 3.0, "direction": -1.0}, {"A_f": 0.5, "A_b": 0.25}, 1.0),
-)
-
-
-def quadratic_shape(inputs, *, A, B):
-    """Parabola in any channel, zero at its reference."""
-    away = deviation(inputs, CHANNEL)
-    return A * away + B * away**2
-
-
-QUADRATIC = closed_form(
-    id="quadratic",
+@effect(
+    closed_form,
     label="quadratic in {x}",
-    equation=r"h = A (x - x_{ref}) + B (x - x_{ref})^2",
-    form="A (x - x_ref) + B (x - x_ref)^2",
+    equation="h = A (x - x_ref) + B (x - x_ref)^2",
     parameters=(
         amplitude("A", "{y}/{x}", 0.01, "slope at the reference"),
         amplitude("B", "{y}/{x}^2", 0.001, "curvature, halved"),
     ),
-    shape=quadratic_shape,
     source="Form: ours. Second order of any smooth dependence.",
     # By hand: 2 from the reference: 0.5 * 2 - 0.25 * 4.
     worked=({"x": 5.0, "x_ref": 3.0}, {"A": 0.5, "B": -0.25}, 0.0),
     along_calendar=False,
 )
+def quadratic(inputs, *, A, B):
+    """Parabola in any channel, zero at its reference."""
+    away = deviation(inputs, CHANNEL)
+    return A * away + B * away**2
 
 
-def log_shape(inputs, *, A):
+@effect(
+    closed_form,
+    label="logarithmic in {x}",
+    equation="h = A ln(x / x_ref)",
+    parameters=(amplitude("A", "{y}", 0.05, "change per factor e of the channel"),),
+    source="Form: ours. The dependence that is the same in every decade.",
+    # By hand: ten times the reference, ln 10 = 2.302585092994046.
+    worked=({"x": 30.0, "x_ref": 3.0}, {"A": 0.5}, 0.5 * 2.302585092994046),
+)
+def log(inputs, *, A):
     r"""Logarithm of any positive channel, zero at its reference.
 
     A is the change per factor e of the channel; NaN where the channel is not positive.
@@ -107,20 +105,20 @@ def log_shape(inputs, *, A):
     return A * log_ratio(inputs, CHANNEL)
 
 
-LOG = closed_form(
-    id="log",
-    label="logarithmic in {x}",
-    equation=r"h = A \ln(x / x_{ref})",
-    form="A ln(x / x_ref)",
-    parameters=(amplitude("A", "{y}", 0.05, "change per factor e of the channel"),),
-    shape=log_shape,
-    source="Form: ours. The dependence that is the same in every decade.",
-    # By hand: ten times the reference, ln 10 = 2.302585092994046.
-    worked=({"x": 30.0, "x_ref": 3.0}, {"A": 0.5}, 0.5 * 2.302585092994046),
+@effect(
+    closed_form,
+    label="logarithmic growth in {x}",
+    equation="h = A ln(1 + x / x_0)",
+    reference="{x} = 0",
+    parameters=(
+        amplitude("A", "{y}", 0.05, "change per factor e of the channel, well beyond x_0"),
+        Parameter("x_0", "{x}", 1.0, (1e-6, 1e9), "where the logarithm sets in", search="span"),
+    ),
+    source="Form: ours, after Eq. 15 of Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102.",
+    # By hand: x = x_0, ln 2 = 0.6931471805599453.
+    worked=({"x": 3.0, "x_ref": 1.0}, {"A": 0.5, "x_0": 3.0}, 0.5 * 0.6931471805599453),
 )
-
-
-def log_growth_shape(inputs, *, A, x_0):
+def log_growth(inputs, *, A, x_0):
     r"""Logarithm of any channel that starts at 0: linear at first, then the same change in every decade.
 
     It has the form of Eq. 15, for channels with a zero, such as time; NaN where the channel is negative.
@@ -128,24 +126,19 @@ def log_growth_shape(inputs, *, A, x_0):
     return A * np.log1p(not_negative(inputs[CHANNEL]) / x_0)
 
 
-LOG_GROWTH = closed_form(
-    id="log_growth",
-    label="logarithmic growth in {x}",
-    equation=r"h = A \ln(1 + x / x_0)",
-    form="A ln(1 + x / x_0)",
-    reference="{x} = 0",
+@effect(
+    closed_form,
+    label="power of {x}",
+    equation="h = A ((x / x_ref)^n - 1)",
     parameters=(
-        amplitude("A", "{y}", 0.05, "change per factor e of the channel, well beyond x_0"),
-        Parameter("x_0", "{x}", 1.0, (1e-6, 1e9), "where the logarithm sets in", search="span"),
+        amplitude("A", "{y}", 0.1, "size at the reference"),
+        Parameter("n", "", 0.5, (-6.0, 6.0), "exponent", search=(-3.0, -2.0, -1.0, -0.5, 0.5, 1.5, 2.0, 3.0)),
     ),
-    shape=log_growth_shape,
-    source="Form: ours, after Eq. 15 of Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102.",
-    # By hand: x = x_0, ln 2 = 0.6931471805599453.
-    worked=({"x": 3.0, "x_ref": 1.0}, {"A": 0.5, "x_0": 3.0}, 0.5 * 0.6931471805599453),
+    source="Form: ours. The dependence without a scale of its own.",
+    # By hand: four times the reference: 2 * (sqrt(4) - 1).
+    worked=({"x": 12.0, "x_ref": 3.0}, {"A": 2.0, "n": 0.5}, 2.0),
 )
-
-
-def power_shape(inputs, *, A, n):
+def power(inputs, *, A, n):
     r"""Power of any positive channel, zero at its reference.
 
     n = -1 is a hyperbola, n = 1 the straight line; n towards 0 is the logarithm, with A growing as 1/n. NaN
@@ -155,23 +148,20 @@ def power_shape(inputs, *, A, n):
     return A * np.expm1(n * log_ratio(inputs, CHANNEL))
 
 
-POWER = closed_form(
-    id="power",
-    label="power of {x}",
-    equation=r"h = A [(x / x_{ref})^n - 1]",
-    form="A ((x / x_ref)^n - 1)",
+@effect(
+    closed_form,
+    label="exponential approach in {x}",
+    equation="h = A (1 - exp(-x / tau))",
+    reference="{x} = 0",
     parameters=(
-        amplitude("A", "{y}", 0.1, "size at the reference"),
-        Parameter("n", "", 0.5, (-6.0, 6.0), "exponent", search=(-3.0, -2.0, -1.0, -0.5, 0.5, 1.5, 2.0, 3.0)),
+        amplitude("A", "{y}", 0.1, "limit"),
+        Parameter("tau", "{x}", 1.0, (1e-6, 1e9), "scale of the approach", search="span"),
     ),
-    shape=power_shape,
-    source="Form: ours. The dependence without a scale of its own.",
-    # By hand: four times the reference: 2 * (sqrt(4) - 1).
-    worked=({"x": 12.0, "x_ref": 3.0}, {"A": 2.0, "n": 0.5}, 2.0),
+    source="Form: ours. Relaxation at a rate proportional to the remaining difference.",
+    # By hand: x = tau, 1 - 1/e = 0.6321205588285577.
+    worked=({"x": 3.0, "x_ref": 1.0}, {"A": 2.0, "tau": 3.0}, 2.0 * 0.6321205588285577),
 )
-
-
-def exponential_approach_shape(inputs, *, A, tau):
+def exponential_approach(inputs, *, A, tau):
     r"""Exponential approach to a limit, from 0, in any channel that is not negative.
 
     NaN where the channel is negative.
@@ -179,24 +169,21 @@ def exponential_approach_shape(inputs, *, A, tau):
     return -A * np.expm1(-not_negative(inputs[CHANNEL]) / tau)
 
 
-EXPONENTIAL_APPROACH = closed_form(
-    id="exponential_approach",
-    label="exponential approach in {x}",
-    equation=r"h = A (1 - e^{-x / \tau})",
-    form="A (1 - exp(-x / tau))",
+@effect(
+    closed_form,
+    label="saturation in {x}",
+    equation="h = A x / (x + x_half)",
     reference="{x} = 0",
     parameters=(
         amplitude("A", "{y}", 0.1, "limit"),
-        Parameter("tau", "{x}", 1.0, (1e-6, 1e9), "scale of the approach", search="span"),
+        Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where half of the limit is reached", search="span"),
     ),
-    shape=exponential_approach_shape,
-    source="Form: ours. Relaxation at a rate proportional to the remaining difference.",
-    # By hand: x = tau, 1 - 1/e = 0.6321205588285577.
-    worked=({"x": 3.0, "x_ref": 1.0}, {"A": 2.0, "tau": 3.0}, 2.0 * 0.6321205588285577),
+    source="Form: Langmuir 1918, J. Am. Chem. Soc. 40(9), 1361-1403, doi:10.1021/ja02242a004: "
+    "places that fill up.",
+    # By hand: x = 3 x_half is three quarters of 2.
+    worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 1.5),
 )
-
-
-def saturation_shape(inputs, *, A, x_half):
+def saturation(inputs, *, A, x_half):
     r"""Saturation by a hyperbola, from 0, in any channel that is not negative.
 
     It approaches its limit more slowly than an exponential: half at x_half, nine tenths at nine times that.
@@ -206,25 +193,21 @@ def saturation_shape(inputs, *, A, x_half):
     return A * x / (x + x_half)
 
 
-SATURATION = closed_form(
-    id="saturation",
-    label="saturation in {x}",
-    equation=r"h = A x / (x + x_{half})",
-    form="A x / (x + x_half)",
-    reference="{x} = 0",
+@effect(
+    closed_form,
+    label="hyperbolic decay in {x}",
+    equation="h = A / (1 + x / x_half)",
+    reference="limit of large {x}",
+    acts_on=(("force", "add"),),
     parameters=(
-        amplitude("A", "{y}", 0.1, "limit"),
-        Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where half of the limit is reached", search="span"),
+        amplitude("A", "{y}", 0.1, "size at 0"),
+        Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where it has fallen to one half", search="span"),
     ),
-    shape=saturation_shape,
-    source="Form: Langmuir 1918, J. Am. Chem. Soc. 40(9), 1361-1403, doi:10.1021/ja02242a004: "
-    "places that fill up.",
-    # By hand: x = 3 x_half is three quarters of 2.
-    worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 1.5),
+    source="Form: ours. Decay at a rate proportional to the square of the value.",
+    # By hand: x = 3 x_half gives a quarter of 2.
+    worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 0.5),
 )
-
-
-def hyperbolic_shape(inputs, *, A, x_half):
+def hyperbolic(inputs, *, A, x_half):
     r"""Hyperbolic decay from A to 0, in any channel that is not negative.
 
     It falls to a half at x_half and to a tenth at nine times that. NaN where the channel is negative.
@@ -237,25 +220,20 @@ def hyperbolic_shape(inputs, *, A, x_half):
     return A / (1 + not_negative(inputs[CHANNEL]) / x_half)
 
 
-HYPERBOLIC = closed_form(
-    id="hyperbolic",
-    label="hyperbolic decay in {x}",
-    equation=r"h = A / (1 + x / x_{half})",
-    form="A / (1 + x / x_half)",
-    reference="limit of large {x}",
-    acts_on=(("force", "add"),),
+@effect(
+    closed_form,
+    label="step in {x}",
+    equation="h = A if x >= x_0, else 0",
+    reference="{x} below {x_0}",
     parameters=(
-        amplitude("A", "{y}", 0.1, "size at 0"),
-        Parameter("x_half", "{x}", 1.0, (1e-6, 1e9), "where it has fallen to one half", search="span"),
+        amplitude("A", "{y}", 0.1, "height of the step"),
+        Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "where it steps", search="between"),
     ),
-    shape=hyperbolic_shape,
-    source="Form: ours. Decay at a rate proportional to the square of the value.",
-    # By hand: x = 3 x_half gives a quarter of 2.
-    worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 0.5),
+    source="Form: ours. Definition of a step.",
+    # By hand: at the step itself, the full height.
+    worked=({"x": 3.0, "x_ref": 1.0}, {"A": -0.5, "x_0": 3.0}, -0.5),
 )
-
-
-def step_shape(inputs, *, A, x_0):
+def step(inputs, *, A, x_0):
     r"""Step in any channel: something was changed, repaired or knocked.
 
     Only the interval between two neighbouring values of the channel is determined for x_0.
@@ -264,49 +242,44 @@ def step_shape(inputs, *, A, x_0):
     return A * np.where(np.isnan(x), np.nan, x >= x_0)
 
 
-STEP = closed_form(
-    id="step",
-    label="step in {x}",
-    equation=r"h = A\,[x \ge x_0]",
-    form="A if x >= x_0, else 0",
-    reference="{x} below {x_0}",
-    parameters=(
-        amplitude("A", "{y}", 0.1, "height of the step"),
-        Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "where it steps", search="between"),
-    ),
-    shape=step_shape,
-    source="Form: ours. Definition of a step.",
-    # By hand: at the step itself, the full height.
-    worked=({"x": 3.0, "x_ref": 1.0}, {"A": -0.5, "x_0": 3.0}, -0.5),
-)
-
-
-def bump_shape(inputs, *, A, x_0, w):
-    r"""Local bump in any channel: a worn place, a joint in the track, an hour when the door stood open."""
-    return A * np.exp(-(((np.asarray(inputs[CHANNEL], dtype=float) - x_0) / w) ** 2))
-
-
-BUMP = closed_form(
-    id="bump",
+@effect(
+    closed_form,
     label="local bump in {x}",
-    equation=r"h = A e^{-((x - x_0) / w)^2}",
-    form="A exp(-((x - x_0) / w)^2)",
+    equation="h = A exp(-((x - x_0) / w)^2)",
     reference="away from {x} = {x_0}",
     parameters=(
         amplitude("A", "{y}", 0.1, "height"),
         Parameter("x_0", "{x}", 0.0, (-1e12, 1e12), "middle", search="inside"),
         Parameter("w", "{x}", 1.0, (1e-6, 1e12), "half-width at 1/e", search="span"),
     ),
-    shape=bump_shape,
     source="Form: ours. A Gaussian bell, smooth and local.",
     # By hand: one half-width from the middle, 1/e = 0.36787944117144233.
     worked=({"x": 1.0, "x_ref": 0.0}, {"A": 2.0, "x_0": 3.0, "w": 2.0}, 2.0 * 0.36787944117144233),
     narrow=True,
     along_calendar=False,
 )
+def bump(inputs, *, A, x_0, w):
+    r"""Local bump in any channel: a worn place, a joint in the track, an hour when the door stood open."""
+    return A * np.exp(-(((np.asarray(inputs[CHANNEL], dtype=float) - x_0) / w) ** 2))
 
 
-def sinusoid_shape(inputs, *, A, lambda_, phi):
+@effect(
+    closed_form,
+    label="periodic in {x}",
+    equation="h = A sin(2 pi (x - x_ref) / lambda + phi)",
+    reference="mean over a wavelength",
+    acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
+    parameters=(
+        amplitude("A", "{y}", 0.1, "amplitude"),
+        Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
+        Parameter("phi", "rad", 0.0, PHASE, "phase at 0, or x_ref", search=PHASES),
+    ),
+    source="Form: ours. The first Fourier term of anything periodic.",
+    # By hand: 0.02 of a period of 0.04 is half a turn, and sin(pi + pi/6) = -sin(pi/6) = -1/2.
+    worked=({"x": 0.02}, {"A": 4.0, "lambda_": 0.04, "phi": np.pi / 6}, -2.0),
+    periodic=True,
+)
+def sinusoid(inputs, *, A, lambda_, phi):
     r"""Sine of any channel; along time it may be due to the mains, a servo or a pump.
 
     Along the position the same form is the physical effect `ripple`. x_ref is 0, or near the channel's values
@@ -316,49 +289,18 @@ def sinusoid_shape(inputs, *, A, lambda_, phi):
     return A * np.sin(angle) * sine_attenuation(inputs, CHANNEL, lambda_)
 
 
-SINUSOID = closed_form(
-    id="sinusoid",
-    label="periodic in {x}",
-    equation=r"h = A \sin(2 \pi (x - x_{ref}) / \lambda + \varphi)",
-    form="A sin(2 pi (x - x_ref) / lambda + phi)",
-    reference="mean over a wavelength",
-    acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
-    parameters=(
-        amplitude("A", "{y}", 0.1, "amplitude"),
-        Parameter("lambda_", "{x}", 1.0, (1e-6, 1e9), "period", search="span"),
-        Parameter("phi", "rad", 0.0, PHASE, "phase at 0, or x_ref", search=PHASES),
-    ),
-    shape=sinusoid_shape,
-    source="Form: ours. The first Fourier term of anything periodic.",
-    # By hand: 0.02 of a period of 0.04 is half a turn, and sin(pi + pi/6) = -sin(pi/6) = -1/2.
-    worked=({"x": 0.02}, {"A": 4.0, "lambda_": 0.04, "phi": np.pi / 6}, -2.0),
-    periodic=True,
-)
-
-
-def sinusoid_changing_shape(inputs, *, A, B, lambda_, phi):
-    r"""Sine of any channel whose amplitude is a straight line in a second one.
-
-    A screw that runs smoothly one way, a joint that is passed at speed, a guide that bends under load: the
-    ripple is stronger in one direction, at one end of the speeds, in some conditions.
-    """
-    return (A + B * deviation(inputs, SECOND)) * sinusoid_shape(inputs, A=1.0, lambda_=lambda_, phi=phi)
-
-
-SINUSOID_CHANGING = closed_form(
-    id="sinusoid_changing",
+@effect(
+    closed_form,
     label="periodic in {x}, with an amplitude that changes with {z}",
-    equation=r"h = (A + B (z - z_{ref})) \sin(2 \pi (x - x_{ref}) / \lambda + \varphi)",
-    form="(A + B (z - z_ref)) sin(2 pi (x - x_ref) / lambda + phi)",
+    equation="h = (A + B (z - z_ref)) sin(2 pi (x - x_ref) / lambda + phi)",
     reference="mean over a wavelength",
     reads=(CHANNEL, SECOND),
-    acts_on=SINUSOID.acts_on,
+    acts_on=sinusoid.effect.acts_on,
     parameters=(
         amplitude("A", "{y}", 0.1, "amplitude at z = z_ref"),
         amplitude("B", "{y}/{z}", 0.0, "its change with z"),
-        *SINUSOID.parameters[1:],
+        *sinusoid.effect.parameters[1:],
     ),
-    shape=sinusoid_changing_shape,
     source="Form: ours. The first Fourier term, with the first order of a change of its amplitude.",
     # By hand: -1/2 as above, times 4 + 3 * (5 - 3).
     worked=(
@@ -368,25 +310,19 @@ SINUSOID_CHANGING = closed_form(
     ),
     periodic=True,
 )
+def sinusoid_changing(inputs, *, A, B, lambda_, phi):
+    r"""Sine of any channel whose amplitude is a straight line in a second one.
 
-
-def sinusoid_harmonics_shape(inputs, *, A, B, lambda_, phi, phi_2):
-    r"""Sine of any channel with its second harmonic.
-
-    A bent and misaligned shaft, or the torque of a motor with its pole pairs, has components once and twice
-    per turn. The loop does not try this form, as it finds harmonics one at a time, each a ripple or sine with
-    its own period. It is for simulated campaigns and effects of users.
+    A screw that runs smoothly one way, a joint that is passed at speed, a guide that bends under load: the
+    ripple is stronger in one direction, at one end of the speeds, in some conditions.
     """
-    angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_
-    once, twice = (sine_attenuation(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
-    return A * np.sin(angle + phi) * once + B * np.sin(2 * angle + phi_2) * twice
+    return (A + B * deviation(inputs, SECOND)) * sinusoid(inputs, A=1.0, lambda_=lambda_, phi=phi)
 
 
-SINUSOID_HARMONICS = closed_form(
-    id="sinusoid_harmonics",
+@effect(
+    closed_form,
     label="periodic in {x}, with a second harmonic",
-    equation=r"h = A \sin(2 \pi x / \lambda + \varphi) + B \sin(4 \pi x / \lambda + \varphi_2)",
-    form="A sin(2 pi x / lambda + phi) + B sin(4 pi x / lambda + phi_2)",
+    equation="h = A sin(2 pi x / lambda + phi) + B sin(4 pi x / lambda + phi_2)",
     reference="mean over a wavelength",
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(
@@ -396,13 +332,22 @@ SINUSOID_HARMONICS = closed_form(
         Parameter("phi", "rad", 0.0, PHASE, "phase at 0", search=PHASES),
         Parameter("phi_2", "rad", 0.0, PHASE, "phase of the harmonic at 0", search=PHASES),
     ),
-    shape=sinusoid_harmonics_shape,
     source="Form: ours. The first two Fourier terms of anything periodic.",
     # By hand: 0.02 of a period of 0.04 is half a turn: 4 sin(pi + pi/6) = -2; a whole one: 1.5 sin(2 pi +
     # pi/2) = 1.5.
     worked=({"x": 0.02}, {"A": 4.0, "B": 1.5, "lambda_": 0.04, "phi": np.pi / 6, "phi_2": np.pi / 2}, -0.5),
     periodic=True,
 )
+def sinusoid_harmonics(inputs, *, A, B, lambda_, phi, phi_2):
+    r"""Sine of any channel with its second harmonic.
+
+    A bent and misaligned shaft, or the torque of a motor with its pole pairs, has components once and twice
+    per turn. The loop does not try this form, as it finds harmonics one at a time, each a ripple or sine with
+    its own period. It is for simulated campaigns and effects of users.
+    """
+    angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_
+    once, twice = (sine_attenuation(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
+    return A * np.sin(angle + phi) * once + B * np.sin(2 * angle + phi_2) * twice
 
 
 # ---------------------------------------------------------------- two channels
@@ -418,7 +363,7 @@ class Scales(NamedTuple):
 
     suffix: str  # of the id
     label: str
-    u: str  # LaTeX
+    u: str  # in the equation
     w: str
     first: Callable  # (inputs, CHANNEL) -> u, shape (n,)
     second: Callable  # (inputs, SECOND) -> w, shape (n,)
@@ -434,19 +379,19 @@ class Scales(NamedTuple):
 # negative.
 SCALES = (
     Scales(
-        "", "{x} and {z}", "x - x_{ref}", "z - z_{ref}", deviation, deviation,
+        "", "{x} and {z}", "x - x_ref", "z - z_ref", deviation, deviation,
         ("{y}/({x} {z})", "{y}/{x}", "{y}/{z}"), "slope of a slope", "two channels",
         # By hand: u = 2, w = -3; 0.5 * 2 * -3 = -3, and -3 + 2 - 6.
         {"x": 12.0, "x_ref": 10.0, "z": 1.0, "z_ref": 4.0}, (-3.0, -7.0),
     ),
     Scales(
-        "_log", "log {x} and {z}", r"\ln(x / x_{ref})", "z - z_{ref}", log_ratio, deviation,
+        "_log", "log {x} and {z}", "ln(x / x_ref)", "z - z_ref", log_ratio, deviation,
         ("{y}/{z}", "{y}", "{y}/{z}"), "slope in z of the slope in ln x", "ln x and z",
         # By hand: u = ln e = 1, w = -3; -1.5, and -1.5 + 1 - 6.
         {"x": np.e, "x_ref": 1.0, "z": 1.0, "z_ref": 4.0}, (-1.5, -6.5),
     ),
     Scales(
-        "_logs", "log {x} and log of 1 + {z}", r"\ln(x / x_{ref})", r"\ln((1 + z) / (1 + z_{ref}))",
+        "_logs", "log {x} and log of 1 + {z}", "ln(x / x_ref)", "ln((1 + z) / (1 + z_ref))",
         log_ratio, log_ratio_from_zero, ("{y}", "{y}", "{y}"), "slope of a slope, in logarithms",
         "ln x and ln(1 + z)",
         # By hand: u = ln e = 1, w = ln e^2 = 2; 1, and 1 + 1 + 4.
@@ -461,12 +406,8 @@ def bilinear_shape(first: Callable, second: Callable, inputs, *, A, B=0.0, C=0.0
     return A * u * w + B * u + C * w
 
 
-def _plain(latex: str) -> str:
-    return latex.replace("\\", "").replace("{ref}", "ref")
-
-
-def _factor(latex: str) -> str:
-    return latex if latex.startswith("\\") else f"({latex})"
+def _factor(scale: str) -> str:
+    return scale if scale.startswith("ln") else f"({scale})"
 
 
 def _closed_form(scales: Scales, kind: str, *, alone: bool) -> Effect:
@@ -475,8 +416,8 @@ def _closed_form(scales: Scales, kind: str, *, alone: bool) -> Effect:
     A product alone is for an effect that shows only where both channels are away from their means. Speed
     times days: aged rubber loses more friction at high speed than unaged rubber does.
     """
-    s, product = scales, f"{_factor(scales.u)} {_factor(scales.w)}"
-    values = {"A": 0.5, "B": 1.0, "C": 2.0}
+    s, values = scales, {"A": 0.5, "B": 1.0, "C": 2.0}
+    warped_plane = f"h = A u w + B u + C w, u = {s.u}, w = {s.w}"
     meanings = (
         "slope of a slope" if alone else s.meaning,
         "slope in the first channel",
@@ -486,8 +427,7 @@ def _closed_form(scales: Scales, kind: str, *, alone: bool) -> Effect:
     return closed_form(
         id=kind + s.suffix,
         label=f"product of {s.label}" + ", and each alone" * alone,
-        equation=rf"h = A u w + B u + C w, \quad u = {s.u}, \; w = {s.w}" if alone else f"h = A {product}",
-        form=f"A u w + B u + C w, u = {_plain(s.u)}, w = {_plain(s.w)}" if alone else f"A {_plain(product)}",
+        equation=warped_plane if alone else f"h = A {_factor(s.u)} {_factor(s.w)}",
         reference=f"{{x}} = {{x_ref}} {'and' if alone else 'or'} {{z}} = {{z_ref}}",
         reads=(CHANNEL, SECOND),
         parameters=tuple(

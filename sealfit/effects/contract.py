@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from types import ModuleType
 from typing import Literal, get_args
 
 import numpy as np
@@ -109,6 +110,8 @@ class Effect:
     (n,). It is zero if all amplitudes are zero, and NaN (without a warning) where the form is not defined,
     such as the logarithm of zero.
 
+    The effects of the catalogue are functions below an `effect` that describes them.
+
     `reference` describes the state in which the shape is zero; mu_0, a and b of the after-model refer to it.
     `{x}`, `{z}` and `{load_N}` stand for channels, `{x_ref}` and the like for fixed reference values, `{x_0}`
     for a parameter.
@@ -116,8 +119,7 @@ class Effect:
 
     id: str
     label: str  # name in reports; {x} stands for the channel
-    equation: str  # LaTeX
-    form: str  # the same in plain text, as closure.json prints it
+    equation: str  # in plain text: "h = A (1 - exp(-t / tau))"
     reads: tuple[str, ...]
     acts_on: tuple[tuple[Target, Operation], ...]  # allowed pairs, most likely first
     parameters: tuple[Parameter, ...]
@@ -141,6 +143,11 @@ class Effect:
             raise ParameterError(f"effect {self.id}: mark at least one parameter as linear (its amplitude).")
 
     @property
+    def form(self) -> str:
+        """Right side of the equation, as closure.json prints it."""
+        return self.equation.removeprefix("h = ")
+
+    @property
     def linear(self) -> tuple[str, ...]:
         """Names of the amplitudes."""
         return tuple(p.name for p in self.parameters if p.linear)
@@ -158,6 +165,25 @@ class Effect:
 # A closed form is of any one channel, zero at its reference, acts anywhere and names no mechanism, unless it
 # says otherwise.
 closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, reference="{x} = {x_ref}", physical=False)
+
+
+def effect(make: Callable[..., Effect] = Effect, **description) -> Callable:
+    """Return a decorator that describes a shape: its attribute `effect` is the effect, whose id is its name.
+
+    `description` has the other fields of `Effect`; `closed_form` may stand for `Effect`.
+    """
+
+    def describe(shape: Callable) -> Callable:
+        shape.effect = make(id=shape.__name__, shape=shape, **description)
+        return shape
+
+    return describe
+
+
+def effects_in(module: ModuleType) -> list[Effect]:
+    """Return the effects at the top level of a module, in their order: described functions, and `Effect`."""
+    values = (getattr(value, "effect", value) for value in vars(module).values())
+    return [value for value in values if isinstance(value, Effect)]
 
 
 def reference(inputs: Mapping[str, object], name: str, default: float) -> float:

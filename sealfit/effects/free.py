@@ -43,8 +43,8 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
     return closed_form(
         id=LEVELS,
         label="levels of {x}",
-        equation=r"h = \sum_k d_k [x = k]",
-        form=f"d_k for category k of {listed(names)}; 0 for {names[0]}" + LESS_MEAN * (means is not None),
+        equation=f"h = d_k for category k of {listed(names)}; 0 for {names[0]}"
+        + LESS_MEAN * (means is not None),
         reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {names[0]}",
         parameters=tuple(
             amplitude(f"d_{k}", "{y}", 0.0, f"{name} less {names[0]}")
@@ -88,8 +88,7 @@ def slopes_effect(categories: Sequence[str]) -> Effect:
     return closed_form(
         id=SLOPES,
         label="linear in {x}, by {z}",
-        equation=r"h = \sum_k e_k [z = k] (x - x_{ref})",
-        form=f"e_k (x - x_ref) for category k of {listed(names)}",
+        equation=f"h = e_k (x - x_ref) for category k of {listed(names)}",
         reads=(CHANNEL, SECOND),
         parameters=tuple(
             amplitude(f"e_{k}", "{y}/{x}", 0.0, f"slope for {name}") for k, name in enumerate(names, start=1)
@@ -162,9 +161,8 @@ def smooth_effect(
     return closed_form(
         id=SMOOTH,
         label="smooth in {x}",
-        equation=r"h = \sum_j c_j B_j(x)",
-        form=f"natural cubic spline through (x_j, c_j), knots {listed(places)}, zero at {places[zero]:.6g}"
-        + LESS_MEAN * (means is not None),
+        equation=f"h = natural cubic spline through (x_j, c_j), knots {listed(places)}, "
+        f"zero at {places[zero]:.6g}" + LESS_MEAN * (means is not None),
         reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {places[zero]:.6g}",
         parameters=tuple(
             amplitude(f"c_{j + 1}", "{y}", 0.0, f"value at {places[j]:.6g} less that at {places[zero]:.6g}")
@@ -250,8 +248,7 @@ def surface_effect(
     return closed_form(
         id=SURFACE,
         label="smooth in {x} and {z}",
-        equation=r"h = \sum_{jk} c_{jk} B_j(x) B_k(z)",
-        form="natural cubic splines through (x_j, z_k, c_jk), knots "
+        equation="h = natural cubic splines through (x_j, z_k, c_jk), knots "
         + " and ".join(listed(given) for given in knots)
         + f", zero at {knots[0][0]:.6g} and {knots[1][0]:.6g}"
         + LESS_MEAN * (means is not None),

@@ -8,35 +8,19 @@ from sealfit.effects.contract import (
     CHANNEL,
     PHASE,
     PHASES,
-    Effect,
     Parameter,
     amplitude,
     deviation,
+    effect,
     factors,
     reference,
     sine_attenuation,
 )
 
 
-def ripple_shape(inputs, *, A, lambda_, phi):
-    r"""Ripple along the rig's position, due to a screw, a guide or a periodic track.
-
-    A lead screw with a pitch error, a bent shaft or an eccentric coupling gives a force that is periodic in
-    the rig's coordinate. The wavelength is the pitch, or an integer fraction of it for a screw of several
-    starts. It is an added force, the same in both directions, if the drive strains the sensor, and a factor
-    on friction if the pressure or the surface of the contact is periodic along the track. A harmonic is a
-    further ripple of half or a third of the wavelength. Positions beyond the tested ones are extrapolated in
-    phase. x_ref is 0, or near the positions of a rig that counts from far away.
-    """
-    x = np.asarray(inputs["displacement_mm"], dtype=float) - reference(inputs, CHANNEL, 0.0)
-    return A * np.sin(2 * np.pi * x / lambda_ + phi) * sine_attenuation(inputs, "displacement_mm", lambda_)
-
-
-RIPPLE = Effect(
-    id="ripple",
+@effect(
     label="ripple along the rig's position",
-    equation=r"h = A \sin(2 \pi (x - x_{ref}) / \lambda + \varphi)",
-    form="A sin(2 pi (x - x_ref) / lambda + phi)",
+    equation="h = A sin(2 pi (x - x_ref) / lambda + phi)",
     reference="mean over a wavelength",
     reads=("displacement_mm",),
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
@@ -52,16 +36,38 @@ RIPPLE = Effect(
         ),
         Parameter("phi", "rad", 0.0, PHASE, "phase at position 0, or x_ref", search=PHASES),
     ),
-    shape=ripple_shape,
     source="Form: ours. A cyclic error of a screw is periodic in its angle; "
     "the sine is its first Fourier term.",
     # By hand: 0.5 mm of a 2 mm pitch is a quarter turn, pi/2; with phi = pi/3 the sine is cos(pi/3) = 1/2.
     worked=({"displacement_mm": 0.5}, {"A": 3.0, "lambda_": 2.0, "phi": np.pi / 3}, 1.5),
     periodic=True,
 )
+def ripple(inputs, *, A, lambda_, phi):
+    r"""Ripple along the rig's position, due to a screw, a guide or a periodic track.
+
+    A lead screw with a pitch error, a bent shaft or an eccentric coupling gives a force that is periodic in
+    the rig's coordinate. The wavelength is the pitch, or an integer fraction of it for a screw of several
+    starts. It is an added force, the same in both directions, if the drive strains the sensor, and a factor
+    on friction if the pressure or the surface of the contact is periodic along the track. A harmonic is a
+    further ripple of half or a third of the wavelength. Positions beyond the tested ones are extrapolated in
+    phase. x_ref is 0, or near the positions of a rig that counts from far away.
+    """
+    x = np.asarray(inputs["displacement_mm"], dtype=float) - reference(inputs, CHANNEL, 0.0)
+    return A * np.sin(2 * np.pi * x / lambda_ + phi) * sine_attenuation(inputs, "displacement_mm", lambda_)
 
 
-def drift_shape(inputs, *, A):
+@effect(
+    label="sensor drift in time",
+    equation="h = A t",
+    reference="time 0 of the file",
+    reads=("time_s",),
+    acts_on=(("force", "add"),),
+    parameters=(amplitude("A", "{y}/{x}", 0.01, "drift of the force per time"),),
+    source="Form: ours. First order in time of a slow change of the zero.",
+    # By hand: 20 s at 0.02 N/s.
+    worked=({"time_s": 20.0}, {"A": 0.02}, 0.4),
+)
+def drift(inputs, *, A):
     r"""Drift of the force channel along a record: a strain-gauge bridge or its amplifier warming up.
 
     A is the rate. The added force does not depend on the direction of motion. Time is that of the file, so
@@ -70,23 +76,18 @@ def drift_shape(inputs, *, A):
     return A * np.asarray(inputs["time_s"], dtype=float)
 
 
-DRIFT = Effect(
-    id="drift",
-    label="sensor drift in time",
-    equation=r"h = A t",
-    form="A t",
-    reference="time 0 of the file",
-    reads=("time_s",),
+@effect(
+    label="zero offset of the force",
+    equation="h = A",
+    reference="zero offset removed",
+    reads=("direction",),
     acts_on=(("force", "add"),),
-    parameters=(amplitude("A", "{y}/{x}", 0.01, "drift of the force per time"),),
-    shape=drift_shape,
-    source="Form: ours. First order in time of a slow change of the zero.",
-    # By hand: 20 s at 0.02 N/s.
-    worked=({"time_s": 20.0}, {"A": 0.02}, 0.4),
+    parameters=(amplitude("A", "{y}", 0.1, "force shown when none acts"),),
+    source="Form: ours. Definition of a zero offset.",
+    # By hand: the offset itself, in both directions.
+    worked=({"direction": -1.0}, {"A": 0.3}, 0.3),
 )
-
-
-def zero_offset_shape(inputs, *, A):
+def zero_offset(inputs, *, A):
     r"""Zero offset of the force channel: a constant added force, the same in both directions.
 
     It is the half-sum of forward and backward force. Strokes in one direction do not distinguish it from
@@ -96,23 +97,22 @@ def zero_offset_shape(inputs, *, A):
     return A * np.ones_like(np.asarray(inputs["direction"], dtype=float))
 
 
-ZERO_OFFSET = Effect(
-    id="zero_offset",
-    label="zero offset of the force",
-    equation=r"h = A",
-    form="A",
+@effect(
+    label="zero offset of the force that changes with {x}",
+    equation="h = A (x - x_ref) + B",
     reference="zero offset removed",
-    reads=("direction",),
+    reads=(CHANNEL, "direction"),
     acts_on=(("force", "add"),),
-    parameters=(amplitude("A", "{y}", 0.1, "force shown when none acts"),),
-    shape=zero_offset_shape,
-    source="Form: ours. Definition of a zero offset.",
-    # By hand: the offset itself, in both directions.
-    worked=({"direction": -1.0}, {"A": 0.3}, 0.3),
+    parameters=(
+        amplitude("A", "{y}/{x}", 0.01, "slope of the offset"),
+        amplitude("B", "{y}", 0.0, "offset at the reference"),
+    ),
+    source="Form: ours. Force on a piston, F = p A, and definition of a zero offset.",
+    # By hand: 0.5 * (7 - 3) - 1.5, in both directions.
+    worked=({"x": 7.0, "x_ref": 3.0, "direction": -1.0}, {"A": 0.5, "B": -1.5}, 0.5),
+    physical=False,
 )
-
-
-def offset_slope_shape(inputs, *, A, B):
+def offset_slope(inputs, *, A, B):
     r"""Zero offset of the force that changes with a channel, the same in both directions.
 
     The force on a piston is pressure times area, so that an error dA of the area adds dA p to the measured
@@ -122,27 +122,22 @@ def offset_slope_shape(inputs, *, A, B):
     return A * deviation(inputs, CHANNEL) + B
 
 
-OFFSET_SLOPE = Effect(
-    id="offset_slope",
-    label="zero offset of the force that changes with {x}",
-    equation=r"h = A (x - x_{ref}) + B",
-    form="A (x - x_ref) + B",
-    reference="zero offset removed",
-    reads=(CHANNEL, "direction"),
-    acts_on=(("force", "add"),),
-    parameters=(
-        amplitude("A", "{y}/{x}", 0.01, "slope of the offset"),
-        amplitude("B", "{y}", 0.0, "offset at the reference"),
+@effect(
+    label="direction asymmetry",
+    equation="h = A d / 2, d = +1 forward, -1 backward",
+    reference="mean of the two directions",
+    reads=("direction",),
+    acts_on=(
+        *factors("mu", "force", "mu_c", "mu_s", "v_s"),
+        ("sigma_2", "add"),
+        *factors("sigma_2", "a", "b", "mu_0"),
     ),
-    shape=offset_slope_shape,
-    source="Form: ours. Force on a piston, F = p A, and definition of a zero offset.",
-    # By hand: 0.5 * (7 - 3) - 1.5, in both directions.
-    worked=({"x": 7.0, "x_ref": 3.0, "direction": -1.0}, {"A": 0.5, "B": -1.5}, 0.5),
-    physical=False,
+    parameters=(amplitude("A", "{y}", 0.05, "forward minus backward"),),
+    source="Form: ours. The odd part in direction of any two values, halved so that A is their difference.",
+    # By hand: backward, half of the difference below the mean.
+    worked=({"direction": -1.0}, {"A": 0.1}, -0.05),
 )
-
-
-def asymmetry_shape(inputs, *, A):
+def asymmetry(inputs, *, A):
     r"""Direction asymmetry: a parameter that differs between the two directions.
 
     Friction of a lip seal, a misaligned sample or a polished track depends on the direction d, +1 or -1. A is
@@ -152,27 +147,18 @@ def asymmetry_shape(inputs, *, A):
     return A * np.asarray(inputs["direction"], dtype=float) / 2
 
 
-ASYMMETRY = Effect(
-    id="asymmetry",
-    label="direction asymmetry",
-    equation=r"h = A d / 2",
-    form="A d / 2, d = +1 forward, -1 backward",
-    reference="mean of the two directions",
-    reads=("direction",),
-    acts_on=(
-        *factors("mu", "force", "mu_c", "mu_s", "v_s"),
-        ("sigma_2", "add"),
-        *factors("sigma_2", "a", "b", "mu_0"),
-    ),
-    parameters=(amplitude("A", "{y}", 0.05, "forward minus backward"),),
-    shape=asymmetry_shape,
-    source="Form: ours. The odd part in direction of any two values, halved so that A is their difference.",
-    # By hand: backward, half of the difference below the mean.
-    worked=({"direction": -1.0}, {"A": 0.1}, -0.05),
+@effect(
+    label="drift along the campaign",
+    equation="h = A t",
+    reference="start of the campaign",
+    reads=("elapsed_h",),
+    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
+    parameters=(amplitude("A", "{y}/{x}", 1e-4, "change per time of the campaign"),),
+    source="Form: ours. First order in time of a slow change.",
+    # By hand: 200 h at 0.05 % per hour.
+    worked=({"elapsed_h": 200.0}, {"A": 5e-4}, 0.1),
 )
-
-
-def campaign_drift_shape(inputs, *, A):
+def campaign_drift(inputs, *, A):
     r"""Drift along the campaign: a slow change over the days of testing.
 
     It may be due to a track that polishes, a sensor that ages, or rubber that goes on aging in the
@@ -181,22 +167,6 @@ def campaign_drift_shape(inputs, *, A):
     the calendar of aging it is not distinguishable from the aging law.
     """
     return A * np.asarray(inputs["elapsed_h"], dtype=float)
-
-
-CAMPAIGN_DRIFT = Effect(
-    id="campaign_drift",
-    label="drift along the campaign",
-    equation=r"h = A t",
-    form="A t",
-    reference="start of the campaign",
-    reads=("elapsed_h",),
-    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
-    parameters=(amplitude("A", "{y}/{x}", 1e-4, "change per time of the campaign"),),
-    shape=campaign_drift_shape,
-    source="Form: ours. First order in time of a slow change.",
-    # By hand: 200 h at 0.05 % per hour.
-    worked=({"elapsed_h": 200.0}, {"A": 5e-4}, 0.1),
-)
 
 
 # Period of day and night, in h.
@@ -213,21 +183,9 @@ def _shows_days(hours: np.ndarray) -> bool:
     return sum(span >= LEAST_PART * DAY_H for span in spans) >= LEAST_DAYS
 
 
-def day_and_night_shape(inputs, *, A, t_0):
-    r"""Change with the time of day: laboratory, drive and oil are warmer in the afternoon than at night.
-
-    t is the time since the campaign's first file. With files in working hours only it describes the change
-    within them and must not be used for the night.
-    """
-    hours = np.asarray(inputs["elapsed_h"], dtype=float) - t_0
-    return A * np.cos(2 * np.pi * hours / DAY_H)
-
-
-DAY_AND_NIGHT = Effect(
-    id="day_and_night",
+@effect(
     label="change with the time of day",
-    equation=r"h = A \cos(2 \pi (t - t_0) / 24\,\mathrm{h})",
-    form="A cos(2 pi (t - t_0) / 24 h)",
+    equation="h = A cos(2 pi (t - t_0) / 24 h)",
     reference="mean over a day",
     reads=("elapsed_h",),
     acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
@@ -242,9 +200,16 @@ DAY_AND_NIGHT = Effect(
             search=(0.0, 3.0, 6.0, 9.0),
         ),
     ),
-    shape=day_and_night_shape,
     source="Form: ours. The first Fourier term of anything that repeats every day.",
     # By hand: 4 h from the largest value is a sixth of a day, and cos 60 degrees = 1/2.
     worked=({"elapsed_h": 58.0}, {"A": 0.04, "t_0": 6.0}, 0.02),
     shown_by=_shows_days,
 )
+def day_and_night(inputs, *, A, t_0):
+    r"""Change with the time of day: laboratory, drive and oil are warmer in the afternoon than at night.
+
+    t is the time since the campaign's first file. With files in working hours only it describes the change
+    within them and must not be used for the night.
+    """
+    hours = np.asarray(inputs["elapsed_h"], dtype=float) - t_0
+    return A * np.cos(2 * np.pi * hours / DAY_H)

@@ -20,7 +20,7 @@ from types import ModuleType
 import numpy as np
 
 from sealfit.effects import EFFECTS
-from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect, Parameter
+from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect, Parameter, effects_in
 from sealfit.effects.free import FREE
 from sealfit.errors import ConfigError, ParameterError
 
@@ -82,9 +82,8 @@ def _read_again(path: Path, id: str) -> FileShape:
 
 
 def _effects_of(path: Path) -> list[Effect]:
-    own = [value for value in vars(_run(path)).values() if isinstance(value, Effect)]
     # not what it imported
-    unique = {id(effect): effect for effect in own if EFFECTS.get(effect.id) is not effect}
+    unique = {id(one): one for one in effects_in(_run(path)) if EFFECTS.get(one.id) is not one}
     if not unique:
         raise ConfigError(
             "holds no effect.", file=path, fix=f"Define one at its top level, or move the file. {EXAMPLE}"
@@ -147,7 +146,7 @@ def contract_fault(effect: Effect) -> str:
 
 
 def _description_faults(effect: Effect) -> Iterator[str]:
-    for name in ("label", "equation", "form", "source"):
+    for name in ("label", "equation", "source"):
         if not (isinstance(getattr(effect, name), str) and getattr(effect, name).strip()):
             yield f"its {name} is empty"
     if not effect.acts_on:

@@ -37,12 +37,22 @@ def test_effects_come_in_the_order_of_the_files_and_others_are_let_be(tmp_path):
     assert list(load_user_effects(tmp_path)) == ["first", "second"]
 
 
+def test_a_described_function_is_an_effect_as_well(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "own-effects.md").read_text("utf-8")
+    write(tmp_path, "patch.py", page.split("```python\n")[1].split("```")[0])
+    (found,) = load_user_effects(tmp_path).values()
+    assert (found.id, found.form) == ("worn_patch", "A / (1 + (x - x_0)^2)")
+    inputs = {"displacement_mm": np.array([3.0, 4.0])}
+    for one in (found, pickle.loads(pickle.dumps(found))):
+        npt.assert_array_equal(one.shape(inputs, A=-0.2, x_0=3.0), [-0.2, -0.1])
+
+
 def test_an_empty_folder_has_no_effects(tmp_path):
     assert load_user_effects(tmp_path) == {}
 
 
 def test_an_imported_effect_of_the_catalogue_is_not_the_files_own(tmp_path):
-    write(tmp_path, "patch.py", "from sealfit.effects.closed_forms import LINEAR\n" + WORN_PATCH)
+    write(tmp_path, "patch.py", "from sealfit.effects.closed_forms import linear\n" + WORN_PATCH)
     assert list(load_user_effects(tmp_path)) == ["worn_patch"]
 
 

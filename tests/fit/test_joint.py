@@ -17,8 +17,7 @@ from sealfit.fit.joint.search import start_model
 WAVE = Effect(
     id="wave",
     label="wave along {x}",
-    equation="A sin(k x)",
-    form="A sin(k x)",
+    equation="h = A sin(k x)",
     reads=(CHANNEL,),
     acts_on=tuple((t, o) for t in TARGETS for o in ("add", "multiply")),
     parameters=(

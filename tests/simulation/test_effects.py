@@ -141,8 +141,7 @@ def test_catalogue_effects_are_resolved_with_their_shapes(campaign, monkeypatch)
     halving = Effect(
         id="halving",
         label="halving with {x}",
-        equation="A 2^{-x/h}",
-        form="A 2^(-x/h)",
+        equation="h = A 2^(-x/h)",
         reads=("x", "load_N"),
         acts_on=(("mu", "multiply"), ("force", "add")),
         parameters=(
