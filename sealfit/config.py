@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from functools import partial
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -34,6 +34,9 @@ from sealfit.units import Conversion, Units, conversion
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 MOST = 10**9  # largest whole number of a config: no file has more lines
 LONGEST_PATTERN = 1000  # characters; a longer one takes long to compile
+
+
+Table = TypeVar("Table", bound=BaseModel)
 
 
 class Strict(BaseModel):
@@ -545,26 +548,35 @@ def read_config(path: Path | None = None) -> str:
     """
     if path is None:
         return files("sealfit").joinpath("configs/default.toml").read_text("utf-8")
+    return read_toml(path, "Check --config.")
+
+
+def read_toml(path: Path, fix: str) -> str:
+    """Return the text of a file; ConfigError, whose fix names the likeliest file, if it cannot be read."""
     try:
         if Path(path).exists() and not Path(path).is_file():  # a pipe would be waited for
-            raise ConfigError("is not a file.", file=path, fix="Check --config.")
+            raise ConfigError("is not a file.", file=path, fix=fix)
         return Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
     except OSError as error:
-        fix = did_you_mean(Path(path), Path.is_file) or "Check --config."
-        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix=fix) from error
+        likely = did_you_mean(Path(path), Path.is_file)
+        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, fix=likely or fix) from error
     except UnicodeDecodeError as error:
         raise ConfigError("is not UTF-8.", file=path, fix="Save it as UTF-8.") from error
 
 
 def parse_config(text: str, name: str) -> Config:
     """Return the config written in `text`, which messages call `name`; errors as `load_config`."""
-    fix = "docs/reference/config.md has every key."
+    return parse_toml(Config, text, name, "docs/reference/config.md has every key.")
+
+
+def parse_toml(model: type[Table], text: str, name: str | Path, fix: str) -> Table:
+    """Return what the text of a TOML file says as a `model`; ConfigError, with a sentence for each fault."""
     try:
-        return Config.model_validate(tomllib.loads(text))
+        return model.model_validate(tomllib.loads(text))
     except ValidationError as error:
-        raise ConfigError(
-            explain(error, Config, text), file=name, line=line_of(error, text), fix=fix
-        ) from error
+        faults = error.errors()
+        line = _line(faults[0], text) if len(faults) == 1 else None
+        raise ConfigError(explain(error, model, text), file=name, line=line, fix=fix) from error
     except (ValueError, RecursionError) as error:  # a number of thousands of digits, or lists in lists
         raise ConfigError(f"is not TOML: {error}.", file=name, fix=fix) from error
 
@@ -594,11 +606,6 @@ def _given(fault: Mapping) -> str:
     if own or not isinstance(fault["input"], str | int | float):
         return ""
     return f"{shortened(repr(fault['input']))}: "
-
-
-def line_of(error: ValidationError, text: str) -> int | None:
-    """Return the line of the one fault that a config has; None of several."""
-    return _line(error.errors()[0], text) if error.error_count() == 1 else None
 
 
 def _line(fault: Mapping, text: str) -> int | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from datetime import datetime, timedelta
 from itertools import product
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, ValidationError, model_validator
 
-from sealfit.config import Strict, explain, line_of
+from sealfit.config import Strict, explain, parse_toml, read_toml
 from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import parse
@@ -275,26 +274,10 @@ def load_spec(path: Path) -> Spec:
         If the file is missing, is not TOML, has a key or value that is not allowed, or names an effect,
         parameter or channel that does not exist; one sentence per fault.
     """
+    text = read_toml(path, "Check the path of SPEC.")
+    spec = parse_toml(Spec, text, path, "sample_data/README.md lists every key.")
     try:
-        text = Path(path).read_text("utf-8-sig")  # Windows editors begin with a byte-order mark
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be read ({error.strerror}).", file=path, fix="Check the path of SPEC."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError("is not UTF-8.", file=path, fix="Save it as UTF-8.") from error
-    try:
-        spec = Spec.model_validate(tomllib.loads(text))
         resolve_effects(spec.effects)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(
-            f"is not TOML: {error}.", file=path, fix="See sample_data/simulated.spec.toml for an example."
-        ) from error
-    except ValidationError as error:
-        fix = "sample_data/README.md lists every key."
-        raise ConfigError(
-            explain(error, Spec, text), file=path, line=line_of(error, text), fix=fix
-        ) from error
     except ConfigError as error:
         raise ConfigError(error.message, file=path, fix=error.fix) from error
     return spec
