@@ -22,7 +22,6 @@ from typer.core import TyperCommand
 from sealfit import __version__
 from sealfit.engine import one_thread
 from sealfit.errors import (
-    LONGEST_PATH,
     MEMORY,
     MORE_MEMORY,
     SealfitError,
@@ -61,6 +60,8 @@ Json = Annotated[bool, Option("--json", help="Print exactly one JSON object on s
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)  # what the system refuses to open
 BUG = 70  # EX_SOFTWARE of sysexits.h
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+INTERRUPTION = "interrupted; what was complete before is kept."
+REPORT = "Please report it, with the traceback on stderr."
 
 
 def end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: bool) -> None:
@@ -95,69 +96,49 @@ def exit_code(app: typer.Typer) -> int:
     one_thread()
     try:
         code = app(standalone_mode=False, prog_name="sealfit") or 0
-        return _interrupted() if code == INTERRUPTED else code
+        return code if code != INTERRUPTED else _fail(SealfitError(INTERRUPTION), INTERRUPTED)
     except SealfitError as error:
-        return _fail(f"sealfit: {error}", error.as_dicts(), 1)
+        return _fail(error)
     except (KeyboardInterrupt, typer.Abort):  # or the code above: which one depends on typer's version
-        return _interrupted()
+        return _fail(SealfitError(INTERRUPTION), INTERRUPTED)
     except BrokenPipeError:  # `sealfit effects | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
         if memory_ran_out(error):
-            return _fail(f"sealfit: {MEMORY} {MORE_MEMORY}", [_error(MEMORY, fix=MORE_MEMORY)], 1)
+            return _fail(SealfitError(MEMORY, fix=MORE_MEMORY))
         if isinstance(error, OSError) and error.errno in FORBIDDEN and error.filename is not None:
-            return _forbidden(error)
-        # Faults of usage. Typer brings its own copy of click, or uses click, by version: told by what they
-        # can do.
-        if not (hasattr(error, "format_message") and hasattr(error, "exit_code")):
-            return _bug(error)
-        text = _usage_fault(error)
-        if "NoArgs" in type(error).__name__:  # `sealfit` alone: its message is the help
-            return _fail(text, [_error("no command was given.")], error.exit_code)
-        usage = error.ctx.get_usage() if getattr(error, "ctx", None) else ""
-        hint = f"Try: {error.ctx.command_path} --help" if usage else ""
-        shown = "\n".join(part for part in (usage, hint, f"sealfit: {text}") if part)
-        return _fail(shown, [_error(text)], error.exit_code)
+            file, reason = os.fsdecode(error.filename), f"there is no access ({error.strerror})."
+            fix = "Fix its name or rights, or those of the folders above it."
+            return _fail(SealfitError(reason, file=file, fix=fix))
+        # Typer brings its own copy of click, or uses click, by version: its errors are known by what they do.
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):
+            return _misuse(error)
+        traceback.print_exception(error)
+        said = " ".join("".join(traceback.format_exception_only(error)).split())
+        bug = {"reason": said, "kind": "bug"}
+        return _fail(SealfitError("this is a bug.", fix=REPORT), BUG, **bug)
 
 
-def _usage_fault(error: Exception) -> str:
-    """Return the message of a fault of usage, with the refused value where the typer in use leaves it out."""
+def _misuse(error: Exception) -> int:
+    """Report a fault of usage, with the refused value where the typer in use leaves it out."""
     if refused := getattr(error.__cause__, "errors", lambda: ())():
         error.message = f"{shortened(repr(refused[0]['input']))}: {error.message}"
-    return error.format_message()
+    text = error.format_message()
+    if "NoArgs" in type(error).__name__:  # `sealfit` alone: its message is the help
+        return _fail(SealfitError("no command was given."), error.exit_code, above=f"{text}\n\n")
+    usage = error.ctx.get_usage() if getattr(error, "ctx", None) else ""
+    above = f"{usage}\nTry: {error.ctx.command_path} --help\n" if usage else ""
+    return _fail(SealfitError(text), error.exit_code, above=above)
 
 
-def _fail(message: str, errors: list[dict], code: int) -> int:
+def _fail(error: SealfitError, code: int = 1, *, above: str = "", **known: str) -> int:
+    """Print an error, below other text, and return its exit code; under --json as an object, too."""
     if "--json" in sys.argv[1:]:
+        errors = [{**one, **known} for one in error.as_dicts()]
         print(json.dumps({"ok": False, "errors": errors}, indent=1, allow_nan=False))
-    print(printable(message), file=sys.stderr)
+    print(printable(f"{above}sealfit: {error}"), file=sys.stderr)
     return code
-
-
-def _forbidden(error: OSError) -> int:
-    """Report a file or folder without access, such as one in a folder that cannot be searched."""
-    file = shortened(os.fsdecode(error.filename), LONGEST_PATH)
-    reason = f"there is no access ({error.strerror})."
-    fix = "Fix its name or rights, or those of the folders above it."
-    return _fail(f"sealfit: {file}: {reason} {fix}", [_error(reason, file=file, fix=fix)], 1)
-
-
-def _bug(error: Exception) -> int:
-    """Report a fault of the program, not its input: the traceback on stderr, one line of it under --json."""
-    traceback.print_exception(error)
-    told = " ".join("".join(traceback.format_exception_only(error)).split())
-    fix = "Please report it, with the traceback on stderr."
-    return _fail(f"sealfit: this is a bug. {fix}", [_error(told, kind="bug", fix=fix)], BUG)
-
-
-def _interrupted() -> int:
-    text = "interrupted; what was complete before is kept."
-    return _fail(f"sealfit: {text}", [_error(text)], INTERRUPTED)
-
-
-def _error(reason: str, **known: str) -> dict:
-    return {"file": None, "line": None, "column": None, "value": None, "fix": "", "reason": reason, **known}
 
 
 # ---------------------------------------------------------------- cli
