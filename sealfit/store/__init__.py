@@ -16,10 +16,10 @@ from sealfit import __version__
 from sealfit.config import Config, Files
 from sealfit.engine import undisturbed
 from sealfit.errors import ConfigError, OutError, RequestError, StaleError, quoted
-from sealfit.store import manifest, staged_writes
+from sealfit.store import manifest
 from sealfit.store.manifest import STATE, ConfigCopy, Fingerprint, Properties, State, fingerprint, to_json
 from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
-from sealfit.store.staged_writes import PARQUET, PROVENANCE, Staged, disk, file_size, held
+from sealfit.store.staged_writes import COMPLETE, PARQUET, PROVENANCE, Staged, disk, file_size, held
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,11 +67,11 @@ class Store:
         ConfigError
             If `effects` may not be run, as `own_effects_folder`.
         """
+        if (out / COMPLETE).exists():
+            with held(out):  # which moves its files
+                return cls.open(out, effects)
         opened = _status_of(out)  # before it is read
         state = State.read(out)
-        if state is not None and state.moving is not None:
-            with held(out):  # which finishes it
-                return cls.open(out, effects)
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
             fix = f"Make them with: sealfit run CAMPAIGN --out {quoted(out)}"
@@ -163,7 +163,7 @@ class Store:
             try:
                 staged.text(STATE, to_json(tidy.as_dict(), indent=None))
                 with disk(self.out):
-                    staged.replace(STATE, STATE)
+                    staged.replace_state()
             finally:
                 staged.clear()
 
@@ -274,9 +274,11 @@ class Store:
     def _require_unchanged(self) -> None:
         """Raise OutError if another process has written since this one opened OUT for reading.
 
-        State.json changes before any other file does, so what was read until now is of one state.
+        The folder of a complete step is there before any file changes, and state.json changes last.
         """
-        if self._opened is not None and _status_of(self.out) != self._opened:
+        if self._opened is None:
+            return
+        if (self.out / COMPLETE).exists() or _status_of(self.out) != self._opened:
             raise OutError("was written while it was read.", file=self.out, fix="Run the command again.")
 
     def _parts_of(self, table: str) -> list[Path]:
@@ -335,33 +337,15 @@ class Store:
         key = self._step_keys(inputs)[name]
         done = manifest.Done(key, __version__, now, round(seconds, 3), files, checksums)
         earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
-        ended = replace(self.state, inputs=inputs, steps={**earlier, name: done})
-        left_over = self._left_over(steps[name].files if name in steps else {}, files)
-        begun = replace(ended, moving=manifest.Moving(staged.name, tuple(sorted(left_over))))
-        staged.text(staged_writes.BEGUN, to_json(begun.as_dict(), indent=None))
-        staged.text(staged_writes.ENDED, to_json(ended.as_dict(), indent=None))
-        staged.text(PROVENANCE, to_json(manifest.provenance(ended), indent=None))
-        # Until state.json is replaced, OUT is what it was. After that the step is done, and whoever opens OUT
-        # next moves the files if this process does not come to it.
+        state = replace(self.state, inputs=inputs, steps={**earlier, name: done})
+        staged.text(STATE, to_json(state.as_dict(), indent=None))
+        staged.text(PROVENANCE, to_json(manifest.provenance(state), indent=None))
         with undisturbed(), disk(self.out):
-            staged.sync()
-            staged.replace(staged_writes.BEGUN, STATE)
-            staged.committed = True
-            staged_writes.sync(self.out)
-            staged_writes.finish(self.out, begun)
-            self.state = ended
+            staged.commit()
+            self.state = state
         self._checksums |= done.checksums
         if staged.inputs is not None:
             self.marks, self._changed, self._keys = inputs, {}, None
-
-    def _left_over(self, old: Mapping[str, int], files: Mapping[str, int]) -> set[str]:
-        """Return the files of an earlier time of the step that are not its any more.
-
-        In the folder of a table nothing else may lie, whoever left it there: readers take all of it.
-        """
-        folders = {file.split("/")[0] for file in files if "/" in file and not file.startswith("plots/")}
-        lying = {f"{folder}/{path.name}" for folder in folders for path in (self.out / folder).glob("*")}
-        return (old.keys() | lying) - files.keys()
 
 
 def _status_of(out: Path) -> tuple | None:

@@ -10,7 +10,7 @@ import os
 import platform
 import stat
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatch
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePath
@@ -233,12 +233,6 @@ def _file_name(name: str) -> str:
     return name
 
 
-def _staging_folder(folder: str) -> str:
-    if not folder.startswith(STAGING):
-        raise ValueError(f"{folder} is no staging folder")
-    return _file_name(folder)
-
-
 FileOfOut = Annotated[str, AfterValidator(_file_of_out)]  # relative to OUT
 
 
@@ -264,17 +258,6 @@ class Properties:
 
 
 @dataclass(frozen=True, slots=True)
-class Moving:
-    """The files of the last step are being moved to their places from a folder in OUT; some may be there.
-
-    `left_over` are the files of an earlier time of the step, to be removed.
-    """
-
-    folder: Annotated[str, AfterValidator(_staging_folder)]
-    left_over: tuple[FileOfOut, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class State:
     """The content of state.json; `properties` where the results are of such a table and not of traces.
 
@@ -287,7 +270,6 @@ class State:
     inputs: Fingerprints = field(default_factory=dict)
     own_effects: dict[str, str | None] = field(default_factory=dict)
     steps: dict[str, Done] = field(default_factory=dict)
-    moving: Moving | None = None
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -316,8 +298,7 @@ class State:
                 raise ValueError
             if kept["format"] < FORMAT:  # of an earlier version: every step is out of date
                 kept = {name: kept.get(name) for name in ("campaign", "config", "properties")}
-            state = _STATE.validate_python(kept)
-            return state if state.steps else replace(state, moving=None)
+            return _STATE.validate_python(kept)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:

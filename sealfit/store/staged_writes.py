@@ -26,11 +26,14 @@ if TYPE_CHECKING:
     from sealfit.report.drawing import Drawn
 
 PROVENANCE = "provenance.json"
-BEGUN, ENDED = "begun.json", "ended.json"  # state.json while the files of a step are moved, and after that
 PARQUET = ".parquet"
 
 # ---------------------------------------------------------------- staged files
-# Files are written in a temporary folder and then moved, so that OUT has no partial files.
+# Files are written in a temporary folder, which is renamed when all of them are there. Then they are moved to
+# their places, state.json last. Whoever opens OUT after an interruption moves the rest of a complete folder,
+# and removes an incomplete one.
+
+COMPLETE = f"{STAGING}complete"
 
 
 class Staged:
@@ -38,12 +41,10 @@ class Staged:
 
     def __init__(self, out: Path, units: Units, step: str):
         self._out, self._units = out, units
-        self.name = f"{STAGING}{os.getpid()}-{step}"
-        self._folder = out / self.name
+        self._folder = out / f"{STAGING}{os.getpid()}-{step}"
         self.files: dict[str, int] = {}
         self.checksums: dict[str, str | None] = {}
         self.inputs: Fingerprints | None = None  # set by ingest: the files read
-        self.committed = False  # whether state.json says that these files are being moved
 
     def table(self, name: str, frame: pd.DataFrame) -> None:
         """Write table `name` of `tables.SCHEMAS`; ValueError if the frame lacks its columns or types."""
@@ -87,51 +88,64 @@ class Staged:
             self.files[name] = path.stat().st_size
             self.checksums[name] = fingerprint(path).sha256
 
-    def sync(self) -> None:
-        """Sync the folders of the staged files to the disk; the files are synced as they are written."""
+    def commit(self) -> None:
+        """Declare the staged files complete, and move them to their places."""
         folders = {(self._folder / file).parent for file in self.files}
         for folder in {*folders, self._folder}:
             if folder.is_dir():  # else its files are in OUT already
                 sync(folder)
         sync(self._out)
+        os.replace(self._folder, self._out / COMPLETE)
+        sync(self._out)
+        finish(self._out)
 
-    def replace(self, name: str, target: str) -> None:
-        """Move a staged file to `target` in OUT, atomically."""
-        os.replace(self._folder / name, self._out / target)
+    def replace_state(self) -> None:
+        """Move state.json alone to its place."""
+        os.replace(self._folder / STATE, self._out / STATE)
 
     def clear(self) -> None:
-        """Remove the staged files, unless they are to be moved to their places."""
-        if not self.committed:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        """Remove the staged files, unless they are complete."""
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def finish(out: Path, state: State) -> None:
-    """Finish the step whose files are being moved: move the rest, remove what is left over, store the state.
+def finish(out: Path) -> None:
+    """Move the files of a complete step to their places, remove what is left over, and move the state.
 
-    Whatever of it has been done already stays, so it may be interrupted and called again. OutError if the
-    staged files are not there any more, or a folder of them is a link.
+    Whatever of it has been done already stays, so it may be interrupted and called again. OutError if one of
+    its folders is a link.
     """
-    folder, (*_, done) = out / state.moving.folder, state.steps.values()
-    if not folder.is_dir():
-        what = f"lacks {folder.name}, with files of a step that was interrupted."
-        raise OutError(what, file=out, fix="Delete the folder, or choose another --out.")
-    refuse_links(folder)
-    folders = sorted({(out / file).parent for file in done.files} - {out})
-    for place in folders:
-        if place.is_file():  # a table that was one file
-            place.unlink()
-        place.mkdir(exist_ok=True)
-    sync(out)  # a power loss may not take a folder to which files were moved
-    for file in (*done.files, PROVENANCE):
-        if (folder / file).exists():  # else it is in OUT already
-            os.replace(folder / file, out / file)
-    for file in state.moving.left_over:
-        (out / file).unlink(missing_ok=True)
-    for place in (*folders, out):
-        sync(place)
-    os.replace(folder / ENDED, out / STATE)
-    sync(out)
+    folder = out / COMPLETE
+    if (state := State.read(folder)) is not None and state.steps:
+        refuse_links(folder)
+        step, done = list(state.steps.items())[-1]
+        folders = sorted({(out / file).parent for file in done.files} - {out})
+        for place in folders:
+            if place.is_file():  # a table that was one file
+                place.unlink()
+            place.mkdir(exist_ok=True)
+        sync(out)  # a power loss may not take a folder to which files were moved
+        for file in (*done.files, PROVENANCE):
+            if (folder / file).exists():  # else it is in OUT already
+                os.replace(folder / file, out / file)
+        for file in _left_over(out, step, done.files):
+            (out / file).unlink(missing_ok=True)
+        for place in (*folders, out):
+            sync(place)
+        os.replace(folder / STATE, out / STATE)
+        sync(out)
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def _left_over(out: Path, step: str, files: Mapping[str, int]) -> set[str]:
+    """Return the files of an earlier time of a step that are not its any more.
+
+    In the folder of a table nothing else may lie, whoever left it there: readers take all of it.
+    """
+    kept = State.read(out)
+    old = kept.steps[step].files if kept is not None and step in kept.steps else {}
+    folders = {file.split("/")[0] for file in files if "/" in file and not file.startswith("plots/")}
+    lying = {f"{folder}/{path.name}" for folder in folders for path in (out / folder).glob("*")}
+    return (old.keys() | lying) - files.keys()
 
 
 def refuse_links(folder: Path) -> None:
@@ -321,10 +335,9 @@ def held(out: Path) -> Iterator[None]:
 
 def _tidy(out: Path) -> None:
     """Move what an interrupted step left to be moved, and remove other staged files."""
-    state = State.read(out)
-    if state is not None and state.moving is not None:
+    if (out / COMPLETE).exists():
         with undisturbed(), disk(out):
-            finish(out, state)
+            finish(out)
     for left in out.glob(f"{STAGING}*"):
         shutil.rmtree(left, ignore_errors=True)
 
@@ -335,7 +348,7 @@ def _make(out: Path) -> bool:
         raise OutError("is a file.", file=out, fix="Give --out a folder.")
     if out.is_dir():
         strangers = [p.name for p in out.iterdir() if p.name != LOCK and not p.name.startswith(STAGING)]
-        if strangers and STATE not in strangers:
+        if strangers and STATE not in strangers and not (out / COMPLETE).exists():
             what = f"is not empty (it holds {min(strangers)}) and was not made by sealfit."
             raise OutError(what, file=out, fix="Choose another --out.")
         refuse_links(out)
