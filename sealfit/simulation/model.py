@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from sealfit.config import Strict
+from sealfit.config import Expression, Strict
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, Effect, Operation, Target
 from sealfit.effects.free import LEVELS, SMOOTH, smooth_effect
@@ -110,18 +109,6 @@ def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) 
 EXPRESSION = "expression"
 
 
-def _safe(text: str) -> str:
-    """Return the text of a formula; ValueError, as pydantic wants it, if it is none."""
-    try:
-        parse(text)
-    except ConfigError as error:
-        raise ValueError(str(error)) from None
-    return text
-
-
-Formula = Annotated[str, AfterValidator(_safe)]
-
-
 class EffectEntry(Strict):
     """One effect: of the catalogue, `smooth`, `levels` (one value per category), or a formula of channels."""
 
@@ -138,7 +125,7 @@ class EffectEntry(Strict):
         default_factory=dict, description="where it is zero or one, e.g. load_N_ref"
     )
     knots: tuple[float, ...] = Field((), description="of a smooth shape")
-    formula: Formula | None = Field(None, description="of an expression")
+    formula: Expression | None = Field(None, description="of an expression")
 
     @model_validator(mode="after")
     def _whole(self) -> EffectEntry:

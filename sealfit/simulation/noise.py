@@ -13,10 +13,9 @@ import pandas as pd
 from pydantic import Field, model_validator
 from scipy.signal import lfilter
 
-from sealfit.config import Strict
+from sealfit.config import Expression, Strict
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import evaluate, parse
-from sealfit.simulation.model import Formula
 
 # ---------------------------------------------------------------- draws
 # Random numbers depend only on the seed and their purpose. Adding a kind of noise or a channel to a SPEC
@@ -337,7 +336,7 @@ class FormulaChannel(Strict):
 
     kind: Literal["formula"]
     name: str
-    formula: Formula
+    formula: Expression
     sd: float = Field(0.0, ge=0, description="white scatter per file")
     decimals: int = Field(4, ge=0, le=12)
 
