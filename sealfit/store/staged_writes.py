@@ -264,11 +264,16 @@ def _refuse_owner(handle: int, path: Path, option: str, locked: bool | None) -> 
     """
     owner = _owner(handle)
     if locked is False:
-        raise _busy(path, owner, option)
-    if owner and owner.get("host") != socket.gethostname():
-        raise _busy(path, owner, option, f" If no sealfit runs on that host any more, delete {path}.")
-    if locked is None and _runs(owner.get("pid")):
-        raise _busy(path, owner, option, f" If that process is no sealfit, delete {path}.")
+        more = ""
+    elif owner and owner.get("host") != socket.gethostname():
+        more = f" If no sealfit runs on that host any more, delete {path}."
+    elif locked is None and _runs(owner.get("pid")):
+        more = f" If that process is no sealfit, delete {path}."
+    else:
+        return
+    host, pid = owner.get("host", "an unknown host"), owner.get("pid", "unknown")
+    what = f"another sealfit (host {host}, process {pid}) is writing here."
+    raise OutError(what, file=path.parent, fix=f"Wait for it to end, or choose another {option}.{more}")
 
 
 def _runs(pid: object) -> bool:
@@ -281,12 +286,6 @@ def _runs(pid: object) -> bool:
     except OSError:  # it runs, and is another user's
         return True
     return True
-
-
-def _busy(path: Path, owner: dict, option: str, more: str = "") -> OutError:
-    host, pid = owner.get("host", "an unknown host"), owner.get("pid", "unknown")
-    what = f"another sealfit (host {host}, process {pid}) is writing here."
-    return OutError(what, file=path.parent, fix=f"Wait for it to end, or choose another {option}.{more}")
 
 
 def _sign(handle: int, path: Path) -> None:
