@@ -27,12 +27,8 @@ MODELS = ("after", "before")  # with the loop's effects taken out at their refer
 def init(folder: Path, output: Path, *, force: bool = False) -> dict:
     """Write the draft of a config that reads the files in a folder; return guesses, doubts and what is next.
 
-    Raises
-    ------
-    OutError
-        If `output` is there already and `force` is not given, is no .toml file, or cannot be written.
-    RequestError
-        If there is no such folder, or no trace file in it that is text.
+    OutError if `output` is there already and `force` is not given, is no .toml file, or cannot be written.
+    RequestError if there is no such folder, or no trace file in it that is text.
     """
     from sealfit.draft import draft
 
@@ -98,13 +94,9 @@ def predict(
 
     `effects_folder` is run: it holds the user's own effects, which the model may need.
 
-    Raises
-    ------
-    StaleError
-        If the loop has not been closed on the campaign as it stands, or with other effects of the user's own.
-    RequestError
-        If the points cannot be read, lack a column that the model needs, the answers cannot be written, or
-        the model needs the user's own effects and no folder of them is given.
+    StaleError if the loop has not been closed on the campaign as it stands, or with other effects of the
+    user's own. RequestError if the points cannot be read, lack a column that the model needs, the answers
+    cannot be written, or the model needs the user's own effects and no folder of them is given.
     """
     from sealfit.closure.prediction_csv import points_of, read_points, write_answers
 
@@ -151,12 +143,8 @@ class LifetimeRequest:
 def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     """Return the days to a threshold of a quantity, by the likeliest law and by its rivals, with intervals.
 
-    Raises
-    ------
-    StaleError
-        If the conditions are not fitted, or the loop is not closed (`model` "after"), or stale.
-    RequestError
-        If the request does not fit the campaign.
+    StaleError if the conditions are not fitted, or the loop is not closed (`model` "after"), or stale.
+    RequestError if the request does not fit the campaign.
     """
     from sealfit.fit.aging.joint_law import rivals_of
     from sealfit.fit.aging.lifetime import answer, finite_ends, goal_of, over_laws
@@ -258,10 +246,7 @@ def _note_on_effects(store: Store) -> str | None:
 def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:
     """Write a campaign with known truth to `out`, and the truth beside it, both whole or not at all.
 
-    Raises
-    ------
-    OutError
-        If `out` is there already and `force` is not given, or as `sealfit.simulation.simulate`.
+    OutError if `out` is there already and `force` is not given, or as `sealfit.simulation.simulate`.
     """
     from sealfit.simulation import load_spec, truth_path
     from sealfit.simulation import simulate as make

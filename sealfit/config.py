@@ -533,10 +533,8 @@ class Config(Strict):
 def load_config(path: Path | None = None) -> Config:
     """Return the config at `path`, or the default that ships inside the package.
 
-    Raises
-    ------
-    ConfigError
-        If the file is missing, is not TOML, or has a key or value that is not allowed; one line per fault.
+    ConfigError if the file is missing, is not TOML, or has a key or value that is not allowed; one line per
+    fault.
     """
     return parse_config(read_config(path), "default.toml" if path is None else str(path))
 

@@ -125,12 +125,8 @@ def single(step: str, out: Path, *, progress: Silent | None = None, **options) -
 
     `options` are fields of `Options`.
 
-    Raises
-    ------
-    StaleError
-        If a step before it is missing or stale; it names the command to run.
-    RequestError
-        If close-loop needs the user's own effects and no `effects_folder` is given.
+    StaleError if a step before it is missing or stale; it names the command to run. RequestError if close-
+    loop needs the user's own effects and no `effects_folder` is given.
     """
     chosen = Options(**options)
     with (

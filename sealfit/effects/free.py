@@ -33,10 +33,7 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
     category in the campaign, the mean of the levels is zero; else the first one is. A category that is not
     listed gives NaN.
 
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two categories, or one stands twice.
+    ParameterError if there are fewer than two categories, or one stands twice.
     """
     names = _different(LEVELS, categories)
     mean = shares(means, len(names))
@@ -79,10 +76,7 @@ def slopes_effect(categories: Sequence[str]) -> Effect:
 
     Its amplitudes `e_1`, `e_2`, ... are the slopes. A category that is not listed gives NaN.
 
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two categories, or one stands twice.
+    ParameterError if there are fewer than two categories, or one stands twice.
     """
     names = _different(SLOPES, categories)
     return closed_form(
@@ -145,10 +139,7 @@ def smooth_effect(
     `x_ref`, by default the first, which has no amplitude; with `means`, the mean of each B_j over the
     campaign, its mean is zero.
 
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two knots, or they do not rise.
+    ParameterError if there are fewer than two knots, or they do not rise.
     """
     places = tuple(float(k) for k in knots)
     if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
@@ -235,10 +226,7 @@ def surface_effect(
     Its amplitudes `c_jk` are the values at knot j of x and k of z less that at the first ones. With `means`,
     the mean of each product of splines over the campaign, z running faster, its mean is zero.
 
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two knots, or they do not rise.
+    ParameterError if there are fewer than two knots, or they do not rise.
     """
     knots = tuple(tuple(float(k) for k in given) for given in (x_knots, z_knots))
     if any(len(given) < 2 or not (np.diff(given) > 0).all() for given in knots):

@@ -56,10 +56,7 @@ def truth_path(campaign: Path) -> Path:
 def load_truth(path: Path) -> dict:
     """Return the truth document at `path`.
 
-    Raises
-    ------
-    RequestError
-        If the file is missing or was not written by `simulate`.
+    RequestError if the file is missing or was not written by `simulate`.
     """
     try:
         document = json.loads(Path(path).read_text("utf-8"))
@@ -168,12 +165,8 @@ def simulate(spec: Spec, out: Path) -> None:
 
     The same SPEC gives the same bytes. The folder is written completely or not at all.
 
-    Raises
-    ------
-    ConfigError
-        If an effect is not in the catalogue or is not finite somewhere on this design.
-    OutError
-        If `out` holds files that `simulate` did not write, or cannot be written.
+    ConfigError if an effect is not in the catalogue or is not finite somewhere on this design. OutError if
+    `out` holds files that `simulate` did not write, or cannot be written.
     """
     out = Path(os.path.abspath(out))
     _refuse_foreign(out)

@@ -268,11 +268,8 @@ class Spec(Strict):
 def load_spec(path: Path) -> Spec:
     """Return the SPEC at `path`, its effects resolved against the catalogue.
 
-    Raises
-    ------
-    ConfigError
-        If the file is missing, is not TOML, has a key or value that is not allowed, or names an effect,
-        parameter or channel that does not exist; one sentence per fault.
+    ConfigError if the file is missing, is not TOML, has a key or value that is not allowed, or names an
+    effect, parameter or channel that does not exist; one sentence per fault.
     """
     text = read_toml(path, "Check the path of SPEC.")
     spec = parse_toml(Spec, text, path, "sample_data/README.md lists every key.")

@@ -60,12 +60,8 @@ class Store:
     def open(cls, out: Path, effects: Path | None = None) -> Store:
         """Return the results in `out`, for reading; `effects` is the folder that --effects-folder names.
 
-        Raises
-        ------
-        OutError
-            If `out` holds no results of sealfit.
-        ConfigError
-            If `effects` may not be run, as `own_effects_folder`.
+        OutError if `out` holds no results of sealfit. ConfigError if `effects` may not be run, as
+        `own_effects_folder`.
         """
         if (out / COMPLETE).exists():
             with held(out):  # which moves its files
@@ -98,11 +94,8 @@ class Store:
         `source` is the config that the command line names, `effects` the folder that --effects-folder names,
         `properties` what is asked of a table of properties in `campaign`.
 
-        Raises
-        ------
-        OutError
-            If `out` is a file, a folder that sealfit did not make, the results of another campaign, in use by
-            another process, or cannot be written.
+        OutError if `out` is a file, a folder that sealfit did not make, the results of another campaign, in
+        use by another process, or cannot be written.
         """
         if campaign is None or source is None:
             cls.open(out, effects)  # raises if there are no results
@@ -316,10 +309,7 @@ class Store:
     def step(self, name: str) -> Iterator[Staged]:
         """Give a place for the files of step `name`; all are moved when the block ends without an error.
 
-        Raises
-        ------
-        OutError
-            If the disk is full or refuses; OUT then holds what it held before.
+        OutError if the disk is full or refuses; OUT then holds what it held before.
         """
         began = time.monotonic()
         staged = Staged(self.out, self.config.units, name)

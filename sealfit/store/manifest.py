@@ -284,10 +284,8 @@ class State:
     def read(cls, out: Path) -> State | None:
         """Return the state kept in `out`, or None if it has none.
 
-        Raises
-        ------
-        OutError
-            If state.json is not one that this version of sealfit wrote, or Arrow cannot open files in `out`.
+        OutError if state.json is not one that this version of sealfit wrote, or Arrow cannot open files in
+        `out`.
         """
         path = out / STATE
         if any("\ud800" <= character <= "\udfff" for character in str(out)):

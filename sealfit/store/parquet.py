@@ -30,11 +30,8 @@ def to_arrow(frame: pd.DataFrame | Columns, schema: Schema, units: Units) -> pa.
     metadata holds `unit` (the true one) and `meaning`; the table's holds `sealfit` (version and table) and
     `units` (true unit by column). NaN becomes null; words may come as dictionaries (`as_dictionary`).
 
-    Raises
-    ------
-    ValueError
-        If a column is missing, doubled, of the wrong type, or not in a closed schema: a fault of the step,
-        not of the user's data.
+    ValueError if a column is missing, doubled, of the wrong type, or not in a closed schema: a fault of the
+    step, not of the user's data.
     """
     names = [str(name) for name in frame]
     if doubled := sorted({name for name in names if names.count(name) > 1}):

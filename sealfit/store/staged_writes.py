@@ -310,11 +310,8 @@ def held(out: Path) -> Iterator[None]:
     It is created if missing, and removed if it stays empty. What an interrupted step left to be moved is
     moved; other staged files are removed.
 
-    Raises
-    ------
-    OutError
-        If `out` is a file, a folder that sealfit did not make, in use by another process, or cannot be
-        written.
+    OutError if `out` is a file, a folder that sealfit did not make, in use by another process, or cannot be
+    written.
     """
     made, path = _make(out), out / LOCK
     try:
