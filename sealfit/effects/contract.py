@@ -245,20 +245,17 @@ def fill_unit(unit: str, x: str, y: str, z: str = "") -> str:
     """
     known = {"{x}": x, "{y}": y, "{z}": z}
     top, slash, bottom = unit.partition("/")
-    if not slash:
-        return known.get(unit, unit)
     top = known.get(top, top)
     base, hat, power = bottom.partition("^")
-    if base.startswith("("):
-        factors = [factor for factor in (known.get(name, name) for name in base[1:-1].split()) if factor]
-        base = " ".join(f"({f})" if len(factors) > 1 and any(c in f for c in "/ *·") else f for f in factors)
-    else:
-        base = known.get(base, base)
-    if not base:
+    factors = [factor for factor in (known.get(name, name) for name in base.strip("()").split()) if factor]
+    if not slash or not factors:
         return top
-    if any(sign in base for sign in "/ *·"):
-        base = f"({base})"
+    base = _in_brackets(" ".join(_in_brackets(f) for f in factors) if len(factors) > 1 else factors[0])
     return f"{top or 1}/{base}{hat}{power}"
+
+
+def _in_brackets(unit: str) -> str:
+    return f"({unit})" if any(sign in unit for sign in "/ *·") else unit
 
 
 # ---------------------------------------------------------------- averaged

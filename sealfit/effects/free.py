@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from inspect import signature
 
@@ -22,8 +23,6 @@ from sealfit.errors import ParameterError
 
 LEVELS, SLOPES = "levels", "slopes"
 LESS_MEAN = "; less its mean over the campaign"
-# Reference of a shape minus its mean.
-MEAN_OF_CAMPAIGN = "mean over {x} in the campaign"
 
 
 def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:
@@ -36,28 +35,34 @@ def levels_effect(categories: Sequence[str], means: Sequence[float] | None = Non
     ParameterError if there are fewer than two categories, or one stands twice.
     """
     names = _different(LEVELS, categories)
-    mean = shares(means, len(names))
-    return closed_form(
+    levels = closed_form(
         id=LEVELS,
         label="levels of {x}",
-        equation=f"h = d_k for category k of {listed(names)}; 0 for {names[0]}"
-        + LESS_MEAN * (means is not None),
-        reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {names[0]}",
+        equation=f"h = d_k for category k of {listed(names)}; 0 for {names[0]}",
+        reference=f"{{x}} = {names[0]}",
         parameters=tuple(
             amplitude(f"d_{k}", "{y}", 0.0, f"{name} less {names[0]}")
             for k, name in enumerate(names[1:], start=1)
         ),
-        shape=partial(_levels, names, mean),
+        shape=partial(_levels, names, shares(means, len(names))),
         source="Form: ours. One number per category, as in any analysis of variance.",
     )
+    return _centred(levels, means)
+
+
+def _centred(shape: Effect, means: Sequence[float] | None, channels: str = "{x}") -> Effect:
+    """Return the description of a shape from which its mean is subtracted, if `means` are given."""
+    if means is None:
+        return shape
+    reference = f"mean over {channels} in the campaign"
+    return replace(shape, equation=shape.equation + LESS_MEAN, reference=reference)
 
 
 def _different(id: str, categories: Sequence[str]) -> tuple[str, ...]:
     names = tuple(str(c) for c in categories)
     if len(names) < 2 or len(set(names)) != len(names):
-        raise ParameterError(
-            f"{id}: {list(names)} must be two or more different categories.", fix="List each once."
-        )
+        reason = f"{id}: {list(names)} must be two or more different categories."
+        raise ParameterError(reason, fix="List each once.")
     return names
 
 
@@ -141,27 +146,31 @@ def smooth_effect(
 
     ParameterError if there are fewer than two knots, or they do not rise.
     """
-    places = tuple(float(k) for k in knots)
-    if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
-        raise ParameterError(
-            f"smooth: knots {list(places)} must be two or more rising numbers.", fix="Sort them."
-        )
+    places = _rising(SMOOTH, knots)
     zero = 0 if x_ref is None else int(np.argmin(np.abs(np.array(places) - x_ref)))
-    mean = shares(means, len(places))
-    free = [j for j in range(len(places)) if j != zero]
-    return closed_form(
+    at_zero = f"{places[zero]:.6g}"
+    spline = closed_form(
         id=SMOOTH,
         label="smooth in {x}",
-        equation=f"h = natural cubic spline through (x_j, c_j), knots {listed(places)}, "
-        f"zero at {places[zero]:.6g}" + LESS_MEAN * (means is not None),
-        reference=MEAN_OF_CAMPAIGN if means is not None else f"{{x}} = {places[zero]:.6g}",
+        equation=f"h = natural cubic spline through (x_j, c_j), knots {listed(places)}, zero at {at_zero}",
+        reference=f"{{x}} = {at_zero}",
         parameters=tuple(
-            amplitude(f"c_{j + 1}", "{y}", 0.0, f"value at {places[j]:.6g} less that at {places[zero]:.6g}")
-            for j in free
+            amplitude(f"c_{j + 1}", "{y}", 0.0, f"value at {place:.6g} less that at {at_zero}")
+            for j, place in enumerate(places)
+            if j != zero
         ),
-        shape=partial(_spline, places, zero, mean),
+        shape=partial(_spline, places, zero, shares(means, len(places))),
         source="Form: ours. de Boor 2001, A Practical Guide to Splines, Springer; natural end conditions.",
     )
+    return _centred(spline, means)
+
+
+def _rising(id: str, knots: Sequence[float]) -> tuple[float, ...]:
+    places = tuple(float(k) for k in knots)
+    if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
+        reason = f"{id}: knots {list(places)} must be two or more rising numbers."
+        raise ParameterError(reason, fix="Sort them.")
+    return places
 
 
 def _spline(
@@ -228,34 +237,24 @@ def surface_effect(
 
     ParameterError if there are fewer than two knots, or they do not rise.
     """
-    knots = tuple(tuple(float(k) for k in given) for given in (x_knots, z_knots))
-    if any(len(given) < 2 or not (np.diff(given) > 0).all() for given in knots):
-        raise ParameterError(f"surface: knots {knots} must be two or more rising numbers.", fix="Sort them.")
-    places = list(np.ndindex(len(knots[0]), len(knots[1])))
-    mean = shares(means, len(places))
-    return closed_form(
+    x, z = _rising(SURFACE, x_knots), _rising(SURFACE, z_knots)
+    places = list(np.ndindex(len(x), len(z)))
+    less_first = "less that at the first knots"
+    surface = closed_form(
         id=SURFACE,
         label="smooth in {x} and {z}",
-        equation="h = natural cubic splines through (x_j, z_k, c_jk), knots "
-        + " and ".join(listed(given) for given in knots)
-        + f", zero at {knots[0][0]:.6g} and {knots[1][0]:.6g}"
-        + LESS_MEAN * (means is not None),
-        reference="mean over {x} and {z} in the campaign"
-        if means is not None
-        else f"{{x}} = {knots[0][0]:.6g} and {{z}} = {knots[1][0]:.6g}",
+        equation=f"h = natural cubic splines through (x_j, z_k, c_jk), knots {listed(x)} and {listed(z)}, "
+        f"zero at {x[0]:.6g} and {z[0]:.6g}",
+        reference=f"{{x}} = {x[0]:.6g} and {{z}} = {z[0]:.6g}",
         reads=(CHANNEL, SECOND),
         parameters=tuple(
-            amplitude(
-                f"c_{j + 1}{k + 1}",
-                "{y}",
-                0.0,
-                f"value at {knots[0][j]:.6g} and {knots[1][k]:.6g} less that at the first knots",
-            )
+            amplitude(f"c_{j + 1}{k + 1}", "{y}", 0.0, f"value at {x[j]:.6g} and {z[k]:.6g} {less_first}")
             for j, k in places[1:]
         ),
-        shape=partial(_surface, knots, mean),
+        shape=partial(_surface, (x, z), shares(means, len(places))),
         source="Form: ours. Wood 2017, Generalized Additive Models, 2nd ed., CRC Press.",
     )
+    return _centred(surface, means, "{x} and {z}")
 
 
 def _surface(
