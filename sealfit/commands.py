@@ -13,7 +13,7 @@ from sealfit.errors import CampaignError, Fault, OutError, RequestError, StaleEr
 from sealfit.progress import Silent
 from sealfit.store import Store, paths
 from sealfit.store.manifest import ConfigCopy
-from sealfit.store.paths import OPTION, existing_out, own_effects_folder, what_differs
+from sealfit.store.paths import OPTION, own_effects_folder, what_differs
 from sealfit.units import Units
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def predict(
     """
     from sealfit.closure.prediction_csv import points_of, read_points, write_answers
 
-    store = Store.open(existing_out(out), effects_folder)
+    store = Store.open(out, effects_folder)
     for warning in store.warnings:
         (progress or Silent()).warn(warning)
     store.require("close-loop")
@@ -149,7 +149,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     from sealfit.fit.aging.joint_law import rivals_of
     from sealfit.fit.aging.lifetime import answer, finite_ends, goal_of, over_laws
 
-    store = Store.open(existing_out(out))
+    store = Store.open(out)
     if asked.model not in MODELS:
         raise RequestError(f"there is no model '{asked.model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
     goal, years = goal_of(asked.threshold, asked.loss_pct), asked.years
@@ -226,7 +226,7 @@ def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict
     if out is None:
         known = EFFECTS | _own_effects(own_effects_folder(effects_folder, None))
         return {"effects": summary.of_effects(known.values(), Units())}
-    store = Store.open(existing_out(out), effects_folder)
+    store = Store.open(out, effects_folder)
     known = EFFECTS | _own_effects(store.effects)
     closed = not store.why_stale("close-loop")
     added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None

@@ -130,7 +130,7 @@ def single(step: str, out: Path, *, progress: Silent | None = None, **options) -
     """
     chosen = Options(**options)
     with (
-        Store.writing(paths.existing_out(out), effects=chosen.effects_folder) as store,
+        Store.writing(out, effects=chosen.effects_folder) as store,
         on_cluster(chosen.scheduler, out),
     ):
         for before in store.up_to(step)[:-1][-1:]:

@@ -18,7 +18,6 @@ from sealfit.notebook import frames
 from sealfit.report import summary, summary_lines
 from sealfit.store import Store
 from sealfit.store.manifest import BATCH
-from sealfit.store.paths import existing_out
 from sealfit.tables import SCHEMAS
 from sealfit.units import Units
 
@@ -115,7 +114,7 @@ def open(out: str | Path, effects_folder: str | Path | None = None) -> Results:
 
     Raises
     ------
-    RequestError, OutError
+    OutError
         If there is no such folder, or it holds no results.
     """
     one_thread()
@@ -343,7 +342,7 @@ class Results:
 
     # ------------------------------------------------------------ reading
     def _open(self) -> Store:
-        store = Store.open(existing_out(self.out), self._effects_folder)
+        store = Store.open(self.out, self._effects_folder)
         for warning in store.warnings:
             warnings.warn(warning, stacklevel=2)
         return store

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from sealfit import __version__
 from sealfit.config import Config, Files
 from sealfit.engine import undisturbed
-from sealfit.errors import ConfigError, OutError, RequestError, StaleError, quoted
+from sealfit.errors import ConfigError, OutError, RequestError, StaleError, did_you_mean, quoted
 from sealfit.store import manifest
 from sealfit.store.manifest import STATE, ConfigCopy, Fingerprint, Properties, State, fingerprint, to_json
 from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
@@ -60,8 +60,8 @@ class Store:
     def open(cls, out: Path, effects: Path | None = None) -> Store:
         """Return the results in `out`, for reading; `effects` is the folder that --effects-folder names.
 
-        OutError if `out` holds no results of sealfit. ConfigError if `effects` may not be run, as
-        `own_effects_folder`.
+        OutError, whose fix names the likeliest folder, if `out` holds no results. ConfigError if `effects`
+        may not be run, as `own_effects_folder`.
         """
         if (out / COMPLETE).exists():
             with held(out):  # which moves its files
@@ -69,9 +69,9 @@ class Store:
         opened = _status_of(out)  # before it is read
         state = State.read(out)
         if state is None:
-            what = "holds no results of sealfit." if out.is_dir() else "is not a folder of results."
-            fix = f"Make them with: sealfit run CAMPAIGN --out {quoted(out)}"
-            raise OutError(what, file=out, fix=fix)
+            what = "holds no results of sealfit." if out.is_dir() else "there is no such folder."
+            fix = did_you_mean(out, lambda folder: (folder / STATE).is_file())
+            raise OutError(what, file=out, fix=fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}")
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
         hashes = effects_seen(effects, state.own_effects, state.config, config)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sealfit.config import Config
 from sealfit.errors import RUNS_TABLES, CampaignError, ConfigError, Fault, RequestError, did_you_mean, quoted
-from sealfit.store.manifest import STATE, ConfigCopy, fingerprint
+from sealfit.store.manifest import ConfigCopy, fingerprint
 
 # ---------------------------------------------------------------- places
 # The folders and files named on the command line; a missing one is refused with the closest existing name.
@@ -53,18 +53,6 @@ def campaign_folder(path: Path, config: Config) -> Path:
             fix = "Did you mean " + " or ".join(quoted(folder) for folder in below[:3]) + "?"
         raise CampaignError([Fault("runs_csv", f"{path} has no {RUNS}.", file=RUNS, fix=fix)])
     return path
-
-
-def existing_out(out: Path) -> Path:
-    """Return `out` if it is a folder.
-
-    Else raise RequestError; its fix names the likeliest folder of results, or the command that makes one.
-    """
-    if out.is_dir():
-        return out
-    fix = did_you_mean(out, lambda folder: (folder / STATE).is_file())
-    fix = fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}"
-    raise RequestError("there is no such folder.", file=out, fix=fix)
 
 
 def existing_file(path: Path, what: str) -> Path:

@@ -375,7 +375,7 @@ def test_missing_results_name_the_command_and_leave_what_is_there(out, tmp_path)
         _ = results.errors
     assert len(results.table("steady_fit"))
     shutil.rmtree(copy)
-    with pytest.raises(RequestError, match="there is no such folder"):
+    with pytest.raises(OutError, match="there is no such folder"):
         _ = results.runs
 
 
@@ -403,9 +403,9 @@ def test_a_second_run_redoes_nothing(tutorial, out, capsys):
 
 
 def test_a_fault_is_shown_in_one_line():
-    with pytest.raises(RequestError) as caught:
+    with pytest.raises(OutError) as caught:
         sealfit.open("nowhere/at/all")
-    assert caught.value._render_traceback_() == [f"RequestError: {caught.value}"]
+    assert caught.value._render_traceback_() == [f"OutError: {caught.value}"]
 
 
 # ---------------------------------------------------------------- the package
