@@ -15,7 +15,7 @@ from campaigns import campaign
 from points import draw_points, force_at
 from rivals import rival_forces
 from scoring import Target, correlations, match, misplaced, named_right
-from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, truth_in_claim
+from truths import NO_INTERVAL, TrueEffect, test_true_forms, true_effects, true_force, truth_in_claim
 
 from sealfit.closure.loop import Closure, close_loop
 from sealfit.closure.output import from_record
@@ -29,7 +29,7 @@ from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import Rows, make_rows
 from sealfit.fit.joint.whitening import Component, Scatter
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.simulation import Spec, load_truth, simulate, true_force, truth_path
+from sealfit.simulation import Spec, load_truth, simulate, truth_path
 
 POINTS = 200
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 from effect_kinds import FORMULA_OF
 
 from sealfit.closure.channels import flip_level, unit_of
@@ -21,6 +22,7 @@ from sealfit.closure.result import channels_of, effect_level
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Effect, Parameter
 from sealfit.effects.free import LEVELS, levels_effect
+from sealfit.errors import RequestError
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.model import Model, Term
 from sealfit.fit.joint.rows import Rows
@@ -31,6 +33,46 @@ from sealfit.simulation.motion import SteadyLaw, steady_law
 UNITS = ("stroke", "file", "run", "specimen")
 # Parameters without interval: a step is the same anywhere between two neighbouring values of the channel.
 NO_INTERVAL = {("step", "x_0")}
+
+
+def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
+    """Return the noise-free force of steady sliding at arbitrary points, in N, shape (n,).
+
+    Parameters
+    ----------
+    truth : mapping
+        The document of `load_truth`.
+    points : DataFrame
+        `speed_mm_s` (signed), the condition columns that the design has, and the channels that its effects
+        read, in the names of sealfit's tables. `load_N` may be left out where the design has one load,
+        `direction` always.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Mean force of the population: average specimen, set-up and repeat.
+
+    Raises
+    ------
+    RequestError
+        If a column is missing or a cell is empty.
+    """
+    spec = Spec.model_validate(truth["spec"])
+    law = steady_law(spec)
+    if "direction" not in points and "speed_mm_s" in points:
+        points = points.assign(direction=np.sign(points["speed_mm_s"]))
+    if "load_N" not in points and len(spec.design.loads_N) == 1:
+        points = points.assign(load_N=spec.design.loads_N[0])
+    channels = {}
+    for name in ("speed_mm_s", *spec.design.columns, *(name for e in law.effects for name in e.channels)):
+        if name not in points:
+            raise RequestError(
+                "the points lack a column.", column=name, fix="Add it; the truth depends on it."
+            )
+        if empty := int(points[name].isna().sum()):
+            raise RequestError(f"the points have {empty} empty cells.", column=name, fix="Fill them.")
+        channels[name] = points[name].to_numpy()
+    return np.broadcast_to(law.force_N(channels), (len(points),)).astype(float)
 
 
 @dataclass(frozen=True)

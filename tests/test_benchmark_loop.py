@@ -8,12 +8,12 @@ from loop_cost import with_idle_columns
 from loop_summary import clustered, summarise
 from points import draw_points
 from scoring import LENIENT, NONE, STRICT, Target, correlations, grade, match, misplaced, named_right
-from truths import true_effects, true_term, truth_in_claim
+from truths import true_effects, true_force, true_term, truth_in_claim
 
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
-from sealfit.simulation import load_truth, simulate, true_force, truth_path
+from sealfit.simulation import load_truth, simulate, truth_path
 
 OIL = Target("linear", ("oil_ppm",), "run", "mu", "multiply")
 RIPPLE = Target("ripple", ("displacement_mm",), "trace", "force", "add")

@@ -18,10 +18,11 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 from drawing_helpers import undrawn
+from truths import true_force
 
 from sealfit.cli import app, exit_code
 from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED
-from sealfit.simulation import load_truth, true_force
+from sealfit.simulation import load_truth
 from sealfit.store import Store
 from sealfit.store.manifest import STEPS
 from sealfit.tables import SCHEMAS

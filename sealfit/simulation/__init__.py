@@ -1,6 +1,6 @@
 """Campaigns with known truth: the folder as a rig would leave it, and the truth beside it.
 
-`load_spec` reads a SPEC, `simulate` writes the campaign, `true_force` knows the answer.
+`load_spec` reads a SPEC, `simulate` writes the campaign.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import io
 import json
 import os
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +31,10 @@ from sealfit.simulation.motion import (
 )
 from sealfit.simulation.spec import Spec, load_spec, plan_files
 
-__all__ = ["Spec", "load_spec", "load_truth", "simulate", "true_force", "truth_path"]
+__all__ = ["Spec", "load_spec", "load_truth", "simulate", "truth_path"]
 
 # ---------------------------------------------------------------- truth
-# The truth of a campaign, `<campaign>.truth.json`, and the force that follows from it.
+# The truth of a campaign, `<campaign>.truth.json`.
 
 SCHEMA = 1
 MADE_BY = "sealfit simulate"
@@ -71,46 +70,6 @@ def load_truth(path: Path) -> dict:
             "is not the truth of a simulated campaign.", file=path, fix="Simulate the campaign anew."
         )
     return document
-
-
-def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
-    """Return the noise-free force of steady sliding at arbitrary points, in N, shape (n,).
-
-    Parameters
-    ----------
-    truth : mapping
-        The document of `load_truth`.
-    points : DataFrame
-        `speed_mm_s` (signed), the condition columns that the design has, and the channels that its effects
-        read, in the names of sealfit's tables. `load_N` may be left out where the design has one load,
-        `direction` always.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Mean force of the population: average specimen, set-up and repeat.
-
-    Raises
-    ------
-    RequestError
-        If a column is missing or a cell is empty.
-    """
-    spec = Spec.model_validate(truth["spec"])
-    law = steady_law(spec)
-    if "direction" not in points and "speed_mm_s" in points:
-        points = points.assign(direction=np.sign(points["speed_mm_s"]))
-    if "load_N" not in points and len(spec.design.loads_N) == 1:
-        points = points.assign(load_N=spec.design.loads_N[0])
-    channels = {}
-    for name in ("speed_mm_s", *spec.design.columns, *(name for e in law.effects for name in e.channels)):
-        if name not in points:
-            raise RequestError(
-                "the points lack a column.", column=name, fix="Add it; the truth depends on it."
-            )
-        if empty := int(points[name].isna().sum()):
-            raise RequestError(f"the points have {empty} empty cells.", column=name, fix="Fill them.")
-        channels[name] = points[name].to_numpy()
-    return np.broadcast_to(law.force_N(channels), (len(points),)).astype(float)
 
 
 def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) -> dict:

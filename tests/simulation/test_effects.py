@@ -6,11 +6,12 @@ import numpy.testing as npt
 import pandas as pd
 import pytest
 from simulation_helpers import ONE_CONDITION, POINT, effect, mean_forces, steady
+from truths import true_force
 
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import Effect, Parameter
 from sealfit.errors import ConfigError, RequestError
-from sealfit.simulation import Spec, simulate, true_force
+from sealfit.simulation import Spec, simulate
 
 
 @pytest.mark.parametrize(

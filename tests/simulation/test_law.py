@@ -8,8 +8,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from simulation_helpers import ONE_CONDITION, POINT, mean_forces, steady
+from truths import true_force
 
-from sealfit.simulation import Spec, true_force
+from sealfit.simulation import Spec
 
 
 def test_steady_force_is_eq_14_by_hand(campaign):

@@ -5,8 +5,7 @@ import numpy.testing as npt
 import pandas as pd
 import pytest
 from simulation_helpers import ONE_CONDITION, effect, mean_forces
-
-from sealfit.simulation import true_force
+from truths import true_force
 
 
 def test_a_trace_rests_ramps_rises_slides_and_stops(campaign):
