@@ -182,13 +182,12 @@ class Part:
 
     step: str
     part: str | None  # None: the whole step
-    seconds: float = 0.0
+    seconds: float | None = None  # None while it goes on
     rows: int | None = None
     of: str = ""
 
 
 _parts: ContextVar[list[Part] | None] = ContextVar("parts", default=None)
-_step: ContextVar[str | None] = ContextVar("step", default=None)
 
 
 @contextlib.contextmanager
@@ -213,19 +212,17 @@ def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[Part]:
     >>> [(part.step, part.part, part.rows, part.of) for part in parts]
     [('ingest', None, None, ''), ('ingest', 'reading', 3, 'files')]
     """
-    parts, step = _parts.get(), _step.get()
+    parts = _parts.get()
+    if parts is None:  # nobody asked
+        parts = []
+    step = next((part.step for part in parts if part.seconds is None), None)
     part = Part(step or name, name if step else None, rows=rows, of=of)
-    if parts is None:
-        yield part
-        return
     parts.append(part)
-    token = _step.set(part.step)
     began = time.perf_counter()
     try:
         yield part
     finally:
         part.seconds = round(time.perf_counter() - began, 3)
-        _step.reset(token)
 
 
 def lines(profile: Sequence[Mapping]) -> list[str]:
