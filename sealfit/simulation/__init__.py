@@ -53,22 +53,14 @@ def truth_path(campaign: Path) -> Path:
 
 
 def load_truth(path: Path) -> dict:
-    """Return the truth document at `path`.
-
-    RequestError if the file is missing or was not written by `simulate`.
-    """
+    """Return the truth document at `path`; RequestError if the file was not written by `simulate`."""
     try:
         document = json.loads(Path(path).read_text("utf-8"))
-    except OSError as error:
-        raise RequestError(
-            f"cannot be read ({error.strerror}).", file=path, fix="Simulate the campaign."
-        ) from error
-    except (ValueError, RecursionError) as error:
-        document = error
+    except (ValueError, RecursionError):
+        document = None
     if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
-        raise RequestError(
-            "is not the truth of a simulated campaign.", file=path, fix="Simulate the campaign anew."
-        )
+        what = "is not the truth of a simulated campaign."
+        raise RequestError(what, file=path, fix="Simulate the campaign anew.")
     return document
 
 

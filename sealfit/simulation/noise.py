@@ -64,10 +64,10 @@ class Quantised(Strict):
     resolution_N: float = Field(gt=0)
 
 
-class RepeatGain(Strict):
-    """A random factor on the friction of every file."""
+class Gain(Strict):
+    """A random factor on the friction of every file, or of every specimen."""
 
-    kind: Literal["repeat_gain"]
+    kind: Literal["repeat_gain", "specimen"]
     sd_rel: float = Field(ge=0)
 
 
@@ -77,13 +77,6 @@ class RunSetup(Strict):
     kind: Literal["run_setup"]
     sd_rel: float = Field(0.0, ge=0)
     sd_N: float = Field(0.0, ge=0)
-
-
-class SpecimenScatter(Strict):
-    """A random factor on the friction of every specimen."""
-
-    kind: Literal["specimen"]
-    sd_rel: float = Field(ge=0)
 
 
 class Proportional(Strict):
@@ -130,9 +123,8 @@ Noise = Annotated[
     White
     | Autocorrelated
     | Quantised
-    | RepeatGain
+    | Gain
     | RunSetup
-    | SpecimenScatter
     | Proportional
     | DisplacementNoise
     | SpeedScatter
@@ -158,16 +150,14 @@ def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> Scat
     gain, offset, speed, outlier = np.ones(n), np.zeros(n), np.ones(n), np.zeros(n, bool)
     for kind, random in _streams(noise, seed):
         match kind:
-            case RepeatGain():
-                gain *= 1.0 + kind.sd_rel * random.standard_normal(n)
+            case Gain():
+                codes, groups = pd.factorize(files["file" if kind.kind == "repeat_gain" else "specimen_id"])
+                gain *= 1.0 + kind.sd_rel * random.standard_normal(len(groups))[codes]
             case RunSetup():
                 codes, runs = pd.factorize(files["run_id"])
                 factor, shift = random.standard_normal((2, len(runs)))
                 gain *= 1.0 + kind.sd_rel * factor[codes]
                 offset += kind.sd_N * shift[codes]
-            case SpecimenScatter():
-                codes, specimens = pd.factorize(files["specimen_id"])
-                gain *= 1.0 + kind.sd_rel * random.standard_normal(len(specimens))[codes]
             case SpeedScatter():
                 speed *= 1.0 + kind.sd_rel * np.clip(random.standard_normal(n), -4.0, 4.0)
             case OutlierRepeats():
