@@ -105,39 +105,32 @@ class Store:
                 store._opened = None
             else:
                 folder = own_effects_folder(effects, source, out, campaign)
-                store = cls._of_campaign(out, campaign.resolve(), source, folder, properties)
+                hashes = {} if folder is None else effect_hashes(folder)
+                asked = State(campaign.resolve(), source, properties, own_effects=hashes)
+                store = cls._of_campaign(out, asked, folder)
             store._keep_what_moved()
             yield store
 
     @classmethod
-    def _of_campaign(
-        cls,
-        out: Path,
-        campaign: Path,
-        source: ConfigCopy,
-        effects: Path | None,
-        properties: Properties | None,
-    ) -> Store:
-        kept = State.read(out)
-        hashes = {} if effects is None else effect_hashes(effects)
-        table = properties.table if properties else None
-        former = kept.properties.table if kept and kept.properties else None
+    def _of_campaign(cls, out: Path, asked: State, effects: Path | None) -> Store:
+        """Return the store of the campaign and config of `asked`, with what `out` has of it already."""
+        kept, campaign = State.read(out), asked.campaign
+        table, former = (own.properties.table if own and own.properties else None for own in (asked, kept))
         if kept is None or (not kept.steps and (kept.campaign != campaign or former != table)):
-            return cls(out, State(campaign, source, properties, own_effects=hashes), kept, effects)
+            return cls(out, asked, kept, effects)
         if former != table:
             what = f"the campaign {kept.campaign}" if former is None else f"the table {former}"
             raise OutError(f"holds the results of {what}.", file=out, fix="Choose another --out.")
-        inputs, moved = kept.inputs, kept.campaign != campaign
-        if moved:
-            inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
-            if any(mark.sha256 != kept.inputs[name].sha256 for name, mark in inputs.items()):
-                what = f"belongs to the campaign {kept.campaign}, and {campaign} holds other data."
-                raise OutError(what, file=out, fix="Choose another --out.")
-        state = State(campaign, source, properties, inputs, hashes, kept.steps)
-        store = cls(out, state, kept, effects)
-        if moved:
-            same = f"{campaign} holds the same data and takes over."
-            store.warnings.append(f"{out} was made from {kept.campaign}; {same}")
+        state = replace(asked, inputs=kept.inputs, steps=kept.steps)
+        if kept.campaign == campaign:
+            return cls(out, state, kept, effects)
+        inputs = {name: fingerprint(campaign / name) for name in kept.inputs}
+        if any(mark.sha256 != kept.inputs[name].sha256 for name, mark in inputs.items()):
+            what = f"belongs to the campaign {kept.campaign}, and {campaign} holds other data."
+            raise OutError(what, file=out, fix="Choose another --out.")
+        store = cls(out, replace(state, inputs=inputs), kept, effects)
+        same = f"{campaign} holds the same data and takes over."
+        store.warnings.append(f"{out} was made from {kept.campaign}; {same}")
         return store
 
     def _keep_what_moved(self) -> None:
