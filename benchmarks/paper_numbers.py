@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from sealfit.physics import aging_law, aging_law_as_printed
+from sealfit.physics import aging_constant, aging_law
 from sealfit.simulation.model import Law, Physics, declared_parameters
 
 PUBLISHED_LAWS = {
@@ -143,7 +143,8 @@ def as_printed(quantity: str, days, start: float | None = None) -> np.ndarray:
     """Return Eq. 15 with the printed a, b and c, from the printed start or another, shape of `days`."""
     law = PUBLISHED_LAWS[quantity]
     mu_0 = law.mu_0 if start is None else start
-    return aging_law_as_printed(days, mu_0=mu_0, a=law.a, b=law.b, c=PUBLISHED_C[quantity])
+    more = aging_constant(law.a, law.b) - PUBLISHED_C[quantity]  # of the constant of Eq. 15
+    return aging_law(days, mu_0=mu_0 + more, a=law.a, b=law.b)
 
 
 def printed_errors() -> dict[str, float]:

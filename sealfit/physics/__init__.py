@@ -1,6 +1,6 @@
 """Equations as pure array functions; they know nothing of tables."""
 
-from sealfit.physics.aging_laws import aging_constant, aging_law, aging_law_as_printed
+from sealfit.physics.aging_laws import aging_constant, aging_law
 from sealfit.physics.lugre import (
     PRESSURES,
     Bristles,
@@ -13,6 +13,6 @@ from sealfit.physics.lugre import (
 )
 
 __all__ = [
-    "PRESSURES", "Bristles", "Contact", "LuGre", "aging_constant", "aging_law", "aging_law_as_printed",
-    "bristle_limit", "lugre_force", "stribeck_decay", "stribeck_force",
+    "PRESSURES", "Bristles", "Contact", "LuGre", "aging_constant", "aging_law", "bristle_limit",
+    "lugre_force", "stribeck_decay", "stribeck_force",
 ]  # fmt: skip

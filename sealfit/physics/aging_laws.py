@@ -1,4 +1,4 @@
-"""Laws of aging: Eq. 15, in its identifiable form and as printed, and its rivals."""
+"""Laws of aging: Eq. 15 in its identifiable form, and its rivals."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def aging_law(days, *, mu_0, a, b):
 
     .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b)
 
-    This is Eq. 15 with c = -a ln b, the only c for which mu(0) = mu_0. As printed, Eq. 15 is not
-    identifiable: only mu_0 - c is determined.
+    This is Eq. 15 with c = -a ln b, the only c for which mu(0) = mu_0. As printed, mu_0 - a ln(t + b) - c is
+    not identifiable: only mu_0 - c is determined.
 
     Parameters
     ----------
@@ -68,22 +68,6 @@ def aging_constant(a, b):
     """
     _, b = _checked(0.0, b)
     return -np.asarray(a, float) * np.log(b)
-
-
-def aging_law_as_printed(days, *, mu_0, a, b, c):
-    r"""Return the coefficient after aging by Eq. 15 as printed, with four parameters.
-
-    .. math:: \mu(t) = \mu_0 - a \ln(t + b) - c
-
-    Parameters and errors as `aging_law`; `c` has the unit of `mu_0`.
-
-    Examples
-    --------
-    >>> round(float(aging_law_as_printed(16.0, mu_0=0.93513, a=0.04448, b=0.0804, c=0.11159)), 4)
-    0.7
-    """
-    days, b = _checked(days, b)
-    return np.asarray(mu_0, float) - np.asarray(a, float) * np.log(days + b) - np.asarray(c, float)
 
 
 # ---------------------------------------------------------------- losses

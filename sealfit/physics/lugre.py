@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import accumulate
 
 import numpy as np
@@ -29,20 +30,14 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
 # ---------------------------------------------------------------- pressure
-# Pressure along the contact: the four distributions of Eqs. 8 to 11.
 
 
-def _inside(zeta_mm, width_mm):
-    zeta = np.asarray(zeta_mm, float)
-    if not width_mm > 0:
-        raise ParameterError(f"width_mm = {width_mm:g}: the contact width must be positive.")
-    if np.any((zeta < 0) | (zeta > width_mm)):
-        raise ParameterError(f"zeta_mm must lie in the contact, from 0 to {width_mm:g} mm.")
-    return zeta
+def load_per_width(zeta_mm, load_N, *, width_mm, shape="uniform", decay=1.0):
+    r"""Return the load per unit width at places in the contact (Eqs. 8 to 11), shape (n,), in N/mm.
 
-
-def uniform(zeta_mm, load_N, *, width_mm):
-    r"""Load per unit width, the same everywhere (Eq. 8), in N/mm: :math:`f_n = F_n / L`.
+    .. math::
+        f_n = \frac{F_n}{L} s(\zeta / L), \quad s(x) = 1, \quad \frac{\pi}{2} \sin \pi x, \quad
+        \frac{\lambda e^{-\lambda x}}{1 - e^{-\lambda}} \quad \text{or} \quad 6 x (1 - x)
 
     Parameters
     ----------
@@ -52,6 +47,10 @@ def uniform(zeta_mm, load_N, *, width_mm):
         Total load F_n in N.
     width_mm : float
         Contact width L in mm.
+    shape : str
+        "uniform", "sine", "exponential" or "parabolic".
+    decay : float
+        lambda of the exponential shape, dimensionless. At 0 it is uniform; below 0 it increases.
 
     Raises
     ------
@@ -60,63 +59,30 @@ def uniform(zeta_mm, load_N, *, width_mm):
 
     Examples
     --------
-    >>> float(uniform(1.0, 50.0, width_mm=2.0))
-    25.0
+    >>> [round(float(load_per_width(1.0, 50.0, width_mm=2.0, shape=shape)), 4) for shape in PRESSURES]
+    [25.0, 39.2699, 23.9879, 37.5]
     """
-    return np.full_like(_inside(zeta_mm, width_mm), load_N / width_mm)
+    zeta = np.asarray(zeta_mm, float)
+    if not width_mm > 0:
+        raise ParameterError(f"width_mm = {width_mm:g}: the contact width must be positive.")
+    if np.any((zeta < 0) | (zeta > width_mm)):
+        raise ParameterError(f"zeta_mm must lie in the contact, from 0 to {width_mm:g} mm.")
+    x = zeta / width_mm
+    if shape == "sine":
+        relative = np.pi / 2 * np.sin(np.pi * x)
+    elif shape == "parabolic":
+        relative = 6 * x * (1 - x)
+    elif shape == "exponential" and decay != 0:
+        relative = decay * np.exp(-decay * x) / -np.expm1(-decay)
+    else:
+        relative = np.ones_like(x)
+    return load_N / width_mm * relative
 
 
-def sine(zeta_mm, load_N, *, width_mm):
-    r"""Load per unit width, half a sine (Eq. 9), in N/mm: :math:`f_n = \frac{\pi F_n}{2L} \sin(\pi\zeta/L)`.
-
-    Parameters and errors as `uniform`.
-
-    Examples
-    --------
-    >>> round(float(sine(1.0, 50.0, width_mm=2.0)), 4)
-    39.2699
-    """
-    zeta = _inside(zeta_mm, width_mm)
-    return np.pi * load_N / (2 * width_mm) * np.sin(np.pi * zeta / width_mm)
-
-
-def exponential(zeta_mm, load_N, *, width_mm, decay=1.0):
-    r"""Load per unit width, falling exponentially (Eq. 10), in N/mm.
-
-    .. math:: f_n = \frac{\lambda F_n}{L (1 - e^{-\lambda})} e^{-\lambda\zeta/L}
-
-    Parameters and errors as `uniform`; `decay` is lambda, dimensionless. At 0 it is `uniform`; below 0 it
-    increases.
-
-    Examples
-    --------
-    >>> round(float(exponential(0.0, 50.0, width_mm=2.0, decay=1.0)), 4)
-    39.5494
-    """
-    zeta = _inside(zeta_mm, width_mm)
-    if decay == 0:
-        return uniform(zeta, load_N, width_mm=width_mm)
-    return decay * load_N / (-width_mm * np.expm1(-decay)) * np.exp(-decay * zeta / width_mm)
-
-
-def parabolic(zeta_mm, load_N, *, width_mm):
-    r"""Load per unit width, a parabola (Eq. 11), in N/mm.
-
-    .. math:: f_n = \frac{3F_n}{2L} [1 - (\frac{\zeta - L/2}{L/2})^2]
-
-    Parameters and errors as `uniform`.
-
-    Examples
-    --------
-    >>> float(parabolic(1.0, 50.0, width_mm=2.0))
-    37.5
-    """
-    zeta = _inside(zeta_mm, width_mm)
-    half = width_mm / 2
-    return 3 * load_N / (2 * width_mm) * (1 - ((zeta - half) / half) ** 2)
-
-
-PRESSURES = {law.__name__: law for law in (uniform, sine, exponential, parabolic)}
+# The distributions by name, functions of zeta_mm, load_N and width_mm.
+PRESSURES = {
+    shape: partial(load_per_width, shape=shape) for shape in ("uniform", "sine", "exponential", "parabolic")
+}
 
 
 @dataclass(frozen=True)
@@ -137,7 +103,7 @@ class Contact:
         Further arguments of the distribution, such as `decay`.
     """
 
-    pressure: Callable = uniform
+    pressure: Callable = load_per_width
     width_mm: float = 1.0
     exponent: float = 1.0
     reference_N_mm: float | None = None
@@ -153,7 +119,7 @@ class Contact:
 
         Examples
         --------
-        >>> share, factor = Contact(sine, width_mm=2.0, exponent=0.8).elements(50.0)
+        >>> share, factor = Contact(PRESSURES["sine"], width_mm=2.0, exponent=0.8).elements(50.0)
         >>> round(float(share.sum()), 12), round(float(share @ factor), 3)
         (1.0, 0.975)
         """
@@ -272,14 +238,7 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
 
     .. math:: g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}]
 
-    Parameters
-    ----------
-    speed_mm_s, load_N : float or ndarray, shape (n,)
-        Sliding speed in mm/s; normal load in N. A load of 1 turns the coefficients into forces.
-    mu_s, mu_c, v_s : float or ndarray
-        Static and Coulomb coefficients, Stribeck speed in mm/s.
-    sigma_0 : float or ndarray
-        Stiffness of the bristles in N/mm.
+    Parameters as `stribeck_force`; sigma_0, the stiffness of the bristles, is in N/mm.
 
     Raises
     ------

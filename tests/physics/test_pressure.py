@@ -5,7 +5,8 @@ from scipy.integrate import quad
 
 from sealfit.errors import ParameterError
 from sealfit.physics import PRESSURES, Contact
-from sealfit.physics.lugre import exponential, parabolic, sine, uniform
+
+uniform, sine, exponential, parabolic = PRESSURES.values()
 
 
 @pytest.mark.parametrize("pressure", PRESSURES.values(), ids=PRESSURES)
