@@ -204,16 +204,16 @@ def test_many_draws_at_once_are_fitted_as_each_alone():
         assert x == pytest.approx(alone(law, covariance, values), rel=1e-5, abs=1e-6)
 
 
-def test_values_left_out_at_once_are_left_out_of_each_fit():
+def test_the_error_at_values_left_out_is_that_of_a_law_fitted_without_them():
     """With a common error of a series, so that what is left out is correlated with what stays."""
     aged = campaign(scatter=0.01)
     common = 1e-5 * (aged.series()[:, None] == aged.series()) + np.diag(aged.variance)
     law = fit_joint_law(replace(aged, variance=common), "log", "rate")
-    covariance = law.aged.covariance(law.scatter).toarray()
-    masks = np.array([*aged.whole_series(), *aged.last_days()])
-    values = np.tile(aged.value, (len(masks), 1))
-    for out, x in zip(masks, solved_many(law, whitened(covariance), values, masks), strict=True):
-        assert x == pytest.approx(alone(law, covariance, aged.value, ~out), rel=1e-5, abs=1e-6)
+    covariance, found = law.aged.covariance(law.scatter).toarray(), left_out(law)
+    for name, masks in (("series", aged.whole_series()), ("last_day", aged.last_days())):
+        fits = [(out, alone(law, covariance, aged.value, ~out)) for out in masks]
+        errors = np.concatenate([(law.at(law.aged, x) - aged.value)[out] for out, x in fits])
+        assert found[name] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-5)
 
 
 def test_of_many_series_some_are_left_out_in_turn():
