@@ -11,9 +11,9 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
-from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke, mean_over
+from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke
 from sealfit.fit.dynamic.presliding import Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
-from sealfit.fit.dynamic.starts import Along, Part, Start, starts_of, strokes_along, whole_strokes
+from sealfit.fit.dynamic.starts import Along, Start, starts_of, strokes_along, whole_strokes
 from sealfit.fit.joint.rows import nesting_run, records
 from sealfit.fit.steady import condition_keys, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces
@@ -218,9 +218,9 @@ def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
         found = fit_stiffness(_evidence(start, of_starts, curve), curve) if braked else None
         models = found.forces_N if found is not None and found.seen else None
         made = [pd.DataFrame(bristle_rows(found, curve, config, braked=braked))]
-        grouped = _Grouped(start, table) if start else None
-        made += [grouped.curves(models), grouped.peaks()] if grouped else [pd.DataFrame(), pd.DataFrame()]
-        made.append(_Grouped(whole, table).peaks() if whole else pd.DataFrame())
+        cells = Cells(start, table) if start else None
+        made += [_mean_starts(cells, models), peaks(cells)] if start else [pd.DataFrame(), pd.DataFrame()]
+        made.append(peaks(Cells(whole, table)) if whole else pd.DataFrame())
         for kept, one in zip(tables, made, strict=True):
             kept.append(one.assign(condition=name))
     return [_together(parts) for parts in tables]
@@ -234,35 +234,20 @@ def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Al
     return [replace(stroke, force_N=stroke.force_N - size[stroke.row]) for stroke in strokes]
 
 
-class _Grouped:
-    """Parts of strokes of one condition, in groups of one commanded speed and direction."""
-
-    def __init__(self, parts: Sequence[Part], table: pd.DataFrame) -> None:
-        own = table.loc[[part.row for part in parts]]
-        group = np.unique(own["group"], return_inverse=True)[1]
-        self.cells, self.file = Cells(parts, group), own["file_number"].to_numpy()
-        self.at = own[["speed_set_mm_s", "direction"]].iloc[self.cells.groups.start].reset_index(drop=True)
-
-    def peaks(self) -> pd.DataFrame:
-        """Return the result of `peaks` as a table, with speed and direction."""
-        found = peaks(self.cells, self.file)
-        at = self.at.iloc[found.pop("group")].reset_index(drop=True)
-        return at.assign(**found)
-
-    def curves(self, models: Sequence[np.ndarray] | None) -> pd.DataFrame:
-        """Return the mean starts, measured and, if there is a fit, modelled, as table `dynamic_curves`."""
-        force, error, n = mean_over(self.cells, self.cells.force_N)
-        model = mean_over(self.cells, self.cells.means(models))[0] if models else np.full(n.shape, np.nan)
-        table = {
-            "distance_mm": self.cells.middle_mm,
-            "force_N": force,
-            "force_se_N": error,
-            "n": n,
-            "model_N": model,
-        }
-        group, cell = np.nonzero(n > 0)
-        at = self.at.iloc[group].reset_index(drop=True)
-        return at.assign(**{name: values[group, cell] for name, values in table.items()})
+def _mean_starts(cells: Cells, models: Sequence[np.ndarray] | None) -> pd.DataFrame:
+    """Return the mean starts, measured and, if there is a fit, modelled, as table `dynamic_curves`."""
+    force, error, n = cells.over_strokes(cells.force_N)
+    model = cells.over_strokes(cells.means(models))[0] if models else np.full(n.shape, np.nan)
+    table = {
+        "distance_mm": cells.middle_mm,
+        "force_N": force,
+        "force_se_N": error,
+        "n": n,
+        "model_N": model,
+    }
+    group, cell = np.nonzero(n > 0)
+    at = cells.at.iloc[group].reset_index(drop=True)
+    return at.assign(**{name: values[group, cell] for name, values in table.items()})
 
 
 def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:

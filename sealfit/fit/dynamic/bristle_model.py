@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+import pandas as pd
 
 from sealfit.fit.dynamic.starts import LEAST, Part
 from sealfit.ingest.segments import Pieces
@@ -18,16 +19,22 @@ MOST_CELLS = 200
 
 
 class Cells:
-    """Cells of distance for groups of strokes; the strokes of a group are adjacent.
+    """Cells of distance for strokes of one condition, in groups of one commanded speed and direction.
+
+    `table` has the group of each stroke, by the row of its part; the strokes of a group are adjacent. `at`
+    has the speed and direction of the groups, and `file` the number of each stroke's file.
 
     The cells of a group extend to the median distance of its strokes, `reach_mm`, shape (groups,). Their
     number, `count`, is the median number of samples of a stroke, `samples`, at most MOST_CELLS. Arrays are
     padded to the largest number of cells; `middle_mm`, shape (groups, cells), is the midpoint of each.
     """
 
-    def __init__(self, parts: Sequence[Part], group: np.ndarray) -> None:
+    def __init__(self, parts: Sequence[Part], table: pd.DataFrame) -> None:
         self.parts = parts
-        self.groups = Pieces(np.bincount(group))
+        own = table.loc[[part.row for part in parts]]
+        self.groups = Pieces(np.unique(own["group"], return_counts=True)[1])
+        self.file = own["file_number"].to_numpy()
+        self.at = own[["speed_set_mm_s", "direction"]].iloc[self.groups.start].reset_index(drop=True)
         self._size = np.array([part.force_N.size for part in parts])
         reach = np.array([part.distance_mm[-1] for part in parts], float)
         self.samples, self.reach_mm = (
@@ -69,18 +76,17 @@ class Cells:
         """Return the sums over groups, shape (groups, ...), of values of strokes, shape (strokes, ...)."""
         return np.add.reduceat(values, self.groups.start, axis=0)
 
+    def over_strokes(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the mean over strokes in each cell, its standard error and their number, (groups, cells).
 
-def mean_over(cells: Cells, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean over strokes in each cell, its standard error and their number, (groups, cells) each.
-
-    `values`, shape (strokes, cells), are NaN if missing.
-    """
-    there = np.isfinite(values)
-    n = cells.totals(there.astype(np.int64))
-    mean = np.where(n > 0, cells.totals(np.where(there, values, 0.0)) / np.maximum(n, 1), np.nan)
-    away = np.where(there, values - np.repeat(mean, cells.groups.size, axis=0), 0.0)
-    variance = cells.totals(away**2) / np.maximum(n - 1, 1)
-    return mean, np.where(n > 1, np.sqrt(variance / np.maximum(n, 1)), np.nan), n
+        `values`, shape (strokes, cells), are NaN if missing.
+        """
+        there = np.isfinite(values)
+        n = self.totals(there.astype(np.int64))
+        mean = np.where(n > 0, self.totals(np.where(there, values, 0.0)) / np.maximum(n, 1), np.nan)
+        away = np.where(there, values - np.repeat(mean, self.groups.size, axis=0), 0.0)
+        variance = self.totals(away**2) / np.maximum(n - 1, 1)
+        return mean, np.where(n > 1, np.sqrt(variance / np.maximum(n, 1)), np.nan), n
 
 
 # ---------------------------------------------------------------- rises

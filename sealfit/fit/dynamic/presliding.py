@@ -19,7 +19,7 @@ evidence is the run, as a set-up shifts all files of a run.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -201,7 +201,7 @@ def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tup
 # The peak of the force before steady sliding, per commanded speed and direction.
 
 
-def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
+def peaks(cells: Cells) -> pd.DataFrame:
     """Return the break-away force F_ba and its ratio to the sliding force, per unit of evidence.
 
     A unit is a file, or a stroke of a single file. The sliding force is extrapolated to the peak along the
@@ -211,17 +211,17 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
     above sliding where the mean of all units is largest, `noise` its standard error in units of that of a
     sample, and `places` the number of positions; `F` is the sliding force.
 
-    `cells` are those of the strokes at one condition, in groups of one commanded speed and direction; `file`,
-    shape (strokes,), is the number of each stroke's file. The results have the shape (units,); `group` is the
-    number of the unit's group. Units with an unknown value are left out.
+    The table has one row per unit, with its commanded speed and direction; units with an unknown value are
+    left out.
     """
     of, count = cells.groups.of, cells.count
     each = np.arange(len(of))
     # Of the window, in cells.
     half = np.ceil(count * np.maximum(SAMPLES / cells.samples, SHARE) / 2).astype(int)
-    lines = _Lines(cells)
+    lines = np.array([astuple(part.sliding) for part in cells.parts], float)
+    mean_N, middle, slope, samples, extent = lines.T
     distance = cells.middle_mm[of]
-    sliding = lines.at(distance)
+    sliding = mean_N[:, None] + slope[:, None] * (distance - middle[:, None])
     force = cells.force_N
     there = np.isfinite(force)
     wide = half[of]
@@ -230,26 +230,27 @@ def peaks(cells: Cells, file: np.ndarray) -> dict[str, np.ndarray]:
         for values in (force, np.ones(force.shape), force - sliding)
     )
     mean = np.where(hits > 0, total / np.maximum(hits, 1), np.nan)
-    unit = _units(of, file)
+    unit = _units(of, cells.file)
     own, whole = _places(above * cells.own, hits * cells.own, unit, cells)
     peak, line = mean[each, own], sliding[each, own]
     whole = whole[of]
     per_cell = (cells.samples / count)[of]
-    error = lines.error(distance[each, whole])
+    away = (distance[each, whole] - middle) / np.maximum(extent, 1e-300)
+    error = np.sqrt(1 / samples + away**2)  # of the line, in standard deviations of a sample
     table = {
         FORCE: np.where(peak > 0.0, peak, np.nan),
         RATIO: np.divide(peak, line, out=np.full(len(of), np.nan), where=(peak > 0.0) & (line > 0.0)),
-        SLIDING: np.where(lines.force > 0.0, lines.force, np.nan),
+        SLIDING: np.where(mean_N > 0.0, mean_N, np.nan),
         TOP: mean[each, whole] - sliding[each, whole],
         NOISE: np.hypot(error, 1 / np.sqrt(np.maximum(hits[each, whole] * per_cell, 1.0))),
         PLACES: np.maximum(count / (2 * half + 1), 1.0)[of],
         WHERE: distance[each, whole],
         REACH: cells.reach_mm[of],
     }
-    made = {name: _mean_of(values, unit) for name, values in table.items()}
-    known = np.all([np.isfinite(values) for values in made.values()], axis=0)
-    first = np.unique(unit, return_index=True)[1]
-    return {name: values[known] for name, values in made.items()} | {"group": of[first][known]}
+    group = of[np.unique(unit, return_index=True)[1]]
+    made = cells.at.iloc[group].reset_index(drop=True)
+    made = made.assign(**{name: _mean_of(values, unit) for name, values in table.items()})
+    return made.dropna(subset=list(table)).reset_index(drop=True)
 
 
 def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: Config) -> pd.DataFrame:
@@ -321,24 +322,6 @@ def largest_rows(found: pd.DataFrame, config: Config) -> pd.DataFrame:
         "identified": True,
     }
     return table[AT].assign(**row, reason=reason)
-
-
-class _Lines:
-    """The sliding force of every stroke of cells, along the distance."""
-
-    def __init__(self, cells: Cells) -> None:
-        names = ("force_N", "slope_N_mm", "distance_mm", "extent_mm", "rows")
-        values = [[getattr(part.sliding, name) for name in names] for part in cells.parts]
-        self.force, self.slope, self.distance, self.extent, self.rows = np.array(values, float).T
-
-    def at(self, distance_mm: np.ndarray) -> np.ndarray:
-        """Return the extrapolated sliding force at distances, shape (strokes, n)."""
-        return self.force[:, None] + self.slope[:, None] * (distance_mm - self.distance[:, None])
-
-    def error(self, distance_mm: np.ndarray) -> np.ndarray:
-        """Return the standard error of `at` at a distance per stroke, in standard deviations of a sample."""
-        away = (distance_mm - self.distance) / np.maximum(self.extent, 1e-300)
-        return np.sqrt(1 / self.rows + away**2)
 
 
 def _pooled(values: pd.DataFrame, groups: Sequence[pd.Series]) -> tuple[dict[str, np.ndarray], np.ndarray]:
