@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -77,25 +77,12 @@ def _fit_rubber(own: pd.DataFrame) -> list[dict]:
     found = found[found["parameter"].isin(pair) & found["aging_days"].notna()]
     found = _of_one_meaning(found, own, pair)
     found = found.assign(quantity=found["parameter"]).sort_values(["condition", "quantity"], kind="stable")
-    aged = own[own["aging_days"].to_numpy(float) > 0]
-    quantities = [name for name in pair if (found["quantity"] == name).any()]
-    unit = str(found["unit"].iloc[0])
-    curves = curves_of(found, list(dict.fromkeys(aged["series"])), quantities, unit)
-    fitted = [name for name in quantities if any(c.place >= 0 and c.quantity == name for c in curves)]
-    if not fitted:
-        return [row for curve in curves for row in law_table.without_law(curve)]
-    number = numbers_of(found, curves)
-    used, number = found[number > WITHOUT_LAW], number[number > WITHOUT_LAW]
-    values = Values(
-        used["aging_days"].to_numpy(float),
-        used["value"].to_numpy(float),
-        np.array([fitted.index(name) for name in used["quantity"]], int),
-        number,
-        steady_covariance(used, values_of(own, "covariance")),
-    )
-    known = values_of(own, "sensor_shift")
-    moved = [known.get(key, 0.0) for key in zip(used["condition"], used["quantity"], strict=True)]
-    return list(rubber_rows(values, curves, fitted, np.nan_to_num(np.array(moved, float))))
+    shifts = values_of(own, "sensor_shift")
+    moved = [shifts.get(key, 0.0) for key in zip(found["condition"], found["quantity"], strict=True)]
+    covariance = steady_covariance(found, values_of(own, "covariance"))
+    series = list(dict.fromkeys(own.loc[own["aging_days"].to_numpy(float) > 0, "series"]))
+    found = found.assign(moved=np.nan_to_num(np.array(moved, float)))
+    return laws_of_series(found, series, pair, covariance)
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
@@ -111,27 +98,23 @@ def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str
     return found[~((found["parameter"] == pair[1]) & found["condition"].isin(few))]
 
 
-def curves_of(found: pd.DataFrame, series: list[str], quantities: list[str], unit: str) -> list[Curve]:
-    """Return the curves of some series and quantities; those with enough days are numbered.
-
-    `found` are the values, with their `series`, `quantity` and `aging_days`.
-    """
-    unaged = set(found.loc[found["aging_days"] == 0, "quantity"])
+def _curves_of(found: pd.DataFrame, series: Sequence[str], quantities: Sequence[str]) -> list[Curve]:
+    """Return the curves of some series and quantities; those with enough days are numbered."""
+    unaged, unit = set(found.loc[found["aging_days"] == 0, "quantity"]), str(found["unit"].iloc[0])
     aged = found[found["aging_days"] > 0]
     tested = dict(
         aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False).unique()
     )
     curves, place = [], 0
-    for name in series:
-        for quantity in quantities:
-            days = np.sort(tested.get((name, quantity), np.zeros(0)))
-            enough = days.size + (quantity in unaged) >= DAYS_FOR_LAW
-            curves.append(Curve(name, quantity, place if enough else -1, days, quantity in unaged, unit))
-            place += enough
+    for name, quantity in product(series, quantities):
+        days = np.sort(tested.get((name, quantity), np.zeros(0)))
+        enough = days.size + (quantity in unaged) >= DAYS_FOR_LAW
+        curves.append(Curve(name, quantity, place if enough else -1, days, quantity in unaged, unit))
+        place += enough
     return curves
 
 
-def numbers_of(found: pd.DataFrame, curves: list[Curve]) -> np.ndarray:
+def _numbers_of(found: pd.DataFrame, curves: list[Curve]) -> np.ndarray:
     """Return the number of each value's curve, shape (n,); -1 for unaged rubber, `WITHOUT_LAW` for none."""
     place = {(c.series, c.quantity): c.place for c in curves if c.place >= 0}
     keys = zip(found["series"], found["quantity"], strict=True)
@@ -203,13 +186,30 @@ def between_scatter(values: Values) -> tuple[float, LawFit]:
 
 
 # ---------------------------------------------------------------- table
-def rubber_rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndarray) -> Iterator[dict]:
-    """Yield the rows of table `aging_fit` of one rubber.
+def laws_of_series(
+    found: pd.DataFrame, series: Sequence[str], quantities: Sequence[str], covariance, **replicates
+) -> list[dict]:
+    """Return the rows of table `aging_fit` of one rubber.
 
-    `fitted` are the quantities with a law, in the order of `values.origin`; `curves` are all, those without a
-    law too. `moved`, shape (n,), is the change of the values if the sensor reads one standard uncertainty too
-    high.
+    `found` has the values: `series`, `quantity`, `aging_days`, `value`, `unit`, and `moved`, their change if
+    the sensor reads one standard uncertainty too high; values of one condition are adjacent. `series` and
+    `quantities` give the order of the laws. `covariance`, shape (n, n), and `replicates` are as in `Values`.
     """
+    quantities = [name for name in quantities if (found["quantity"] == name).any()]
+    curves = _curves_of(found, series, quantities)
+    fitted = [name for name in quantities if any(c.place >= 0 and c.quantity == name for c in curves)]
+    if not fitted:
+        return [row for curve in curves for row in law_table.without_law(curve)]
+    days, value, moved = (found[name].to_numpy(float) for name in ("aging_days", "value", "moved"))
+    origin = np.array([quantities.index(name) for name in found["quantity"]], int)
+    number = _numbers_of(found, curves)
+    kept = number > WITHOUT_LAW
+    values = Values(days, value, origin, number, covariance, **replicates).part(kept)
+    return list(_rows(values, curves, fitted, moved[kept]))
+
+
+def _rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndarray) -> Iterator[dict]:
+    """Yield the rows of all curves; `fitted` are the quantities with a law, in the order of their origin."""
     quantities = {}
     model = np.empty(values.value.size)
     for q, name in enumerate(fitted):

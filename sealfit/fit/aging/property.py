@@ -21,11 +21,9 @@ from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from sealfit.config import Config
-from sealfit.fit.aging import SMALLEST, WITHOUT_LAW, aging_curves, curves_of, numbers_of, rubber_rows
+from sealfit.fit.aging import SMALLEST, aging_curves, laws_of_series
 from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, aged_of, law_tables, laws_of
 from sealfit.fit.aging.joint_law import Aged, JointLaw
-from sealfit.fit.aging.law import Values
-from sealfit.fit.aging.law_table import without_law
 from sealfit.tables import AGING_FIT
 
 # Largest ratio of the variance between batches to that between specimens that is searched.
@@ -177,14 +175,6 @@ def _law_per_series(means: Means, quantity: str, unit: str) -> list[dict]:
     days, series = table["aging_days"].to_numpy(float), table["series"]
     columns = [name for name in (TEMPERATURE, COMPRESSION) if name in table]
     order = table[days > 0].sort_values(columns, kind="stable")["series"] if columns else series[days > 0]
-    table = table.assign(quantity=quantity)
-    curves = curves_of(table, list(dict.fromkeys(order)), [quantity], unit)
-    if all(curve.place < 0 for curve in curves):
-        return [row for curve in curves for row in without_law(curve)]
-    number = numbers_of(table, curves)
-    kept = number > WITHOUT_LAW
-    values = Values(
-        days, table["value"].to_numpy(float), np.zeros(days.size, int), number, means.covariance, means.size,
-        means.df, means.level_df,
-    ).part(kept)  # fmt: skip
-    return list(rubber_rows(values, curves, [quantity], np.zeros(int(kept.sum()))))
+    table = table.assign(quantity=quantity, unit=unit, moved=0.0)
+    replicates = {"size": means.size, "replicates_df": means.df, "level_df": means.level_df}
+    return laws_of_series(table, list(dict.fromkeys(order)), [quantity], means.covariance, **replicates)
