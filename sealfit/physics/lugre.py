@@ -87,27 +87,14 @@ PRESSURES = {
 
 @dataclass(frozen=True)
 class Contact:
-    r"""A contact whose friction depends on the local pressure, :math:`\mu \propto p^{n-1}`.
+    r"""A contact whose friction depends on the local pressure, :math:`\mu \propto p^{n-1}`."""
 
-    Attributes
-    ----------
-    pressure : callable
-        One of `PRESSURES`, or another function with the same arguments, in N/mm.
-    width_mm : float
-        Contact width L in mm.
-    exponent : float
-        n; 1 for friction independent of the pressure, 2/3 to 1 for rubber.
-    reference_N_mm : float, optional
-        Load per width at which mu_s and mu_c are defined; default the mean of the present load.
-    shape : mapping
-        Further arguments of the distribution, such as `decay`.
-    """
-
-    pressure: Callable = load_per_width
-    width_mm: float = 1.0
-    exponent: float = 1.0
+    pressure: Callable = load_per_width  # one of `PRESSURES`, or a function with the same arguments
+    width_mm: float = 1.0  # contact width L
+    exponent: float = 1.0  # n; 1 for friction independent of the pressure, 2/3 to 1 for rubber
+    # Load per width at which mu_s and mu_c are defined; default the mean of the present load.
     reference_N_mm: float | None = None
-    shape: Mapping[str, float] = field(default_factory=dict)
+    shape: Mapping[str, float] = field(default_factory=dict)  # further arguments of `pressure`: `decay`
 
     def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
         """Return each element's share of the load and mu relative to the reference, shape (elements,) each.
@@ -141,15 +128,8 @@ def stribeck_decay(speed_mm_s, v_s):
 
     Parameters
     ----------
-    speed_mm_s : float or ndarray
-        Sliding speed v in mm/s, of either sign.
-    v_s : float or ndarray
-        Stribeck speed in mm/s, broadcast against the speed.
-
-    Returns
-    -------
-    float or ndarray
-        E, without unit.
+    speed_mm_s, v_s : float or ndarray
+        Sliding speed v in mm/s, of either sign; Stribeck speed in mm/s, broadcast against it.
 
     Raises
     ------
@@ -170,7 +150,7 @@ def stribeck_decay(speed_mm_s, v_s):
 
 
 def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
-    r"""Return the friction force of the distributed LuGre model in steady sliding (Eq. 14), in N.
+    r"""Return the friction force of the distributed LuGre model in steady sliding (Eq. 14), shape (n,), in N.
 
     .. math:: F = N [\mu_c + (\mu_s - \mu_c) e^{-(v / v_s)^2}] \mathrm{sgn}\,v + \sigma_2 v
 
@@ -182,11 +162,6 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
     mu_s, mu_c, v_s, sigma_2 : float or ndarray, shape (n,)
         Static and Coulomb coefficients; Stribeck speed in mm/s; viscous coefficient in N s/mm.
 
-    Returns
-    -------
-    float or ndarray, shape (n,)
-        Force in N, an odd function of the speed, with its sign for nonnegative coefficients.
-
     Raises
     ------
     ParameterError
@@ -194,9 +169,9 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
 
     Notes
     -----
-    In steady sliding sigma_0 and sigma_1 have no effect. F(0) = 0 is not the break-away force.
-    Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053;
-    Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102, Eq. 14.
+    The force has the sign of the speed. F(0) = 0 is not the break-away force; sigma_0 and sigma_1 have no
+    effect in steady sliding. Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425,
+    doi:10.1109/9.376053; Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102, Eq. 14.
 
     Examples
     --------
@@ -216,21 +191,11 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
 
 @dataclass(frozen=True)
 class Bristles:
-    """Force, deflection and heat along a history of the speed.
+    """Force, deflection and heat along a history of the speed, shape (n,) each."""
 
-    Attributes
-    ----------
-    force_N : ndarray, shape (n,)
-        Friction force.
-    deflection_mm : ndarray, shape (n,)
-        Mean deflection z in mm, weighted by stiffness.
-    heat_mW : ndarray, shape (n,)
-        Dissipated power in mW: the power of the force minus that stored in the bristles.
-    """
-
-    force_N: np.ndarray
-    deflection_mm: np.ndarray
-    heat_mW: np.ndarray
+    force_N: np.ndarray  # friction force
+    deflection_mm: np.ndarray  # mean deflection z, weighted by stiffness
+    heat_mW: np.ndarray  # dissipated power: that of the force minus what is stored in the bristles
 
 
 def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
@@ -262,30 +227,15 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
 
 @dataclass(frozen=True)
 class LuGre:
-    """The parameters of the dynamic LuGre model.
+    """The parameters of the dynamic LuGre model."""
 
-    Attributes
-    ----------
-    mu_s, mu_c, v_s : float
-        Static and Coulomb coefficients, Stribeck speed in mm/s.
-    sigma_0, sigma_1, sigma_2 : float
-        Stiffness in N/mm, damping of the bristles in N s/mm, viscous coefficient in N s/mm.
-    contact : Contact, optional
-        Contact with pressure-dependent friction.
-    """
-
-    mu_s: float
-    mu_c: float
-    v_s: float
-    sigma_0: float
-    sigma_1: float = 0.0
-    sigma_2: float = 0.0
-    contact: Contact | None = None
-
-    def limit_mm(self, speed_mm_s, load_N: float) -> np.ndarray:
-        """Return the deflections in steady sliding in mm, shape (..., elements), by `bristle_limit`."""
-        numbers = {"mu_s": self.mu_s, "mu_c": self.mu_c, "v_s": self.v_s, "sigma_0": self.sigma_0}
-        return np.asarray(bristle_limit(speed_mm_s, load_N, **numbers))[..., None] * self.elements(load_N)[1]
+    mu_s: float  # static coefficient
+    mu_c: float  # Coulomb coefficient
+    v_s: float  # Stribeck speed in mm/s
+    sigma_0: float  # stiffness in N/mm
+    sigma_1: float = 0.0  # damping of the bristles in N s/mm
+    sigma_2: float = 0.0  # viscous coefficient in N s/mm
+    contact: Contact | None = None  # with pressure-dependent friction
 
     def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
         """Return each element's share of the load and factor on mu, by `Contact.elements`."""
@@ -309,11 +259,6 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
         Parameters.
     deflection_mm : float
         Initial deflection of all bristles in mm.
-
-    Returns
-    -------
-    Bristles
-        Force, mean deflection and heat at every time.
 
     Raises
     ------
@@ -346,13 +291,14 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
         raise ParameterError(
             f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative."
         )
-    share = model.elements(load_N)[0]
+    share, factor = model.elements(load_N)
     speed = np.asarray(speed_mm_s, float)
     if speed.shape != time.shape:
         raise ParameterError(
             f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time."
         )
-    limit = model.limit_mm(speed, load_N)
+    parameters = {name: getattr(model, name) for name in ("mu_s", "mu_c", "v_s", "sigma_0")}
+    limit = bristle_limit(speed, load_N, **parameters)[:, None] * factor
     z = _stepped(time, speed, limit, np.full(share.size, float(deflection_mm)))
     rate = speed[:, None] - np.abs(speed)[:, None] * z / limit
     force = (model.sigma_0 * z + model.sigma_1 * rate) @ share + model.sigma_2 * speed
