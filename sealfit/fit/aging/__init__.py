@@ -126,9 +126,7 @@ def _numbers_of(found: pd.DataFrame, curves: list[Curve]) -> np.ndarray:
 def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], float]:
     """Return the values of table `steady_fit` with a `quantity`, by condition and parameter."""
     rows = steady_fit[steady_fit["quantity"] == quantity]
-    return dict(
-        zip(zip(rows["condition"], rows["parameter"], strict=True), rows["value"].tolist(), strict=True)
-    )
+    return rows.set_index(["condition", "parameter"])["value"].to_dict()
 
 
 def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> csr_array:
@@ -241,17 +239,12 @@ def aging_curves(aging_fit: pd.DataFrame) -> pd.DataFrame:
     """
     tables = []
     for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
-        keys = zip(own["quantity"], own["parameter"], strict=True)
-        known = dict(zip(keys, own["value"].tolist(), strict=True))
+        known = own.set_index(["quantity", "parameter"])["value"].to_dict()
         for quantity in [quantity for quantity, parameter in known if parameter == "mu_0"]:
-            curve = pd.DataFrame(_curve(known, quantity), columns=AGING_CURVES.names())
-            tables.append(curve.assign(series=series, quantity=quantity))
-    return pd.concat([curve for curve in tables if len(curve)] or [_no_curve()], ignore_index=True)
-
-
-def _no_curve() -> pd.DataFrame:
-    texts = dict.fromkeys(("series", "quantity"), "str")
-    return pd.DataFrame(columns=AGING_CURVES.names(), dtype=float).astype(texts)
+            tables.append(pd.DataFrame(_curve(known, quantity)).assign(series=series, quantity=quantity))
+    none = pd.DataFrame({name: np.zeros(0) for name in AGING_CURVES.names()})
+    none = none.astype(dict.fromkeys(("series", "quantity"), "str"))
+    return pd.concat([curve for curve in tables if len(curve)] or [none], ignore_index=True)[none.columns]
 
 
 def _curve(known: dict[tuple[str, str], float], quantity: str) -> dict[str, np.ndarray]:

@@ -331,16 +331,15 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
     loss, losses are divided by k.
     """
     aged = law.aged
-    tested = (aged.temperature_C, aged.compression_ratio_pct)
     scaled, start = law.tested_days(), law.x[0]
-    value = aged.value if law.acts_on == "rate" else start + (aged.value - start) / law.rate(aged)
+    value = aged.value if law.acts_on == "rate" else start + (aged.value - start) / law.factors(aged)[1]
     points = {"kind": "value", "scaled_days": scaled, "value": value, "aging_days": aged.days}
-    for name, column in zip((TEMPERATURE, COMPRESSION), tested, strict=True):
-        points[name] = np.nan if column is None else np.where(aged.days > 0, column, np.nan)
+    for name, (column, _) in DRIVERS.items():
+        points[column] = np.where(aged.days > 0, aged.known[name], np.nan) if name in aged.known else np.nan
     first = scaled[scaled > 0].min() / 3
     near = first * np.linspace(0, 1, START_POINTS, endpoint=False) ** 2  # laws fall fastest there
     days = np.r_[near, np.geomspace(first, scaled.max() * 1.5, CURVE_POINTS)]
-    middle = [np.full(days.size, aged.middle[name]) if name in aged.middle else None for name, *_ in DRIVERS]
+    middle = [np.full(days.size, aged.middle[name]) if name in aged.middle else None for name in DRIVERS]
     at = Aged(days, np.zeros(days.size), *middle)
     slope = law.slope(at)
     half = law.t * np.sqrt(np.einsum("in,ij,jn->n", slope, law.covariance, slope))

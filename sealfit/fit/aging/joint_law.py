@@ -31,12 +31,12 @@ MOST_LEFT_OUT = 50
 SPARE = 2
 
 
-# Variables that change the rate of aging: coefficient in ln k (kJ/mol, 1/%), attribute, and the function of
-# the attribute that the coefficient multiplies.
-DRIVERS = (
-    ("E", "temperature_C", lambda celsius: 1 / (GAS_CONSTANT * (celsius + aging_laws.ZERO_C))),
-    ("kappa", "compression_ratio_pct", lambda percent: percent),
-)
+# Variables that change the rate of aging: attribute, and the function of it that the coefficient in ln k (in
+# kJ/mol, 1/%) multiplies.
+DRIVERS = {
+    "E": ("temperature_C", lambda celsius: 1 / (GAS_CONSTANT * (celsius + aging_laws.ZERO_C))),
+    "kappa": ("compression_ratio_pct", lambda percent: percent),
+}
 
 
 @dataclass(frozen=True)
@@ -89,26 +89,29 @@ class Aged:
         """Values to which the scatter is relative, shape (n,)."""
         return np.abs(self.value) if self.size is None else self.size
 
+    @cached_property
+    def known(self) -> dict[str, np.ndarray]:
+        """The variables on record, shape (n,) each, by the name of their coefficient."""
+        found = {name: getattr(self, column) for name, (column, _) in DRIVERS.items()}
+        return {name: at for name, at in found.items() if at is not None}
+
     def drivers(self) -> tuple[str, ...]:
         """Return the names of the coefficients in ln k of the variables that were varied."""
-        there = ((name, getattr(self, column)) for name, column, _ in DRIVERS)
-        return tuple(name for name, at in there if at is not None and np.unique(at[self.days > 0]).size > 1)
+        return tuple(name for name, at in self.known.items() if np.unique(at[self.days > 0]).size > 1)
 
     @cached_property
     def middle(self) -> dict[str, float]:
         """Reference temperature and compression, the middle of the tested ones, by the coefficient's name."""
-        there = ((name, getattr(self, column)) for name, column, _ in DRIVERS)
-        aged = ((name, at[self.days > 0]) for name, at in there if at is not None)
-        return {name: float(np.median(np.unique(tested))) for name, tested in aged}
+        return {name: float(np.median(np.unique(at[self.days > 0]))) for name, at in self.known.items()}
 
     def away(self, name: str, middle: float) -> np.ndarray:
         """Return the factor of a coefficient in ln k relative to a temperature or compression, shape (n,)."""
-        column, of = next((column, of) for own, column, of in DRIVERS if own == name)
-        return np.where(self.days > 0, of(middle) - of(getattr(self, column)), 0.0)
+        of = DRIVERS[name][1]
+        return np.where(self.days > 0, of(middle) - of(self.known[name]), 0.0)
 
     def series(self) -> np.ndarray:
         """Return the number of each value's series, shape (n,); -1 for unaged specimens."""
-        keys = [at for at in (self.temperature_C, self.compression_ratio_pct) if at is not None]
+        keys = list(self.known.values())
         number, aged = np.full(self.days.size, -1), self.days > 0
         number[aged] = 0
         if keys:
@@ -227,13 +230,13 @@ class JointLaw:
     def at(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
         """Return the law at other conditions, shape (n,), or (..., n) for x of shape (..., p)."""
         x = self.x if x is None else x
-        k, own = self.rate(aged, x), self.own(x)
-        lost = (
-            self.loss.value(aged.days * k, *own)
-            if self.acts_on == "rate"
-            else k * self.loss.value(aged.days, *own)
-        )
-        return x[..., :1] - x[..., 1:2] * lost
+        in_time, in_loss = self.factors(aged, x)
+        return x[..., :1] - x[..., 1:2] * (in_loss * self.loss.value(aged.days * in_time, *self.own(x)))
+
+    def factors(self, aged: Aged, x: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the factors of temperature and compression on time and on the loss, shape (..., n) each."""
+        k = self.rate(aged, x)
+        return (k, np.ones_like(k)) if self.acts_on == "rate" else (np.ones_like(k), k)
 
     def own(self, x: np.ndarray) -> list[np.ndarray]:
         """Return the parameters of the shape, shape (..., 1) each."""
@@ -256,19 +259,16 @@ class JointLaw:
     def slope(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
         """Return the derivatives with respect to x, shape (p, n), or (..., p, n) for x of shape (..., p)."""
         x = self.x if x is None else x
-        k, own, a = self.rate(aged, x), self.own(x), x[..., 1:2]
-        if self.acts_on == "rate":
-            lost = self.loss.value(aged.days * k, *own)
-            along_k, *along_own = self.loss.slopes(aged.days * k, *own)
-        else:
-            lost = along_k = k * self.loss.value(aged.days, *own)
-            along_own = [k * slope for slope in self.loss.slopes(aged.days, *own)[1:]]
+        (in_time, in_loss), own, a = self.factors(aged, x), self.own(x), x[..., 1:2]
+        lost = in_loss * self.loss.value(aged.days * in_time, *own)
+        along_time, *along_own = (in_loss * slope for slope in self.loss.slopes(aged.days * in_time, *own))
+        along_k = along_time if self.acts_on == "rate" else lost
         along = [*along_own, *(along_k * away for away in self.away(aged).values())]
         return np.stack([np.ones_like(lost), -lost, *(-a * slope for slope in along)], axis=-2)
 
     def tested_days(self) -> np.ndarray:
         """Return the aging times in days, scaled to the master curve if the rate changes, shape (n,)."""
-        return self.aged.days * (self.rate(self.aged) if self.acts_on == "rate" else 1.0)
+        return self.aged.days * self.factors(self.aged)[0]
 
     def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
         """Yield name, value, ends of the 95 % interval (NaN: no bound), and whether the values determine it.

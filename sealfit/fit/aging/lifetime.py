@@ -97,7 +97,7 @@ def lifetime(
         half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
         low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
-    asked = days * (float(law.rate(place)[0]) if law.acts_on == "rate" else 1.0)
+    asked = days * float(law.factors(place)[0][0])
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
     return Lifetime(days, low, high, threshold, beyond, _outside(law, place))
 
@@ -146,7 +146,7 @@ def over_laws(
 def _place(law: JointLaw, temperature_C: float | None, compression_ratio_pct: float | None) -> Aged:
     """Return the condition of use after checks; see `lifetime` for the errors raised."""
     given = (temperature_C, compression_ratio_pct)
-    for (name, column, _), value in zip(DRIVERS, given, strict=True):
+    for (name, (column, _)), value in zip(DRIVERS.items(), given, strict=True):
         what, (least, most), unit = USES[column]
         if name in law.names and value is None:
             raise RequestError(
@@ -175,13 +175,13 @@ def _tested(law: JointLaw, column: str) -> np.ndarray:
 
 def _days(law: JointLaw, x: np.ndarray, goal: Goal, place: Aged) -> float:
     """Return the lifetime in days for parameters x; inf if the goal is not reached."""
-    k, own = float(law.rate(place, x)[0]), [float(value[0]) for value in law.own(x)]
-    a = x[1] * (k if law.acts_on == "loss" else 1.0)
+    in_time, in_loss = (float(factor[0]) for factor in law.factors(place, x))
+    own, a = [float(value[0]) for value in law.own(x)], x[1] * in_loss
     phi = (x[0] - goal.reached(x[0])) / a if a != 0 else np.inf
     if phi <= 0:
         return 0.0 if a > 0 else np.inf
     with np.errstate(over="ignore"):
-        days = float(law.loss.time(phi, *own)) / (k if law.acts_on == "rate" else 1.0)
+        days = float(law.loss.time(phi, *own)) / in_time
     return days if days < FOREVER else np.inf
 
 

@@ -290,8 +290,7 @@ Known = Mapping[tuple[str, str, str], float]
 def _fitted(steady_fit: pd.DataFrame) -> Known:
     """Return the values of table `steady_fit`, of parameters only identified ones."""
     rows = steady_fit[steady_fit["identified"].to_numpy(bool) | (steady_fit["quantity"] != "steady")]
-    keys = zip(rows["condition"], rows["quantity"], rows["parameter"], strict=True)
-    return dict(zip(keys, rows["value"].tolist(), strict=True))
+    return rows.set_index(["condition", "quantity", "parameter"])["value"].to_dict()
 
 
 def _curve(condition: str, fitted: Known, steady: pd.DataFrame) -> Curve:
