@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -269,16 +269,16 @@ def _layout(model: Model, rows: Rows) -> Layout:
 
     A block has the declared numbers of a specimen's conditions, then the parameters of all terms.
     """
-    make = partial(_make_layout, model, rows)
-    return rows.cache.once(("layout", model.size), make, at=model.declared)
+    declared = model.declared
 
+    def make() -> Layout:
+        size = model.theta.size
+        index, block = rows.cache.once(("blocks",), lambda: _blocks(declared, rows), at=declared)
+        added = np.arange(size, model.size)
+        index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
+        return Layout(model.size, index, block)
 
-def _make_layout(model: Model, rows: Rows) -> Layout:
-    size = model.theta.size
-    index, block = rows.cache.once(("blocks",), partial(_blocks, model.declared, rows), at=model.declared)
-    added = np.arange(size, model.size)
-    index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
-    return Layout(model.size, index, block)
+    return rows.cache.once(("layout", model.size), make, at=declared)
 
 
 def _blocks(declared: Declared, rows: Rows) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
-from scipy.sparse import csr_array
 
 from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.rows import LEVELS, Groups, Rows
@@ -112,15 +111,12 @@ class RestrictedLikelihood:
         self.places = [(level, KINDS.index(kind)) for level, kind in kinds]
         self.finest = next(iter(groups.starts))
         self.above = list(dict.fromkeys(level for level, _ in kinds if level != self.finest))
-        self.groups = {}  # level -> (what sums the finer groups in each group, group of each finer group)
+        self.groups = {}  # of the next finer groups, by level
         self.layout = {self.finest: every.layout}
-        finer = groups.starts[self.finest]
+        finer = self.finest
         for level in self.above:
-            own = np.searchsorted(finer, groups.starts[level])
-            summing = csr_array((np.ones(finer.size), np.arange(finer.size), np.r_[own, finer.size]))
-            self.groups[level] = (summing, groups.codes[level][finer])
-            finer = groups.starts[level]
-            self.layout[level] = every.layout.of(finer)
+            self.groups[level], finer = groups.at(finer), level
+            self.layout[level] = every.layout.of(groups.starts[level])
 
     def __call__(self, variances: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the value and its derivative with respect to each variance, shape (kinds,)."""
@@ -164,9 +160,9 @@ class RestrictedLikelihood:
                 if n is None:
                     n, y = m, mt
                 else:
-                    code = self.groups[self.above[k + 1]][1]
+                    code = self._code(self.above[k + 1])
                     n, y = m + left @ n[code] @ left.swapaxes(1, 2), mt + left @ y[code]
-                code = self.groups[self.above[k]][1]
+                code = self._code(self.above[k])
                 square, cross = square - square @ n[code] @ square, cross - square @ y[code]
             level = self.above[k - 1] if k else self.finest
             for kind in (kind for place, kind in self.places if place == level):
@@ -176,8 +172,12 @@ class RestrictedLikelihood:
 
     def _sums(self, values: np.ndarray, level: str) -> np.ndarray:
         """Return the sums over the groups of a level of values of the next finer groups, (groups, ...)."""
-        found = self.groups[level][0] @ values.reshape(len(values), -1)
+        found = self.groups[level].sums(values.reshape(len(values), -1), level)
         return found.reshape(-1, *values.shape[1:])
+
+    def _code(self, level: str) -> np.ndarray:
+        """Return the number of the group of a level of each next finer group."""
+        return self.groups[level].codes[level]
 
 
 def _root_of(gram: np.ndarray) -> np.ndarray:
