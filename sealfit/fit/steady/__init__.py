@@ -85,11 +85,15 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     """
     conditions, scatter, variance = solve_conditions(steady)
     keys = condition_keys(steady, config)
-    blocks = [slice(start, start + BLOCK) for start in range(0, len(conditions), BLOCK)]
-    found = [_table_rows(conditions[block], variance.at(block), scatter, config) for block in blocks]
-    table = pd.concat(found, ignore_index=True).merge(
-        keys, on="condition", how="left", validate="many_to_one"
-    )
+    for start in range(0, len(conditions), BLOCK):
+        block = slice(start, start + BLOCK)
+        bound(conditions[block], variance.at(block).rise())
+    rows = [
+        {"condition": c.name, **row}
+        for k, c in enumerate(conditions)
+        for row in _rows(c, variance.at(k), scatter, config)
+    ]
+    table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
     fixed = STEADY_FIT.names()
     return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
 
@@ -154,19 +158,6 @@ def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
 
 # ---------------------------------------------------------------- table
-def _table_rows(
-    conditions: list[Condition], variance: UnitVariance, scatter: Scatter, config: Config
-) -> pd.DataFrame:
-    """Return the rows of table `steady_fit` for some conditions; this computes their intervals."""
-    bound(conditions, variance.rise())
-    rows = [
-        {"condition": c.name, **row}
-        for k, c in enumerate(conditions)
-        for row in _rows(c, variance.at(k), scatter, config)
-    ]
-    return pd.DataFrame(rows)
-
-
 def _rows(condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config) -> Iterator[dict]:
     unit_of = parameter_units(config.units, condition.has_load)
     fitted = condition.jacobian(), condition.arrays[-1], condition.values, condition.names
@@ -235,7 +226,6 @@ def _statistics(
     if condition.left_out:
         lack += f" {condition.left_out} runs without load were left out of the fit."
     own = no_repeats or ("own" if variance.own else "pooled")
-    speeds = max(len(values) for values in condition.levels.values())
     residual = condition.arrays[2] - condition.model_force()
     for name, value, unit, reason in (
         ("chi2", condition.chi2 if repeated else None, "", no_repeats),
@@ -249,7 +239,7 @@ def _statistics(
         ("rmse_N", np.sqrt(np.mean(residual**2)), force_unit, ""),
         ("n_runs", len(condition.runs), "", ""),
         ("n_files", condition.runs["files"].sum(), "", ""),
-        ("n_speeds", speeds, "", "levels within one direction"),
+        ("n_speeds", condition.speeds, "", "levels within one direction"),
     ):
         yield table_row(quantity="statistics", parameter=name, value=value, unit=unit, reason=reason)
 

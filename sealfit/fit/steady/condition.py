@@ -109,9 +109,14 @@ class Condition:
         return float(half) if abs(half) > 4 * error else 0.0
 
     @property
+    def speeds(self) -> int:
+        """Number of speed levels within one direction."""
+        return max(len(values) for values in self.levels.values())
+
+    @property
     def few_speeds(self) -> bool:
         """Whether the speeds are too few for a Stribeck curve."""
-        return max(len(values) for values in self.levels.values()) < FULL
+        return self.speeds < FULL
 
     def run_levels(self) -> np.ndarray:
         """Direction and speed level of every run, shape (n, 2)."""
@@ -262,14 +267,14 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
 
 def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
     """Return the same from the form of the model alone."""
-    most = max(len(values) for values in condition.levels.values())
     verdict = dict.fromkeys(NAMES, (True, ""))
     if condition.model == CONSTANT:
         lone = "one speed only in each direction: these runs determine the sliding coefficient at that speed."
         verdict |= {name: (False, lone) for name in ("mu_s", "v_s", "sigma_2")}
         verdict["mu_c"] = (True, "the sliding coefficient at the one speed tested, sigma_2 v included.")
     elif condition.model == VISCOUS and condition.few_speeds:
-        few = f"{most} speeds in one direction: the Stribeck curve needs four, two of them below about 2 v_s."
+        few = f"{condition.speeds} speeds in one direction: "
+        few += "the Stribeck curve needs four, two of them below about 2 v_s."
         verdict |= {name: (False, few) for name in ("mu_s", "v_s")}
         verdict["mu_c"] = (
             True,
