@@ -7,7 +7,7 @@ parameter.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -85,3 +85,10 @@ def whole_steady_fit(read: Callable[[str], pd.DataFrame], suffix: str = "") -> p
         ),
     )
     return pd.concat([fit, *(part for part in parts if len(part))], ignore_index=True)
+
+
+def covariance_matrix(covariances: Mapping[str, float], names: Sequence[str]) -> np.ndarray:
+    """Return the covariance of parameters, shape (p, p), from values by "mu_s,mu_c"; 0 if unknown."""
+    upper = np.array([[covariances.get(f"{one},{other}", 0.0) for other in names] for one in names])
+    upper = np.where(np.isfinite(upper), upper, 0.0)
+    return upper + np.triu(upper, 1).T

@@ -127,13 +127,13 @@ def test_the_effects_uncertainty_is_common_to_all_conditions(warmed):
     _, after, tables = warmed
     free, conditions = tables["steady_after"], tables["steady_fit_after"]
     known = free.drop(columns=shifts_of(free))
-    alone = shared_levels(known, fit_conditions(known, Config()))
-    levels = shared_levels(free, conditions)
-    added = (levels.covariance - alone.covariance).toarray()
+    _, alone = shared_levels(known, fit_conditions(known, Config()))
+    levels, covariance = shared_levels(free, conditions)
+    added = (covariance - alone).toarray()
     place = after.model.term_slice(0)
     share = 0.035 / 0.05  # of the warming, in the mean of a stroke at mu_s: some 3.5 of 5 percent
-    error = share * np.sqrt(after.covariance[place, place][0, 0]) * levels.table["value"].to_numpy()
-    unlike = levels.table["condition"].to_numpy()[:, None] != levels.table["condition"].to_numpy()[None, :]
+    error = share * np.sqrt(after.covariance[place, place][0, 0]) * levels["value"].to_numpy()
+    unlike = levels["condition"].to_numpy()[:, None] != levels["condition"].to_numpy()[None, :]
     assert (added[unlike] > 0).all()
     npt.assert_allclose(np.sqrt(np.diag(added)) / error, 1.0, atol=0.6)
 

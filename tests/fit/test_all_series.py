@@ -54,7 +54,7 @@ def test_intervals_do_not_depend_on_which_conditions_are_done_together(campaign,
 
 
 def test_exact_forces_give_the_coefficients_back(campaign):
-    found = levels(campaign(noise=1e-9, setup=1e-9)).table
+    found, _ = levels(campaign(noise=1e-9, setup=1e-9))
     assert len(found) == 12
     for row in found.itertuples():
         law = {"mu_s": MU_S, "mu_c": MU_C}[row.quantity]
@@ -63,7 +63,7 @@ def test_exact_forces_give_the_coefficients_back(campaign):
 
 def test_values_and_covariance_are_those_of_one_fit_to_all_forces(campaign):
     table = campaign(noise=0.01, days=(0, 2, 8), repeats=40, ways=(1,))
-    found, runs = levels(table), run_table(table)
+    (found, measured), runs = levels(table), run_table(table)
     k = np.searchsorted((0, 2, 8), runs["aging_days"])
     speed, force = runs["speed"].to_numpy(), runs["force"].to_numpy()
 
@@ -73,23 +73,21 @@ def test_values_and_covariance_are_those_of_one_fit_to_all_forces(campaign):
 
     direct = least_squares(residual, [0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 5.0, 0.02], x_scale="jac", xtol=1e-14)
     covariance = np.linalg.inv(direct.jac.T @ direct.jac)
-    order = [
-        (0, 2, 8).index(row.aging_days) + 3 * (row.quantity == "mu_c") for row in found.table.itertuples()
-    ]
-    se, own = np.sqrt(np.diag(covariance))[order], np.sqrt(found.covariance.diagonal())
-    assert np.abs(found.table["value"].to_numpy() - direct.x[order]).max() < 0.15 * se.min()
+    order = [(0, 2, 8).index(row.aging_days) + 3 * (row.quantity == "mu_c") for row in found.itertuples()]
+    se, own = np.sqrt(np.diag(covariance))[order], np.sqrt(measured.diagonal())
+    assert np.abs(found["value"].to_numpy() - direct.x[order]).max() < 0.15 * se.min()
     assert own == pytest.approx(se, rel=0.15)
     correlation = covariance[np.ix_(order, order)] / np.outer(se, se)
-    assert np.abs(found.covariance.toarray() / np.outer(own, own) - correlation).max() < 0.1
+    assert np.abs(measured.toarray() / np.outer(own, own) - correlation).max() < 0.1
 
 
 def test_what_the_days_share_makes_the_values_surer_than_free_fits(campaign):
     table = campaign(noise=0.01)
     fits = fit_conditions(table, Config())
-    found = shared_levels(table, fits)
+    found, covariance = shared_levels(table, fits)
     free = fits[fits["quantity"] == "steady"].set_index(["condition", "parameter"])["se"]
-    own = np.array([free[row.condition, row.quantity] for row in found.table.itertuples()])
-    assert np.median(np.sqrt(found.covariance.diagonal()) / own) < 0.8
+    own = np.array([free[row.condition, row.quantity] for row in found.itertuples()])
+    assert np.median(np.sqrt(covariance.diagonal()) / own) < 0.8
 
 
 def test_a_day_with_two_speeds_is_known_through_the_others(campaign):
@@ -98,7 +96,7 @@ def test_a_day_with_two_speeds_is_known_through_the_others(campaign):
     fits = fit_conditions(table[~few], Config())
     alone = fits[(fits["aging_days"] == 8) & (fits["parameter"] == "mu_s")]
     assert not alone["identified"].any()
-    found = shared_levels(table[~few], fits).table
+    found, _ = shared_levels(table[~few], fits)
     value = found[(found["aging_days"] == 8) & (found["quantity"] == "mu_s")]["value"]
     assert float(value.iloc[0]) == pytest.approx(0.93513 - 0.04448 * np.log1p(8 / 0.0804), rel=0.01)
 
@@ -111,9 +109,9 @@ def test_days_that_do_not_agree_on_the_stribeck_speed_keep_their_free_fits(campa
         1 + 0.003 * np.random.default_rng(3).standard_normal(int(late.sum()))
     )
     fits = fit_conditions(table, Config())
-    found = shared_levels(table, fits)
+    found, _ = shared_levels(table, fits)
     free = fits[fits["quantity"] == "steady"].set_index(["condition", "parameter"])["value"]
-    for row in found.table.itertuples():
+    for row in found.itertuples():
         assert row.value == free[row.condition, row.quantity]
 
 
@@ -179,8 +177,8 @@ def test_a_day_with_fast_speeds_only_has_no_static_coefficient(campaign, speeds)
     table = campaign(noise=0.004, series=((60.0, 80.0), (80.0, 80.0)), specimen=0.01)
     late = (table["temperature_C"] == 80.0) & (table["aging_days"] == 16)
     table = table[~late | table["speed_set_mm_s"].isin(speeds)]
-    found = levels(table)
-    own = found.table[(found.table["temperature_C"] == 80.0) & (found.table["aging_days"] == 16)]
+    found, _ = levels(table)
+    own = found[(found["temperature_C"] == 80.0) & (found["aging_days"] == 16)]
     assert set(own["quantity"]) == {"mu_c"}
     laws, _ = joint_laws(table, fit_conditions(table, Config()), Config())
     assert laws["scatter_rel"].max() < 0.05
@@ -193,8 +191,8 @@ def test_a_day_that_scatters_more_weighs_less(campaign):
     gain = dict.fromkeys(table.loc[late, "run_id"].unique())
     gain = {run: 1 + 0.04 * rng.standard_normal() for run in gain}
     table.loc[late, "force_N"] *= table.loc[late, "run_id"].map(gain)
-    found = levels(table)
-    se = dict(zip(found.table["aging_days"], np.sqrt(found.covariance.diagonal()), strict=False))
+    found, covariance = levels(table)
+    se = dict(zip(found["aging_days"], np.sqrt(covariance.diagonal()), strict=False))
     assert se[16.0] > 1.5 * se[8.0]  # was 1.0
 
 

@@ -11,6 +11,7 @@ import pandas as pd
 from scipy.sparse import csr_array, diags_array
 
 from sealfit.config import Config
+from sealfit.fit import covariance_matrix
 from sealfit.fit.aging import law_table
 from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
 from sealfit.fit.aging.law_table import Curve, Estimate, OneQuantity
@@ -252,12 +253,8 @@ def _curve(known: dict[tuple[str, str], float], quantity: str) -> dict[str, np.n
     mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
     if np.isnan([mu_0, a, b]).any():
         return {}
-    names = [f"{quantity}:{name}" for name in ("mu_0", "a", "ln b")]
-    covariance = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(i + 1):
-            value = known["covariance", f"{names[j]},{names[i]}"]
-            covariance[i, j] = covariance[j, i] = value if np.isfinite(value) else 0.0
+    covariances = {parameter: value for (kind, parameter), value in known.items() if kind == "covariance"}
+    covariance = covariance_matrix(covariances, [f"{quantity}:{name}" for name in ("mu_0", "a", "ln b")])
     t = law_table.t_of_95(known["statistics", f"{quantity}:error_df"])
     days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
     ratio = days / b

@@ -15,7 +15,6 @@ speeds that disagree with the others.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -60,17 +59,11 @@ START_POINTS = 20
 # mu_s and mu_c of all conditions from the forces.
 
 
-@dataclass(frozen=True)
-class Levels:
-    """Values of mu_s and mu_c (F_s and F_c) and the covariance of their measurement."""
+def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> tuple[pd.DataFrame, csr_array]:
+    """Return mu_s and mu_c at every aged condition and the unaged rubber, and their covariance.
 
-    table: pd.DataFrame  # `condition`, `quantity`, `value`, and the condition's columns of `steady_fit`
-    covariance: csr_array  # (n, n) of the values; before the loop it is 0 between series
-
-
-def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
-    """Return mu_s and mu_c, with their covariance, at every aged condition and the unaged rubber.
-
+    The table has `condition`, `quantity` (mu_s, mu_c, F_s or F_c), `value`, and the condition's columns of
+    `steady_fit`. The covariance of measurement, shape (n, n), is 0 between series before the loop.
     `steady_fit` has the separate fits, of which only identified values are used, with `aging_days`. FitError
     if there is no row to fit.
     """
@@ -84,26 +77,21 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
     conditions, _, variance = solve_conditions(steady, steady_fit)
     place = {c.name: k for k, c in enumerate(conditions)}
     series = series_of_curve(about.reset_index(drop=True), aging=True)
-    known_covariances, known_shifts = (
-        values_of(steady_fit, "covariance"),
-        values_of(steady_fit, "effect_shift"),
-    )
-    count = len(shifts_of(steady))
+    known_shifts, count = values_of(steady_fit, "effect_shift"), len(shifts_of(steady))
     tables, covariances, shifts, covered = [], [], [], set()
     for places in about.groupby(series, sort=False).indices.values():
         of = [place[name] for name in about["condition"].to_numpy(object)[places]]
-        found = _shared([conditions[k] for k in of], variance, variance.value[of], curved)
-        if found is not None:
-            tables.append(found[0])
-            covariances.append(found[1])
-            shifts.append(found[2])
-            covered |= found[3]
+        curve = _shared([conditions[k] for k in of], variance, variance.value[of], curved)
+        if curve is not None:
+            for kept, one in zip((tables, covariances, shifts), curve.determined(), strict=True):
+                kept.append(one)
+            covered |= {c.name for c in curve.own}
     alone = free[free["condition"].isin(set(about["condition"]) - covered)]
     keys = zip(alone["condition"], alone["quantity"], strict=True)
     shift = [[known_shifts.get((c, f"{q}:{k + 1}"), 0.0) for k in range(count)] for c, q in keys]
     shift = np.reshape(shift, (len(alone), count))
     # Effects are common to all conditions: their part in the separate fits' covariances is subtracted here.
-    within = steady_covariance(alone, known_covariances)
+    within = steady_covariance(alone, values_of(steady_fit, "covariance"))
     row, column = within.nonzero()
     common = csr_array(((shift[row] * shift[column]).sum(axis=1), (row, column)), shape=within.shape)
     table = pd.concat([*tables, alone], ignore_index=True)
@@ -113,16 +101,15 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> Levels:
         covariance = csr_array(covariance + together @ together.T)
     order = np.argsort(pd.Index(about["condition"]).get_indexer(table["condition"]), kind="stable")
     table = table.iloc[order].merge(about, on="condition", how="left", validate="many_to_one")
-    return Levels(table, covariance[order][:, order])
+    return table, covariance[order][:, order]
 
 
 def _shared(
     own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
-) -> tuple[pd.DataFrame, np.ndarray, np.ndarray, set[str]] | None:
-    """Return the values of a series on a shared curve, or None if its days do not share one.
+) -> _Curve | None:
+    """Return the shared curve of the days of a series, or None if they do not share one.
 
-    Returns the values, their covariance, their change along the directions of the effects' uncertainty, shape
-    (values, k), and the conditions on the curve. `widened`, shape (conditions,), is the factor on variances.
+    `widened`, shape (conditions,), is the factor on variances.
     """
     is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]
@@ -140,16 +127,7 @@ def _shared(
         every = _Curve(own, widened)
         if not _worse(every.rss - curve.rss, every.df - curve.df, df):
             curve = every
-    covariance, _ = covariance_of(curve.tangent())
-    names = list(curve.names())
-    value, variances = curve.levels.ravel(), np.diag(covariance)[: len(names)]
-    keep = np.isfinite(variances) & (variances > 0) & (value > 0) & (variances < (DETERMINED * value) ** 2)
-    table = pd.DataFrame(names, columns=["condition", "quantity"]).assign(value=value)
-    places = np.flatnonzero(keep)
-    sure = np.where(np.isfinite(covariance), covariance, 0.0)
-    shift = sure[places] @ curve.tangent().T @ curve.shifts()
-    known = {c.name for c in curve.own}
-    return table[keep].reset_index(drop=True), covariance[np.ix_(places, places)], shift, known
+    return curve
 
 
 def _worse(rise: float, more: int, df: float) -> bool:
@@ -189,11 +167,21 @@ class _Curve:
         residual = force - (levels[self.code].T * columns).sum(axis=0) - sigma_2 * speed
         return float(residual @ residual), levels, sigma_2, rank
 
-    def names(self) -> Iterator[tuple[str, str]]:
-        """Yield condition and quantity of every level, in the order of the tangent's columns."""
-        for condition in self.own:
-            for name in ("mu_s", "mu_c"):
-                yield condition.name, name if condition.has_load else FORCES[name]
+    def determined(self) -> tuple[pd.DataFrame, np.ndarray, np.ndarray]:
+        """Return mu_s and mu_c where they are determined, their covariance, and their shift, (values, k).
+
+        The shift is their change along the directions of the effects' uncertainty.
+        """
+        names = [(c.name, q if c.has_load else FORCES[q]) for c in self.own for q in ("mu_s", "mu_c")]
+        tangent, value = self.tangent(), self.levels.ravel()
+        covariance, _ = covariance_of(tangent)
+        variance = np.diag(covariance)[: value.size]
+        keep = np.isfinite(variance) & (variance > 0) & (value > 0) & (variance < (DETERMINED * value) ** 2)
+        table = pd.DataFrame(names, columns=["condition", "quantity"]).assign(value=value)
+        places = np.flatnonzero(keep)
+        moved = np.concatenate([c.shifts for c in self.own]) * self.root[:, None]  # weighted forces
+        shift = np.where(np.isfinite(covariance), covariance, 0.0)[places] @ tangent.T @ moved
+        return table[keep].reset_index(drop=True), covariance[np.ix_(places, places)], shift
 
     def tangent(self) -> np.ndarray:
         """Return weighted derivatives with respect to the levels, ln v_s and sigma_2 if not 0, (runs, p)."""
@@ -205,10 +193,6 @@ class _Curve:
         bend = rise * self.load * np.exp(-square) * 2 * square * self.root
         shared = [bend] + ([self.speed * self.root] if self.sigma_2 > 0 else [])
         return np.column_stack([own.reshape(runs, -1), *shared])
-
-    def shifts(self) -> np.ndarray:
-        """Return weighted changes of forces along the directions of the effects' uncertainty, (runs, k)."""
-        return np.concatenate([c.shifts for c in self.own]) * self.root[:, None]
 
 
 # ---------------------------------------------------------------- laws
@@ -224,13 +208,13 @@ def aged_values(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> AgedValues:
 
     The arguments are those of `shared_levels`.
     """
-    levels = shared_levels(steady, steady_fit)
-    rubber, quantity = levels.table["rubber"], levels.table["quantity"]
+    levels, covariance = shared_levels(steady, steady_fit)
+    rubber, quantity = levels["rubber"], levels["quantity"]
     order, found = [*FORCES, *FORCES.values()], {}
     for name in sorted(set(rubber)):
         for one in sorted(set(quantity[rubber == name]), key=order.index):
             here = ((rubber == name) & (quantity == one)).to_numpy()
-            found[name, one] = aged_of(levels.table[here], levels.covariance[here][:, here])
+            found[name, one] = aged_of(levels[here], covariance[here][:, here])
     return found
 
 
@@ -311,7 +295,9 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
 
     None if the series have too few values for separate laws.
     """
-    aged, series, days = law.aged, law.aged.series(), law.aged.days_of_series()
+    aged, series = law.aged, law.aged.series()
+    pairs = np.unique(np.column_stack([series, aged.days])[series >= 0], axis=0)
+    days = np.bincount(pairs[:, 0].astype(int))  # number of days of each series
     if len(days) < 2 or min(days) < 3:
         return None
     origin = np.zeros(aged.value.size, int)

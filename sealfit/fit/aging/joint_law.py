@@ -118,12 +118,6 @@ class Aged:
             number[aged] = np.unique(np.column_stack(keys)[aged], axis=0, return_inverse=True)[1].ravel()
         return number
 
-    def days_of_series(self) -> np.ndarray:
-        """Return the number of days of each series, shape (series,)."""
-        series = self.series()
-        pairs = np.unique(np.column_stack([series, self.days])[series >= 0], axis=0)
-        return np.bincount(pairs[:, 0].astype(int))
-
     def whole_series(self) -> list[np.ndarray]:
         """Return the mask of each series, shape (n,) each; of `MOST_LEFT_OUT`, evenly spread, if more."""
         series = self.series()

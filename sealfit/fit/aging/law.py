@@ -177,10 +177,6 @@ class Groups:
         row, column = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
         self.whitening = values.whitening[row.ravel(), column.ravel()].reshape(row.shape)
 
-    def white(self, columns: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return whitened columns, shape (r, c, n), of the groups `of`, shape (r,)."""
-        return columns @ np.swapaxes(self.whitening[of], 1, 2)
-
     def evaluate(self, x: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whitened residuals, shape (r, n), and derivatives, (r, p, n), of groups at x, (r, p)."""
         a, u = x[:, self.m : self.m + self.width, None], x[:, self.m + self.width :, None]
@@ -188,7 +184,8 @@ class Groups:
         loss = np.log1p(ratio)
         model = (x[:, : self.m, None] * self.of_origin[of]).sum(axis=1) - (a * loss).sum(axis=1)
         slope = np.concatenate([self.of_origin[of], -loss, a * ratio / (1 + ratio)], axis=1)
-        white = self.white(np.concatenate([slope, (model - self.value[of])[:, None]], axis=1), of)
+        columns = np.concatenate([slope, (model - self.value[of])[:, None]], axis=1)
+        white = columns @ np.swapaxes(self.whitening[of], 1, 2)
         return white[:, -1], white[:, :-1]
 
     def free(self, x: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
+from sealfit.fit import covariance_matrix
 from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke
 from sealfit.fit.dynamic.presliding import Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
 from sealfit.fit.dynamic.starts import Along, Start, starts_of, strokes_along, whole_strokes
@@ -283,37 +284,32 @@ def _numbered(numbers: np.ndarray) -> np.ndarray:
     return numbers if (numbers != numbers[:1]).any() else np.arange(len(numbers))
 
 
-# Values of table `steady_fit` by condition, quantity and parameter.
-Known = Mapping[tuple[str, str, str], float]
+# Values of table `steady_fit` by parameter, of each condition and quantity.
+Known = Mapping[tuple[str, str], Mapping[str, float]]
 
 
 def _fitted(steady_fit: pd.DataFrame) -> Known:
     """Return the values of table `steady_fit`, of parameters only identified ones."""
     rows = steady_fit[steady_fit["identified"].to_numpy(bool) | (steady_fit["quantity"] != "steady")]
-    return rows.set_index(["condition", "quantity", "parameter"])["value"].to_dict()
+    groups = rows.groupby(["condition", "quantity"], sort=False)
+    return {key: dict(zip(own["parameter"], own["value"].tolist(), strict=True)) for key, own in groups}
 
 
 def _curve(condition: str, fitted: Known, steady: pd.DataFrame) -> Curve:
     """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified."""
+    values, covariances, statistics = (
+        fitted.get((condition, quantity), {}) for quantity in ("steady", "covariance", "statistics")
+    )
     load = steady["load_N"].mean(skipna=False)
-    sigma_2 = max(float(fitted.get((condition, "steady", "sigma_2"), 0.0)), 0.0)
+    sigma_2 = max(float(values.get("sigma_2", 0.0)), 0.0)
     for static, coulomb, factor in (("mu_s", "mu_c", load), ("F_s", "F_c", 1.0)):
-        known = [fitted.get((condition, "steady", name)) for name in (static, coulomb, "v_s")]
+        known = [values.get(name) for name in (static, coulomb, "v_s")]
         if None not in known:
             unit = np.array([factor, factor, 1.0, 1.0])
-            covariance = _covariance(condition, fitted, (static, coulomb, "v_s", "sigma_2"))
-            df = int(fitted.get((condition, "statistics", "df"), 1))
+            covariance = covariance_matrix(covariances, (static, coulomb, "v_s", "sigma_2"))
             parameters = unit * [*known, sigma_2]
-            return Curve(*parameters.tolist(), covariance * np.outer(unit, unit), df)
+            return Curve(
+                *parameters.tolist(), covariance * np.outer(unit, unit), int(statistics.get("df", 1))
+            )
     flat = float(np.median(steady["size_N"] - sigma_2 * steady["speed_mm_s"].abs()))
     return Curve(flat, flat, np.inf, sigma_2)
-
-
-def _covariance(condition: str, fitted: Known, names: Sequence[str]) -> np.ndarray:
-    """Return the covariance of a steady fit's parameters, shape (p, p), 0 if unknown."""
-    covariance = np.zeros((len(names), len(names)))
-    for i, j in np.ndindex(covariance.shape):
-        value = fitted.get((condition, "covariance", f"{names[i]},{names[j]}"), np.nan)
-        if np.isfinite(value):
-            covariance[i, j] = covariance[j, i] = value
-    return covariance
