@@ -188,6 +188,10 @@ class Groups:
         white = columns @ np.swapaxes(self.whitening[of], 1, 2)
         return white[:, -1], white[:, :-1]
 
+    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return `evaluate` of all groups; `x`, shape (all,), are all parameters."""
+        return self.evaluate(x[self.places], np.arange(len(self.rows)))
+
     def free(self, x: np.ndarray) -> np.ndarray:
         """Return which parameters of the groups, shape (g, p), are not at a limit of ln b."""
         return (x[self.places] > self.bounds[0]) & (x[self.places] < self.bounds[1])
@@ -197,7 +201,7 @@ class Groups:
 
         `x`, shape (all,), are all parameters; `column`, shape (g, n), is any whitened column.
         """
-        _, slope = self.evaluate(x[self.places], np.arange(len(self.rows)))
+        _, slope = self.at(x)
         columns = np.concatenate([slope[:, : self.m], column[:, None]], axis=1)
         if not self.width:
             return columns
@@ -229,7 +233,7 @@ class LawFit:
     @cached_property
     def residuals(self) -> list[np.ndarray]:
         """Whitened residuals of `values.groups`, shape (g, n) each."""
-        return [own.evaluate(self.x[own.places], np.arange(len(own.rows)))[0] for own in self.values.groups]
+        return [own.at(self.x)[0] for own in self.values.groups]
 
 
 def law_model(values: Values, x: np.ndarray) -> np.ndarray:
@@ -274,7 +278,7 @@ def _polished(values: Values, start: np.ndarray) -> LawFit:
             low, high = own.bounds.copy()
             low[:, :m] = high[:, :m] = mu_0
             x[own.places], _ = levenberg_marquardt(own.evaluate, x[own.places], low, high)
-            rest, _ = own.evaluate(x[own.places], np.arange(len(own.rows)))
+            rest, _ = own.at(x)
             residual.append(rest.ravel())
             slope.append(np.swapaxes(own.eliminated(x, rest)[:, :m], 0, 1).reshape(m, -1))
         return np.concatenate(residual)[None], np.hstack(slope)[None]

@@ -77,7 +77,7 @@ def curve_errors(fit: LawFit, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
     pulls = elsewhere(fit, [white[own.rows] for own in values.groups])
     for own, (root, _), pull in zip(values.groups, likelihoods(fit), pulls, strict=True):
         every = np.arange(len(own.rows))[:, None]
-        _, slope = own.evaluate(fit.x[own.places], every[:, 0])
+        _, slope = own.at(fit.x)
         tangent = np.concatenate([slope, _of_mu_0(root, slope.shape[1])], axis=2)
         found, _ = covariance_of(np.swapaxes(tangent, 1, 2), own.free(fit.x))
         gradient = (slope @ white[own.rows][..., None])[..., 0]
