@@ -93,65 +93,35 @@ class Loss:
     form: str  # equation in plain text
     parameters: tuple[str, ...]
     units: tuple[str, ...]
-    value: Callable  # (days, *parameters) -> phi, broadcast
+    value: Callable  # (days, *parameters) -> phi, broadcast; days are a number or an array
     time: Callable  # (phi, *parameters) -> days until the loss is phi; inf if it is not reached
     slopes: Callable  # (days, *parameters) -> derivatives by ln t and the logarithm of each parameter
 
 
-def _log(days, b):
-    return np.log1p(np.asarray(days, float) / b)
-
-
-def _log_time(phi, b):
-    return b * np.expm1(phi)
-
-
 def _log_slopes(days, b):
-    share = np.asarray(days, float) / (b + days)
+    share = days / (b + days)
     return share, -share
 
 
-def _stretched(days, tau, beta):
-    return -np.expm1(-((np.asarray(days, float) / tau) ** beta))
-
-
 def _stretched_time(phi, tau, beta):
-    phi = np.asarray(phi, float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(phi < 1, tau * (-np.log1p(-np.minimum(phi, 1.0))) ** (1 / beta), np.inf)
 
 
 def _stretched_slopes(days, tau, beta):
-    ratio = np.asarray(days, float) / tau
+    ratio = days / tau
     power = ratio**beta
     slope = beta * power * np.exp(-power)
     return slope, -slope, slope * np.log(np.where(ratio > 0, ratio, 1.0))
 
 
-def _power(days, n):
-    return np.asarray(days, float) ** n
-
-
-def _power_time(phi, n):
-    return np.asarray(phi, float) ** (1 / n)
-
-
 def _power_slopes(days, n):
-    days = np.asarray(days, float)
     slope = n * days**n
     return slope, slope * np.log(np.where(days > 0, days, 1.0))
 
 
-def _induction(days, b, t_i):
-    return np.log1p(np.maximum(np.asarray(days, float) - t_i, 0.0) / b)
-
-
-def _induction_time(phi, b, t_i):
-    return t_i + b * np.expm1(phi)
-
-
 def _induction_slopes(days, b, t_i):
-    late = np.maximum(np.asarray(days, float) - t_i, 0.0)
+    late = np.maximum(days - t_i, 0.0)
     per_day = (late > 0) / (b + late)
     return days * per_day, -late * per_day, -t_i * per_day
 
@@ -160,15 +130,29 @@ def _induction_slopes(days, b, t_i):
 LOSSES = {
     loss.name: loss
     for loss in (
-        Loss("log", "mu_0 - a ln(1 + t/b)", ("b",), ("d",), _log, _log_time, _log_slopes),
+        Loss(
+            "log", "mu_0 - a ln(1 + t/b)", ("b",), ("d",),
+            value=lambda days, b: np.log1p(days / b),
+            time=lambda phi, b: b * np.expm1(phi),
+            slopes=_log_slopes,
+        ),
         Loss(
             "stretched", "mu_0 - a (1 - exp(-(t/tau)^beta))", ("tau", "beta"), ("d", ""),
-            _stretched, _stretched_time, _stretched_slopes,
+            value=lambda days, tau, beta: -np.expm1(-((days / tau) ** beta)),
+            time=_stretched_time,
+            slopes=_stretched_slopes,
         ),
-        Loss("power", "mu_0 - a t^n", ("n",), ("",), _power, _power_time, _power_slopes),
+        Loss(
+            "power", "mu_0 - a t^n", ("n",), ("",),
+            value=lambda days, n: days**n,
+            time=lambda phi, n: phi ** (1 / n),
+            slopes=_power_slopes,
+        ),
         Loss(
             "induction", "mu_0 - a ln(1 + max(t - t_i, 0)/b)", ("b", "t_i"), ("d", "d"),
-            _induction, _induction_time, _induction_slopes,
+            value=lambda days, b, t_i: np.log1p(np.maximum(days - t_i, 0.0) / b),
+            time=lambda phi, b, t_i: t_i + b * np.expm1(phi),
+            slopes=_induction_slopes,
         ),
     )
 }  # fmt: skip
