@@ -172,7 +172,12 @@ def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
     )
     fine = u_low[:, None] + (u_high - u_low)[:, None] * np.linspace(0, 1, FINE)
     fine = np.concatenate([fine, u_best[:, None]], axis=1)
-    low, high = conditional_ends(problems, fine, limit)
+    root = np.sqrt(weight)[:, None, :]
+    columns = problems.basis(fine, np.arange(len(fine)))
+    y = np.broadcast_to(force[:, None, :] * root, columns.shape[:-1])
+    low, high = constrained_ends(columns * root[..., None], y, limit, PHYSICAL)
+    with np.errstate(invalid="ignore"):  # NaN where the limit is exceeded
+        low, high = np.fmin.reduce(low, axis=1), np.fmax.reduce(high, axis=1)
     estimate = fit.values[:, [0, 1, 3]]
     low, high = np.fmin(low, estimate), np.fmax(high, estimate)
     v_low, v_high = np.where(open_low, 0.0, np.exp(u_low)), np.where(open_high, np.inf, np.exp(u_high))
@@ -192,16 +197,6 @@ def _crossing(problems: Separable, grid, u_best, inside, limit, sign):
         ok = value[:, 0] <= limit
         near, far = np.where(ok, middle, near), np.where(ok, far, middle)
     return sign * near, open_
-
-
-def conditional_ends(problems: Separable, u, limit):
-    """Return the union over u of the constrained intervals of the coefficients, shape (problems, p) each."""
-    root = np.sqrt(problems.weight)[:, None, :]
-    columns = problems.basis(u, np.arange(len(u)))
-    y = np.broadcast_to(problems.y[:, None, :] * root, columns.shape[:-1])
-    low, high = constrained_ends(columns * root[..., None], y, limit, problems.nonnegative)
-    with np.errstate(all="ignore"):
-        return np.fmin.reduce(low, axis=1), np.fmax.reduce(high, axis=1)
 
 
 # ---------------------------------------------------------------- one condition
