@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -36,47 +35,31 @@ def read_points(path: Path) -> pd.DataFrame:
         raise RequestError("is not UTF-8.", file=path, fix="Save it as CSV UTF-8.") from error
     except OSError as error:
         raise RequestError(f"cannot be read ({error.strerror}).", file=path, fix="Fix its rights.") from error
-    lines = csv.reader(io.StringIO(raw, newline=""))
-    filled = _filled(lines, path)
-    names = _names_of_points([name.strip() for name in next(filled, [])], path)
-    rows = []
-    for row in filled:
-        if len(row) != len(names):
-            raise RequestError(
-                f"has {len(row)} cells, and there are {len(names)} columns.",
-                file=path,
-                line=lines.line_num,
-                fix="Fix the row; a comma inside a cell needs quotes, a decimal comma a point.",
-            )
-        rows.append(row)
-    text = pd.DataFrame(rows, columns=names, dtype=object)
-    if text.empty:
-        raise RequestError("has no rows.", file=path, fix="Give one row per point.")
-    return text
-
-
-def _filled(lines, path: Path) -> Iterator[list[str]]:
-    """Yield the rows that are not blank; raises RequestError for a cell that holds the end of its line."""
-    begins = 1
+    lines, rows, begins = csv.reader(io.StringIO(raw, newline="")), [], 1
     for row in lines:
         if any("\n" in cell or "\r" in cell for cell in row):
             fix = "Close or delete it."
             raise RequestError("a quotation mark is left open.", file=path, line=begins, fix=fix)
         begins = lines.line_num + 1
         if any(cell.strip() for cell in row):
-            yield row
-
-
-def _names_of_points(names: list[str], path: Path) -> list[str]:
-    """Return the names of the columns of points, checked."""
-    if not any(names):
-        raise RequestError("is empty.", file=path, fix="Give a line of column names, then one row per point.")
-    if len(names) == 1 and any(mark in names[0] for mark in ";\t| "):
-        raise RequestError(
-            "is not separated by commas.", file=path, line=1, fix="Save it with commas and points."
-        )
+            rows.append(row)
+            _refuse_width(row, rows[0], file=path, line=lines.line_num)
+    if len(rows) < 2:
+        what = "has no rows." if rows else "is empty."
+        raise RequestError(what, file=path, fix="Give a line of column names, then one row per point.")
+    names = [name.strip() for name in rows[0]]
     _refuse_names(names, file=path, line=1)
-    return names
+    return pd.DataFrame(rows[1:], columns=names, dtype=object)
+
+
+def _refuse_width(row: list[str], names: list[str], **place: object) -> None:
+    """Raise RequestError for a row that has not one cell per name, or names that no comma separates."""
+    if len(names) == 1 and any(mark in names[0].strip() for mark in ";\t| "):
+        raise RequestError("is not separated by commas.", fix="Save it with commas and points.", **place)
+    if len(row) != len(names):
+        what = f"has {len(row)} cells, and there are {len(names)} columns."
+        fix = "Fix the row; a comma inside a cell needs quotes, a decimal comma a point."
+        raise RequestError(what, fix=fix, **place)
 
 
 def _refuse_names(names: list[str], **place: object) -> None:
