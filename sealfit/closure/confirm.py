@@ -188,9 +188,8 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
         shift = pass_shifts(samples[seen], rows, length, axis)
         term = replace(proposal.term, fixed={**proposal.term.fixed, "shift": shift})
         model = replace(after.model, terms=(*after.model.terms[:-1], term))
-        old, new = (
-            _within_strokes(test, evaluate(m, test, jacobian=False)[0]) for m in (before.model, model)
-        )
+        residuals = (test.force - evaluate(m, test, jacobian=False)[0] for m in (before.model, model))
+        old, new = (own - test.groups.means(own, "stroke")[test.codes("stroke")] for own in residuals)
         weight = rows.weight[out]
         squares += weight @ old**2, weight @ new**2
     # The amplitude of a ripple differs between files, so each file is tested for the same wave in both
@@ -211,12 +210,6 @@ def _first_half(table: pd.DataFrame, in_turn: bool) -> np.ndarray:
     start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]])
     count = np.diff(np.r_[start, stroke.size])
     return np.arange(stroke.size) - np.repeat(start, count) < np.repeat(count, count) / 2
-
-
-def _within_strokes(rows: Rows, force: np.ndarray) -> np.ndarray:
-    """Return measured minus model about its mean in each stroke, shape (n,)."""
-    residual = rows.force - force
-    return residual - rows.groups.means(residual, "stroke")[rows.codes("stroke")]
 
 
 @dataclass(frozen=True)

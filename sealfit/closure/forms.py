@@ -361,19 +361,15 @@ def richer_laws(
 ) -> list[tuple[Candidate, Proposal]]:
     """Return each richer aging law with its adjusted test; none with 30 specimens or more."""
     specimens = fitted.rows.groups.starts["specimen"].size
-    lawful = any(fitted.model.declared.law.values())
-    if (
-        AGING not in channels
-        or channels[AGING].unit != "specimen"
-        or not lawful
-        or specimens >= criteria.JACKKNIFE_UNITS
-    ):
+    by_specimen = AGING in channels and channels[AGING].unit == "specimen"
+    lawful = by_specimen and any(fitted.model.declared.law.values())
+    spare = specimens - fitted.model.declared.mu_parameter_count
+    later = np.unique(fitted.rows.days[fitted.rows.days > 0])[1:]
+    if not lawful or specimens >= criteria.JACKKNIFE_UNITS or spare <= FEWEST or not later.size:
         return []
     known = {t.effect.id for t in fitted.model.terms}
     laws = [e for e in effects.values() if e.physical and e.reads == (AGING,) and TARGET in e.acts_on]
     laws = [e for e in laws if e.id not in known and len(e.linear) == 1 and e.nonlinear]
-    if specimens - fitted.model.declared.mu_parameter_count <= FEWEST:
-        return []
     rows = fitted.rows.sparse(ROWS)
     before = reestimated(fit(fitted.model, rows, fitted.scatter, turns=1))
     found = [_law_test(fitted, before, effect, len(laws)) for effect in laws]
@@ -384,8 +380,6 @@ def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tupl
     """Return one law's candidate and proposal."""
     term = Term(effect, effect.reads, *TARGET, fixed={})
     after = _best(before, term)
-    if after is None:
-        return None
     place = len(after.model.terms) - 1
     without = reestimated(before.refitted(after.model.without_term(place)))
     gain = min(before.deviance, without.deviance) - after.deviance
@@ -412,12 +406,10 @@ def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tupl
     return candidate, Proposal(term, values, "specimen", units, gain, adjusted, column, candidate.key)
 
 
-def _best(before: Fitted, term: Term) -> Fitted | None:
+def _best(before: Fitted, term: Term) -> Fitted:
     """Return the best joint fit of the law from several start values."""
     effect, rows = term.effect, before.rows
     days = np.unique(rows.days[rows.days > 0])[:-1]
-    if not days.size:
-        return None
     amplitude, number = effect.linear[0], effect.nonlinear[0].name
     found: list[Fitted] = []
     for day in days[np.unique(np.linspace(0, days.size - 1, STARTS).round().astype(int))].tolist():

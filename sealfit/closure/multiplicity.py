@@ -59,19 +59,20 @@ def adjust(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
 
     Results with the same number of units are flipped with the same signs, so that their correlation is used.
     """
-    own = [j.log_p for j in results]
-    return _adjusted(
-        own, _drawn(lambda: _least(results, rng, flips), min(own), max(j.units for j in results))
-    )
+    units = max(j.units for j in results)
+    return _adjusted([j.log_p for j in results], lambda: _least(results, rng, flips), units)
 
 
-def _drawn(draw: Callable[[], np.ndarray], smallest: float, units: int) -> np.ndarray:
-    """Return draws of the smallest log p-value until `ENOUGH` are below the observed one, or no more fit."""
+def _adjusted(own: Sequence[float], draw: Callable[[], np.ndarray], units: int) -> np.ndarray:
+    """Return adjusted p-values from log p and draws of the smallest log p under the null hypothesis.
+
+    They are drawn until `ENOUGH` are below the observed one, or no more fit.
+    """
     least = draw()
     most = min(MOST_FLIPS, MOST_SIGNS // units)
-    while np.count_nonzero(least <= smallest) < ENOUGH and least.size < most:
+    while np.count_nonzero(least <= min(own)) < ENOUGH and least.size < most:
         least = np.concatenate([least, draw()])
-    return least
+    return (1 + np.searchsorted(np.sort(least), own, side="right")) / (least.size + 1)
 
 
 def critical_many(results: Sequence[ScoreTestResult], level: float, rng: np.random.Generator) -> float:
@@ -139,11 +140,9 @@ def adjust_small_sample(
         tests = [results[k].small_sample for k in tried]
         logs = np.array([test.log_p for test in tests])
         count = max(results[k].units for k in tried)
-        least = _drawn(lambda: _least_small_sample(units, tests, rng, draws), logs.min(), count)
+        drawn = _adjusted(logs, lambda: _least_small_sample(units, tests, rng, draws), count)
         # Bonferroni is for p-values that are smaller than the draws resolve.
-        p_values[tried] = _unequal(units.level) * np.minimum(
-            _adjusted(logs, least), len(tried) * np.exp(logs)
-        )
+        p_values[tried] = _unequal(units.level) * np.minimum(drawn, len(tried) * np.exp(logs))
     return p_values
 
 
@@ -172,8 +171,3 @@ def adjust_slopes(results: Sequence[ScoreTestResult]) -> np.ndarray:
         count = sum(results[k].slopes[0].slope.size for k in tried)
         p_values[tried] = np.minimum(count * np.exp(least), 1.0)
     return p_values
-
-
-def _adjusted(own: Sequence[float], least: np.ndarray) -> np.ndarray:
-    """Return adjusted p-values from log p and many draws of the smallest log p under the null hypothesis."""
-    return (1 + np.searchsorted(np.sort(least), own, side="right")) / (least.size + 1)

@@ -186,7 +186,8 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     candidates += [p for p in equals if p.term.effect.physical and p not in candidates and p.size <= fewest]
     equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < EQUAL_BIC]
     if not any(p.term.effect.id == LINEAR for p in equal_fits):  # a straight line shows no mechanism
-        own = [p for p in equal_fits if _is_specific(p)]
+        # The BIC penalty is not decisive for physical effects of just these channels.
+        own = [p for p in equal_fits if p.term.effect.physical and CHANNEL not in p.term.effect.reads]
         least = min((p.fitted.deviance for p in own), default=0.0)
         candidates += [p for p in own if p.fitted.deviance - least < 2 * EQUAL_BIC and p not in candidates]
     if candidates:
@@ -194,12 +195,6 @@ def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
     else:
         first = next((p for p in found if p.bic - best.bic < RIVAL_BIC and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
-
-
-def _is_specific(proposal: Proposal) -> bool:
-    """Whether a form is a physical effect of just these channels; the BIC penalty is not decisive then."""
-    effect = proposal.term.effect
-    return effect.physical and CHANNEL not in effect.reads
 
 
 def _changes_earlier(fitted: Fitted, proposal: Proposal) -> bool:
@@ -256,18 +251,16 @@ def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
     Those with a far larger BIC are none. They were fitted under the scatter of the best, which does not
     contain their misfit, and their forces may be wrong by many times the noise.
     """
-    return [p for p in found if p is not chosen and not _identical(p, chosen) and _rival(p, chosen)]
+    return [p for p in found if p is not chosen and _rival(p, chosen)]
 
 
 def _rival(proposal: Proposal, chosen: Proposal) -> bool:
+    same_equation = proposal.term.key()[1:] == chosen.term.key()[1:]
+    if same_equation and abs(proposal.bic - chosen.bic) < 1e-3:
+        return False
     similarity = correlation(proposal, chosen)
     most = REFIT_MARGIN if similarity > SAME_EFFECT else RIVAL_BIC
     return similarity > RIVAL_CORRELATION and proposal.bic - chosen.bic < most
-
-
-def _identical(one: Proposal, other: Proposal) -> bool:
-    """Whether two proposals are the same equation, on the same channels and quantity."""
-    return one.term.key()[1:] == other.term.key()[1:] and abs(one.bic - other.bic) < 1e-3
 
 
 def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal] = ()) -> list[Proposal]:

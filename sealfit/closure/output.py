@@ -39,9 +39,11 @@ from sealfit.tables import CHANNELS, CURVES, SHAPE_POINTS, SHAPES
 def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
     """Return both fitted models with covariance, scatter and tested ranges as JSON values."""
     rows = after.rows
+    # The folder of user effects is an argument of a prediction.
+    own_config = config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
     return {
         "schema": 1,
-        "config": _without_effects(config).model_dump(mode="json"),
+        "config": own_config.model_dump(mode="json"),
         "conditions": rows.conditions.to_dict(orient="list"),
         "has_load": rows.has_load,
         "has_aging": rows.has_aging,
@@ -77,11 +79,6 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
     }
 
 
-def _without_effects(config: Config) -> Config:
-    """Return the config without the folder of user effects, which is an argument of a prediction."""
-    return config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
-
-
 def _model(model: Model) -> dict:
     return {
         "theta": model.theta.tolist(),
@@ -91,17 +88,13 @@ def _model(model: Model) -> dict:
                 "channels": list(term.channels),
                 "acts_on": term.acts_on,
                 "operation": term.operation,
-                "fixed": {k: ({} if k == "shift" else _plain(v)) for k, v in term.fixed.items()},
+                "fixed": {k: ({} if k == "shift" else v) for k, v in term.fixed.items()},
                 "values": {k: float(v) for k, v in values.items()},
                 "smoothness": term.smoothness,
             }
             for term, values in zip(model.terms, model.values, strict=True)
         ],
     }
-
-
-def _plain(value: object) -> object:
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _ranges(rows: Rows) -> dict:

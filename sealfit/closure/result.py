@@ -109,21 +109,18 @@ def closure_document(
 ) -> dict:
     """Return closure.json."""
     after, units = models.after, config.units
-    numbers = {}
-    for name, fitted, held in (
-        ("before", models.before, models.held_before),
-        ("after", after, models.held_after),
-    ):
-        found = errors(fitted.rows, fitted.residual)
-        numbers[name] = {
-            "rmse_N": found["rmse_N"],
-            "rmse_runs_N": found["rmse_runs_N"],
+    numbers = {
+        name: {
+            **errors(fitted.rows, fitted.residual),
             "heldout_rmse_N": models.heldout_rmse_N(held),
             "heldout_extrapolated_rmse_N": models.heldout_rmse_N(held, extrapolated=True),
-            "max_abs_N": found["max_abs_N"],
-            "mean_abs_pct": found["mean_abs_pct"],
             "lack_of_fit_p": lack_of_fit(fitted),
         }
+        for name, fitted, held in (
+            ("before", models.before, models.held_before),
+            ("after", after, models.held_after),
+        )
+    }
     floor, scatter = noise_floor(after), scatter_list(after)
     quality = fit_quality(numbers["after"], floor)
     seen = sensitivity(selection, config.loop.family_error)
@@ -205,11 +202,16 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
     term, proposal = after.model.terms[number], item.proposal
     own_phase = "shift" in term.fixed  # each stroke direction of a file has its own
     intervals = effect_intervals(after, number, proposal.unit)
+    if own_phase:
+        intervals["phi"] = (None, None, None)
+    smooth = ""
+    if term.smoothness is not None:
+        smooth = f"; smooth, {effective_df(after, number):.1f} effective degrees of freedom"
     parameters = [
         {
             "name": p.symbol,
-            "value": None if own_phase and p.name == "phi" else intervals[p.name][0],
-            "ci95": [None, None] if own_phase and p.name == "phi" else list(intervals[p.name][1:]),
+            "value": intervals[p.name][0],
+            "ci95": list(intervals[p.name][1:]),
             "unit": parameter_unit(p.unit, term, config.units),
         }
         for p in term.effect.parameters
@@ -222,7 +224,7 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
         "acts_on": term.acts_on,
         "operation": term.operation,
         "reference": reference_of(term, after.model.values[number], config),
-        "form": form_of(term) + _smoothness(after, number),
+        "form": form_of(term) + smooth,
         "named": proposal.named,
         "candidate": False,
         "parameters": parameters,
@@ -254,13 +256,6 @@ def effect_level(term: Term, rows: Rows) -> str:
     """Return the finest level at which one of the effect's channels varies, in closure.json's words."""
     units = [unit_of(rows.values(name), rows) for name in channels_of(term, rows)]
     return LEVEL_NAMES[min(units, key=FINER.get)]
-
-
-def _smoothness(after: Fitted, number: int) -> str:
-    """Return a text with the effective degrees of freedom of a penalised free shape; "" for other effects."""
-    if after.model.terms[number].smoothness is None:
-        return ""
-    return f"; smooth, {effective_df(after, number):.1f} effective degrees of freedom"
 
 
 def form_of(term: Term) -> str:

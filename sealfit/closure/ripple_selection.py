@@ -60,7 +60,11 @@ class Ripples:
             return own
         if not self.added:
             return fitted
-        return fit(_held(own.model), fitted.rows, own.scatter, turns=2)
+        held = tuple(
+            replace(t, fixed={**t.fixed, "held": {name: (value, value) for name, value in v.items()}})
+            for t, v in zip(own.model.terms, own.model.values, strict=True)
+        )
+        return fit(replace(own.model, terms=held), fitted.rows, own.scatter, turns=2)
 
     def _find(self, model: Model | None = None) -> Peak | None:
         known = (
@@ -71,15 +75,6 @@ class Ripples:
         common_phase = self.context.config.position_origin == "rig"
         peak = find_ripple(self.samples, common_phase=common_phase, known=known)
         return peak if peak is not None and peak.p_value <= self.context.config.loop.family_error else None
-
-
-def _held(model: Model) -> Model:
-    """Return a model whose terms are fixed."""
-    terms = [
-        replace(t, fixed={**t.fixed, "held": {name: (value, value) for name, value in v.items()}})
-        for t, v in zip(model.terms, model.values, strict=True)
-    ]
-    return replace(model, terms=tuple(terms))
 
 
 def without_ripples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:

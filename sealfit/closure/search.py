@@ -260,11 +260,11 @@ def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
         return []
     if one.numeric and other.numeric:
         products = [(u * w)[:, None] for u in _scales(one) for w in _scales(other)]
-        u, w = _even(one), _even(other)
+        u, w = (_centred(evenly(channel.values)) for channel in (one, other))
         blocks = [*products, np.column_stack([u**j * w**k for j, k in BENDS])]
     else:
         number, category = (one, other) if one.numeric else (other, one)
-        u = _even(number)
+        u = _centred(evenly(number.values))
         levels = np.unique(category.values)
         blocks = [(category.values[:, None] == levels[None, 1:]) * u[:, None]]
     sizes = [np.sqrt((columns**2).mean(axis=0)) for columns in blocks]
@@ -281,10 +281,6 @@ def _scales(channel: Channel) -> list[np.ndarray]:
     if x.min() >= 0 and x.max() > LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
         scales.append(np.log(shifted_from_zero(x)))
     return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
-
-
-def _even(channel: Channel) -> np.ndarray:
-    return _centred(evenly(channel.values))
 
 
 def _centred(values: np.ndarray) -> np.ndarray:

@@ -69,7 +69,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     fitted = selection.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
     files, specimens = (rows.groups.starts[level].size for level in ("file", "specimen"))
-    search = _Search(selection, alpha)
+    search, least = _Search(selection, alpha), criteria.LEAST_UNITS_OF_SLOPES
     in_model = _channels_in_model(selection)
     entries = []
     for name, channel in selection.channels.items():
@@ -85,19 +85,15 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
                 stated = float(max(TO_BE_ADDED * times, criteria.SIZE_MARGIN * criteria.LEAST_SIZE))
                 smallest = force * stated if times < 1 else None
-            if smallest is None and name in in_model:
+            if smallest is not None:
+                needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
+            elif name in in_model:
                 continue
-            if smallest is None:
+            else:
                 units = rows.groups.starts[scatter_level([channel], rows)].size
                 if channel.unit == "sample" and specimens > 1:
                     units = min(units, specimens)
-                needed = (
-                    int(np.ceil(files * criteria.LEAST_UNITS_OF_SLOPES / units))
-                    if units < criteria.LEAST_UNITS_OF_SLOPES
-                    else None
-                )
-            else:
-                needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
+                needed = int(np.ceil(files * least / units)) if units < least else None
             entries.append(
                 {
                     "variable": name,
@@ -109,8 +105,8 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 }
             )
     # No variable describes how specimens differ.
-    if len(rows.conditions) < specimens < criteria.LEAST_UNITS_OF_SLOPES:
-        needed = int(np.ceil(files * criteria.LEAST_UNITS_OF_SLOPES / specimens))
+    if len(rows.conditions) < specimens < least:
+        needed = int(np.ceil(files * least / specimens))
         unknown = {"variable": SPECIMEN, "level": "condition", "acts_on": "mu", "smallest_N": None}
         entries.append({**unknown, "smallest_pct": None, "files_needed": needed})
     return entries
@@ -242,13 +238,13 @@ class _Search:
         noise, effect = (replace(fitted, white_residual=column) for column in white.T)
         for one in (noise, effect):
             one.__dict__["basis"] = fitted.basis
-        channel = self.channels[candidate.channels[-1]]
         columns = candidate.columns * noise.slope(*candidate.target)[:, None]
-        variants = tests.variants(columns, channel.unit)
+        variants = tests.variants(columns, self.channels[candidate.channels[-1]].unit)
+        margin = self._by_units(candidate, noise, effect, variants)
         if all(enough_specimens(noise, left).all() for left in variants):
-            return self._by_units(candidate, noise, effect, variants)
-        large = min(float(least_share(effect, left).max()) for left in variants) / criteria.LARGE_SHARE
-        return min(large, self._by_units(candidate, noise, effect, variants))
+            return margin
+        shares = [float(least_share(effect, left).max()) for left in variants]
+        return min(margin, min(shares) / criteria.LARGE_SHARE)
 
     def _by_units(
         self, candidate: Candidate, noise: Fitted, effect: Fitted, variants: Sequence[np.ndarray]
@@ -256,9 +252,11 @@ class _Search:
         """Return the margin by the tests against the units' scatter."""
         channel, test_result = self.channels[candidate.channels[-1]], candidate.test_result
         known = test_result.small_sample
-        by_test = (
-            0.0 if known is None else min(self._by_one_test(noise, effect, left, known) for left in variants)
-        )
+        by_test = 0.0
+        if known is not None and known.level in self.critical_small_sample:
+            tail = np.exp(self.critical_small_sample[known.level])
+            units = [ClusterTests(one, known.level) for one in (noise, effect)]
+            by_test = min(_by_numbers(*units, left, known.target, tail) for left in variants)
         if test_result.slopes:
             tail = self.level / self.contrasts / (1 if known is None else N_VARIANCES)
             pairs = zip(variants, test_result.slopes, strict=True)
@@ -294,12 +292,6 @@ class _Search:
             )
         ]
         return float(np.nanmax(margins))
-
-    def _by_one_test(self, noise: Fitted, effect: Fitted, left: np.ndarray, known: SmallSampleTest) -> float:
-        if known.level not in self.critical_small_sample:
-            return 0.0
-        units = (ClusterTests(one, known.level) for one in (noise, effect))
-        return _by_numbers(*units, left, known.target, np.exp(self.critical_small_sample[known.level]))
 
     def _by_many(
         self, noise: Fitted, effect: Fitted, left: np.ndarray, level: str, candidate: Candidate
@@ -388,23 +380,14 @@ def undetectable_variables(
             undetectable.append(SPECIMEN)
             continue
         channel: Channel = selection.channels[entry["variable"]]
-        if (
-            channel.grouping
-            or channel.name in in_model
-            or channel.name in ASIDE
-            or entry["level"] != LEVEL_NAMES[channel.unit]
-        ):
+        aside = channel.grouping or channel.name in in_model or channel.name in ASIDE
+        if aside or entry["level"] != LEVEL_NAMES[channel.unit]:
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
-        own = [
-            s
-            for s in scatter
-            if channel.unit != "sample" and starts[s["level"]].size == starts[channel.unit].size
-        ]
+        count = starts[channel.unit].size if channel.unit != "sample" else None
+        own = [s for s in scatter if starts[s["level"]].size == count]
         much = any(s["sd_rel"] > criteria.MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
-        few_specimens = (
-            channel.unit == "specimen" and starts["specimen"].size < criteria.LEAST_UNITS_OF_SLOPES
-        )
+        few_specimens = channel.unit == "specimen" and count < criteria.LEAST_UNITS_OF_SLOPES
         decisive = channel.unit == "sample" or channel.name == "direction" or few_specimens
         if much or (decisive and not np.isfinite(smallest)):
             undetectable.append(channel.name)
