@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -60,15 +61,12 @@ class Gain:
         return self.rmse_N / max(self.rmse_N + self.left_N, 1e-300)
 
 
-def heldout_gain(
-    before: Fitted, proposal: Proposal, loop: Loop, samples: pd.DataFrame, known: dict[tuple, np.ndarray]
-) -> Gain:
+def heldout_gain(before: Fitted, proposal: Proposal, loop: Loop, samples: pd.DataFrame) -> Gain:
     """Return the gain of a proposal on held-out groups of its own unit.
 
     If files scatter by newtons, the RMSE hardly changes with a ripple of 0.1 N. The whitened sum of squares
     does, because the offset and gain of a whole file or run have little weight in it. For the same reason
-    both are taken about the means of the groups within which the effect varies. `known` caches the residual
-    of the model without the proposal in each fold.
+    both are taken about the means of the groups within which the effect varies.
     """
     if "shift" in proposal.term.fixed:
         return _gain_within_files(before, proposal, samples)
@@ -80,12 +78,10 @@ def heldout_gain(
     else:
         masks = folds(rows, level, loop.folds, loop.seed)
     around = None if calendar else varies_within(proposal)  # a block of time is predicted as a whole
-    return _gain(before, proposal, masks, around, (level, *calendar[:1]), known)
+    return _gain(before, proposal, masks, around, (level, loop.folds, loop.seed, *calendar[:1]))
 
 
-def gain_between_settings(
-    before: Fitted, proposal: Proposal, known: dict[tuple, np.ndarray]
-) -> Iterator[Gain]:
+def gain_between_settings(before: Fitted, proposal: Proposal) -> Iterator[Gain]:
     """Yield the gain of a proposal if all files at an inner setting of one of its channels are held out.
 
     Forms of one parameter are not tested: they cannot follow single settings, and a line is nearly zero at
@@ -100,22 +96,18 @@ def gain_between_settings(
             continue
         values = settings(level_values(np.abs(values) if name == "speed_mm_s" else values, rows))
         if LEAST_SETTINGS <= np.unique(values).size <= MOST_SETTINGS:
-            yield _gain(before, proposal, whole_settings(rows, values), None, ("setting", name), known)
+            yield _gain(before, proposal, whole_settings(rows, values), None, ("setting", name))
 
 
 def _gain(
-    before: Fitted,
-    proposal: Proposal,
-    masks: Iterable[np.ndarray],
-    around: str | None,
-    key: tuple,
-    known: dict[tuple, np.ndarray],
+    before: Fitted, proposal: Proposal, masks: Iterable[np.ndarray], around: str | None, folds_of: tuple
 ) -> Gain:
     """Return the gain on rows held out by `masks`, about the means of the groups of level `around` if given.
 
     The means are over the rows of all folds: in one fold a specimen may have a single run, and nothing would
     be left about its own mean. Both residuals are whitened by the scatter estimated with the proposal.
-    Without it the effect is part of the scatter, and a specimen has almost no weight.
+    Without it the effect is part of the scatter, and a specimen has almost no weight. The residual without
+    the proposal is cached; `folds_of` is what the masks depend on.
     """
     rows, after = before.rows, proposal.fitted
     left = np.full((2, rows.force.size), np.nan)
@@ -124,11 +116,10 @@ def _gain(
         if not inside.any():
             continue
         held = rows.subset(out)
-        if (*key, number) not in known:
-            known[*key, number] = _heldout_residual(before, before.model, out, held)
-        left[:, inside] = np.array([known[*key, number], _heldout_residual(before, after.model, out, held)])[
-            :, inside[out]
-        ]
+        make = partial(_heldout_residual, before, before.model, out, held)
+        without = before.cache.once(("held out", *folds_of, number), make)
+        left[0, inside] = without[inside[out]]
+        left[1, inside] = _heldout_residual(before, after.model, out, held)[inside[out]]
     scored = np.isfinite(left[0])
     if not scored.any():
         return Gain(0.0, 0.0, 0.0, 0.0)
@@ -275,33 +266,26 @@ def confirmed(
     """
     config = context.config
     refused: list[RefusedEffect] = []
-    known: dict[tuple, np.ndarray] = {}  # residuals without the proposal in each fold
-
-    def gain_of(proposal: Proposal) -> Gain:
-        return heldout_gain(fitted, proposal, config.loop, samples, known)
-
     for proposal in proposals[: criteria.MOST_PROPOSALS]:
-        gain = gain_of(proposal)
+        gain = heldout_gain(fitted, proposal, config.loop, samples)
         negative = turns_negative(proposal.fitted)
-        reason = NEGATIVE if negative else _reason_refused(fitted, proposal, gain, samples, known)
+        reason = NEGATIVE if negative else _reason_refused(fitted, proposal, gain, samples)
         unit = config.units.unit("force")
         label = describe(proposal.term, fitted.rows)
         context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
+            others = rivals(proposal, proposals)
             most = criteria.MOST_RIVALS if context.compare else 0
-            others = tuple(
-                (rival, gain_of(rival).left_N if k < most else np.nan)
-                for k, rival in enumerate(rivals(proposal, proposals))
-            )
+            left = [heldout_gain(fitted, rival, config.loop, samples).left_N for rival in others[:most]]
+            left += [np.nan] * (len(others) - len(left))
+            others = tuple(zip(others, left, strict=True))
             return AcceptedEffect(proposal, gain.rmse_N, gain.left_N, others, number), []
         if proposal.p_value <= config.loop.family_error:
             refused.append(RefusedEffect(proposal, reason))
     return None, refused
 
 
-def _reason_refused(
-    fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame, known: dict
-) -> str | None:
+def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame) -> str | None:
     """Return the reason why a proposal is refused; None if it is confirmed."""
     force = float(np.sqrt(np.mean(fitted.rows.force**2)))
     size = float(np.sqrt(np.mean(added_force(proposal) ** 2)))
@@ -325,7 +309,7 @@ def _reason_refused(
     if p_value > criteria.WEAK_P and gain.share < criteria.LEAST_FALL:
         above = f"its p-value is above {criteria.WEAK_P:g}"
         return f"{above}, and it lowers the held-out error by less than {criteria.LEAST_FALL:.0%}"
-    if not all(g.real for g in gain_between_settings(fitted, proposal, known)):
+    if not all(g.real for g in gain_between_settings(fitted, proposal)):
         return "it does not predict held-out settings between those it was fitted to"
     if not proposal.term.effect.periodic and vague_between_speeds(fitted, proposal):
         return "with it the force between the tested speeds is less certain than the error that it removes"

@@ -178,7 +178,7 @@ class Renaming:
 
     def _gain_N(self, without: Fitted, proposal: Proposal) -> float:
         """Return by how much the model of a fitted proposal lowers the error on held-out data."""
-        return heldout_gain(without, proposal, self.context.config.loop, self.samples, {}).rmse_N
+        return heldout_gain(without, proposal, self.context.config.loop, self.samples).rmse_N
 
     def _confirmed(
         self, without: Fitted, proposals: Sequence[Proposal], number: int

@@ -203,7 +203,7 @@ def _replaced(
     without = after.refitted(after.model.without_term(number))
     model = without.model.with_term(chosen.term, chosen.fitted.model.values[-1])
     chosen = replace(chosen, fitted=after.refitted(model))
-    gain = heldout_gain(without, chosen, config.loop, samples, {})
+    gain = heldout_gain(without, chosen, config.loop, samples)
     rest = (r for r in _rivals(item) if r[0].term is not chosen.term)
     rivals = ((item.proposal, item.left_N), *rest)
     after = fit(chosen.fitted.model, after.rows, after.scatter, turns=2)

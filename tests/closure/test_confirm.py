@@ -31,7 +31,7 @@ def test_a_form_of_one_number_is_not_asked_between_settings():
     """Over three settings a straight line is zero at the middle one, and gains nothing there."""
     before = fit_declared(make_rows(make_bins(0, temperatures=(60.0,), days=(4.0,), bins=4), has_aging=True))
     line = SimpleNamespace(channels=("repeat",), effect=SimpleNamespace(parameters=("A",)))
-    assert list(gain_between_settings(before, SimpleNamespace(term=line), {})) == []
+    assert list(gain_between_settings(before, SimpleNamespace(term=line))) == []
 
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-15])
@@ -44,9 +44,9 @@ def test_the_one_load_of_a_campaign_has_no_settings_whatever_its_rounding(jitter
     warming = EFFECTS["warming_power"]
     term = Term(warming, warming.reads, "mu", "multiply", {"load_N_ref": 49.03, "speed_mm_s_ref": 10.0})
     after = fit(before.model.with_term(term, {"A": 0.01, "tau": 5.0}), rows, before.scatter, turns=0)
-    known = {}
-    list(gain_between_settings(before, SimpleNamespace(term=term, fitted=after, unit="run"), known))
-    assert {(name, number) for _, name, number in known} == {("speed_mm_s", k) for k in range(3)}
+    list(gain_between_settings(before, SimpleNamespace(term=term, fitted=after, unit="run")))
+    known = [key[2:] for key in before.cache if key[:2] == ("held out", "setting")]
+    assert set(known) == {("speed_mm_s", k) for k in range(3)}
 
 
 def test_a_share_lost_along_strokes_is_held_out_about_their_means_however_much_friction_differs_between_runs():  # noqa: E501
@@ -72,9 +72,7 @@ def test_a_gain_is_weighed_by_the_scatter_that_is_left_with_the_effect_in(seed):
     before = fit_declared(rows)
     term = Term(EFFECTS["aging_floor"], ("aging_days",), "mu", "multiply")
     after = fit(before.model.with_term(term, {"A": 0.05, "t_f": 4.0}), rows, before.scatter, turns=2)
-    gain = heldout_gain(
-        before, SimpleNamespace(term=term, fitted=after, unit="specimen"), FIVE_FOLDS, None, {}
-    )
+    gain = heldout_gain(before, SimpleNamespace(term=term, fitted=after, unit="specimen"), FIVE_FOLDS, None)
     assert gain.real
 
 
@@ -94,7 +92,7 @@ def test_one_run_of_a_specimen_in_a_fold_is_compared_with_the_mean_of_all_its_ru
     after = fit(before.model.with_term(term, {"A": 0.5}), before.rows, before.scatter, turns=2)
     column = after.force - before.force
     proposal = SimpleNamespace(term=term, fitted=after, unit="run", column=column)
-    gain = heldout_gain(before, proposal, FIVE_FOLDS, None, {})
+    gain = heldout_gain(before, proposal, FIVE_FOLDS, None)
     assert gain.real
     assert gain.rmse_N > 0.2
 
