@@ -22,7 +22,7 @@ from sealfit.closure.small_sample_test import (
     specimens_agree,
 )
 from sealfit.fit.joint import Fitted
-from sealfit.fit.joint.rows import LEVELS
+from sealfit.fit.joint.rows import LEVELS, Cache, cached
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 
 # A candidate is a free shape of one channel acting on one quantity: columns c of the force. After whitening
@@ -140,7 +140,7 @@ class ScoreTests:
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
         self.cluster_tests = {level: ClusterTests(fitted, level) for level in LEVELS}
-        self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.cache = Cache()
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
         """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
@@ -277,15 +277,12 @@ class ScoreTests:
         t = float(total @ np.linalg.pinv(spread, hermitian=True) @ total)
         return _log(fdtrc(k, units - k, t * (units - k) / (k * (units - 1))))
 
+    @cached
     def _without(self, level: str) -> tuple[np.ndarray, np.ndarray]:
         """Return per unit the inverse of 1 - B'B, shape (units, k, k), and B'r, (units, k), in its block."""
-        if level not in self._kept:
-            fitted = self.fitted
-            share, axes = fitted.unit_shares(level)
-            inverse = _inverse_of(1 - share, axes)
-            product = fitted.basis.sums(fitted.rows.groups, level, fitted.white_residual).values
-            self._kept[level] = (inverse, product)
-        return self._kept[level]
+        share, axes = self.fitted.unit_shares(level)
+        groups, residual = self.fitted.rows.groups, self.fitted.white_residual
+        return _inverse_of(1 - share, axes), self.fitted.basis.sums(groups, level, residual).values
 
 
 def _log(p_value: float) -> float:

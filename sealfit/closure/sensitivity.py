@@ -169,7 +169,7 @@ class _Search:
 
     def __init__(self, selection: Selection, alpha: float) -> None:
         self.fitted, self.channels, self.candidates = selection.after, selection.channels, selection.last
-        self.level, self.units = alpha / criteria.SEARCHES, {}
+        self.level, self.tests = alpha / criteria.SEARCHES, ScoreTests(selection.after)
         results = [c.test_result for c in selection.last]
         slopes = [j.slopes for j in results if j.slopes]
         small_sample = [test for c in selection.last if (test := self._retested(c)) is not None]
@@ -195,10 +195,8 @@ class _Search:
         known, target = candidate.test_result.small_sample, candidate.target
         if known is None:
             return None
-        if known.level not in self.units:
-            self.units[known.level] = ClusterTests(self.fitted, known.level)
         columns = candidate.columns * self.fitted.slope(*target)[:, None]
-        return self.units[known.level].test(project(self.fitted, columns), target)
+        return self.tests.cluster_tests[known.level].test(project(self.fitted, columns), target)
 
     def surer(self, times: float, candidate: Candidate) -> float:
         """Return the factor on an effect, found with `TARGET_POWER`, with which its evidence is not weak.
