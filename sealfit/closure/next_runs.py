@@ -116,6 +116,10 @@ LONGER_STROKES = (
     "would show effects along the strokes, which end before the friction is steady: slide eleven times the "
     "length of the rise to 63 %"
 )
+SECOND_SPECIMEN = (
+    "would show the scatter of specimens, which is unknown in this campaign and in no interval: "
+    "a second specimen of a tested condition"
+)
 ROWS = 4  # Rows per stroke at which forces are compared.
 
 
@@ -148,9 +152,11 @@ def next_runs(
                 wanted.append({"why": why, "conditions": conditions})
     if selection.inconclusive is not None:
         wanted.append(_replicate_of(selection.inconclusive, config))
-    if selection.after.rows.has_aging and not selection.after.scatter.estimates("specimen"):
-        wanted.append(_second_specimen(selection.after.rows, config))
-    if too_short(selection.after.rows):
+    rows = selection.after.rows
+    if rows.has_aging and not selection.after.scatter.estimates("specimen"):
+        last = rows.table.iloc[int(np.argmax(rows.days))]
+        wanted.append({"why": SECOND_SPECIMEN, "conditions": _settings(last, condition_columns(config))})
+    if too_short(rows):
         wanted.append({"why": LONGER_STROKES, "conditions": {}})
     return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
 
@@ -180,16 +186,6 @@ def _run_to_repeat(one: OutlierFile, config: Config) -> dict:
     return {
         "why": f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and {done}",
         "conditions": _settings(one.conditions, names),
-    }
-
-
-def _second_specimen(rows: Rows, config: Config) -> dict:
-    """Return the last condition, for a test on a second specimen if the scatter of specimens is not known."""
-    k = int(np.argmax(rows.days))
-    return {
-        "why": "would show the scatter of specimens, which is unknown in this campaign and in no interval: "
-        "a second specimen of a tested condition",
-        "conditions": _settings(rows.table.iloc[k], condition_columns(config)),
     }
 
 

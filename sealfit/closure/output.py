@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
+from pandas.api.typing import SeriesGroupBy
 
 from sealfit.closure.channels import Channel, unit_of
 from sealfit.closure.errors_and_intervals import (
@@ -345,21 +346,18 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     rows = after.rows
     channels = {name for term in (*before.model.terms, *after.model.terms) for name in term.channels}
     read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
-    direction = np.sign(rows.speed)
-    sliding = np.flatnonzero(direction != 0)
-    order = sliding[np.lexsort((-direction[sliding], rows.condition[sliding]))]  # forward strokes first
-    cuts = np.flatnonzero(np.diff(rows.condition[order]) | (np.diff(direction[order]) != 0)) + 1
-    own = {name: pd.Series(rows.values(name), name=name) for name in open_columns(rows.table)}
-    columns = {name: _averaged(own.get(name, rows.table[name]), np.split(order, cuts)) for name in read}
-    speeds = [np.abs(rows.speed[chosen]) for chosen in np.split(order, cuts)]
-    counts = [POINTS if own.max() > 1.02 * own.min() else 1 for own in speeds]
-    first = order[np.r_[0, cuts]]
-    points = pd.DataFrame({**columns, "direction": direction[first]}).loc[
-        np.repeat(np.arange(first.size), counts)
-    ]
-    along = [np.geomspace(own.min(), own.max(), count) for own, count in zip(speeds, counts, strict=True)]
-    points = points.assign(speed_mm_s=points["direction"].to_numpy() * np.concatenate(along), file="")
-    at = rows.points(points, np.repeat(rows.condition[first], counts))
+    own = {name: rows.values(name) for name in open_columns(rows.table)}
+    table = rows.table.assign(
+        **own, pace=np.abs(rows.speed), at=rows.condition, backward=-np.sign(rows.speed)
+    )
+    groups = table[table["backward"] != 0].groupby(["at", "backward"])  # forward strokes first
+    points = pd.DataFrame({name: _averaged(groups[name]) for name in read}).reset_index()
+    low, high = groups["pace"].min().to_numpy(), groups["pace"].max().to_numpy()
+    counts = np.where(high > 1.02 * low, POINTS, 1)
+    along = np.concatenate([np.geomspace(*own) for own in zip(low, high, counts, strict=True)])
+    points = points.loc[np.repeat(points.index, counts)].assign(direction=lambda own: -own["backward"])
+    points = points.assign(speed_mm_s=points["direction"] * along, file="")
+    at = rows.points(points, points["at"].to_numpy())
     mean, tangent = evaluate(after.model, at)
     reach = mean_half_width(tangent, after.covariance, degrees_of_freedom(after), sandwiches(after))
     forces = {"force_before_N": evaluate(before.model, at, jacobian=False)[0], "force_after_N": mean}
@@ -367,9 +365,8 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     return at.table.assign(**forces, **ends)[CURVES.names()]
 
 
-def _averaged(column: pd.Series, groups: list[np.ndarray]) -> list:
+def _averaged(groups: SeriesGroupBy) -> pd.Series:
     """Return the mean of a numeric channel, or the most frequent category, in each group of rows."""
-    if pd.api.types.is_float_dtype(column) or column.name in ("repeat", "stroke"):
-        return [float(column.iloc[rows].mean()) for rows in groups]
-    number, names = pd.factorize(column, sort=True)
-    return [names[np.bincount(number[rows]).argmax()] for rows in groups]
+    if pd.api.types.is_float_dtype(groups.obj) or groups.obj.name in ("repeat", "stroke"):
+        return groups.mean().astype(float)
+    return groups.agg(lambda own: own.mode().iloc[0])
