@@ -212,18 +212,20 @@ class _Law:
         if self.place is None:
             yield from without_law(self.curve_of)
             return
-        found = self._estimate()
-        words, interval = "; ".join(self._kept_words()), self._interval(found)
+        after, at, config = self.after, self.place, self.config
+        sensor = after.whitening((np.sign(after.rows.speed) * config.sensor.u)[:, None])[:, 0]
+        shift = after.covariance[at] @ after.white_jacobian.against(sensor)
+        found = Estimate(after.model.theta[at], after.covariance[np.ix_(at, at)], shift)
+        changed = {"force", "mu", f"mu_{self.end}", "mu_0", "a", "b"}
+        kept = [t for t in after.model.terms if is_kept(t, config) and t.acts_on in changed]
+        words = "; ".join(
+            f"The effect {t.effect.id} of {' and '.join(t.channels)} acts on top of it." for t in kept
+        )
+        interval = self._interval(found)
         for row in law_rows(self.curve_of, found, interval, self.df):
             yield {**row, "reason": " ".join(part for part in (row["reason"], words) if part)}
         yield from self._statistics(steady_fit)
         yield from covariance_rows(self.curve_of, found.covariance)
-
-    def _estimate(self) -> Estimate:
-        after, at = self.after, self.place
-        sensor = after.whitening((np.sign(after.rows.speed) * self.config.sensor.u)[:, None])[:, 0]
-        shift = after.covariance[at] @ after.white_jacobian.against(sensor)
-        return Estimate(after.model.theta[at], after.covariance[np.ix_(at, at)], shift)
 
     def _interval(self, found: Estimate) -> CurveInterval:
         """Return the 95 % limits of a, b and c; b is open beyond the search range of laws."""
@@ -236,11 +238,6 @@ class _Law:
         )
         c, half = -found.x[1] * found.x[2], t * found.error_of_c()
         return CurveInterval((found.x[1] - t * error[1], found.x[1] + t * error[1]), b, (c - half, c + half))
-
-    def _kept_words(self) -> list[str]:
-        changed = {"force", "mu", f"mu_{self.end}", "mu_0", "a", "b"}
-        kept = [t for t in self.after.model.terms if is_kept(t, self.config) and t.acts_on in changed]
-        return [f"The effect {t.effect.id} of {' and '.join(t.channels)} acts on top of it." for t in kept]
 
     def _statistics(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
         """Yield the errors of the law at single conditions, and the statistics behind its intervals."""

@@ -54,13 +54,10 @@ def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str
     own = [e for e in effects.values() if e.physical and CHANNEL not in e.reads and set(e.reads) <= known]
     found = []
     for effect in own:
-        first = None
-        for *form, left in (f for target in effect.acts_on for f in _at_grid(fitted, effect, target)):
-            if left >= IDENTIFIABLE:
-                break  # it is distinguishable there
-            first = first or form
-        else:
-            found += [_alias(fitted, *first)] if first else []
+        forms = (form for target in effect.acts_on for form in _at_grid(fitted, effect, target))
+        first = next(forms, None)
+        if first is not None and all(form[-1] < IDENTIFIABLE for form in itertools.chain([first], forms)):
+            found.append(_alias(fitted, *first[:-1]))
     return found
 
 

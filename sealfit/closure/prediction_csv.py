@@ -95,11 +95,7 @@ def _as_read(column: pd.Series) -> pd.Series:
     """Return a column as it would come from a CSV: numbers as float, words without spaces around them."""
     if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
         return column.astype(float)
-    return _numbers(column.astype(object).where(column.notna(), "").map(str))
-
-
-def _numbers(cells: pd.Series) -> pd.Series:
-    cells = cells.str.strip()
+    cells = column.astype(object).where(column.notna(), "").map(str).str.strip()
     missing = cells.isin(MISSING)
     numbers = pd.to_numeric(cells.where(~missing), errors="coerce")
     if (numbers.notna() | missing).all():

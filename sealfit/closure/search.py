@@ -55,6 +55,7 @@ TARGETS = (
     ("v_s", "multiply"), ("sigma_2", "add"), ("a", "multiply"), ("b", "multiply"),
 )  # fmt: skip
 MAIN_TARGETS = (("mu", "multiply"), ("force", "add"))
+NOT_TESTED = ScoreTestResult(0.0, 0, 0, 0.0)
 
 
 def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
@@ -113,14 +114,11 @@ def _shape_candidates(
     for acts_on, operation in targets:
         if not (_allowed(channel, acts_on, operation, both_ways, loads) and _declared(fitted, acts_on)):
             continue
-        slope = fitted.slope(acts_on, operation)
-        if not np.abs(slope).max() > 0:
+        if not np.abs(fitted.slope(acts_on, operation)).max() > 0:
             continue
         halved = channel.name == "direction" and acts_on != "force"
         own = channel.values[:, None] / 2 if halved else shapes
-        variants = tests.variants(own * slope[:, None], channel.unit)
-        unit = channel.unit
-        names = (channel.name,)
+        unit, names = channel.unit, (channel.name,)
         unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
         # it is seen only as a difference between directions
         if unsigned and FINER[channel.unit] > FINER["stroke"]:
@@ -128,10 +126,19 @@ def _shape_candidates(
             unit = min(unit, unit_of(np.sign(rows.speed), rows), key=FINER.get)
         level = flip_level(unit, rows)
         between = level if channel.grouping else scatter_level([channel], rows)
-        for part in parts:
-            test_result = tests([v[:, part] for v in variants], between, level, (acts_on, operation))
-            if test_result is not None:
-                yield Candidate(names, acts_on, operation, level, own[:, part], test_result)
+        tested = Candidate(names, acts_on, operation, level, own, NOT_TESTED)
+        yield from _tested(tests, tested, parts, channel.unit, between)
+
+
+def _tested(
+    tests: ScoreTests, whole: Candidate, parts: Sequence[slice], unit: str, between: str
+) -> Iterator[Candidate]:
+    """Yield a candidate for each part of the columns of `whole` that can be tested."""
+    variants = tests.variants(whole.columns * tests.fitted.slope(*whole.target)[:, None], unit)
+    for part in parts:
+        test_result = tests([v[:, part] for v in variants], between, whole.unit, whole.target)
+        if test_result is not None:
+            yield replace(whole, columns=whole.columns[:, part], test_result=test_result)
 
 
 def _declared(fitted: Fitted, acts_on: str) -> bool:
@@ -224,28 +231,23 @@ def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Ca
     blocks = mixed_columns(one, other)
     if not blocks:
         return []
-    fitted, finer = tests.fitted, min(one.unit, other.unit, key=FINER.get)
-    between = scatter_level((one, other), fitted.rows)
-    level = flip_level(finer, fitted.rows)
+    rows, finer = tests.fitted.rows, min(one.unit, other.unit, key=FINER.get)
+    between, level = scatter_level((one, other), rows), flip_level(finer, rows)
     shapes = np.column_stack(blocks)
     ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
+    parts = [slice(*place) for place in itertools.pairwise(ends)]
     found = []
     for target in MAIN_TARGETS:
-        if "load_N" in (one.name, other.name) and target[0] == "force":
-            continue
-        variants = tests.variants(shapes * fitted.slope(*target)[:, None], finer)
-        for block, first, last in zip(blocks, ends[:-1], ends[1:], strict=True):
-            test_result = tests([v[:, first:last] for v in variants], between, level, target)
-            if test_result is not None:
-                names = (one.name, other.name)
-                found.append(Candidate(names, *target, level, block, test_result, pair=True))
+        if "load_N" not in (one.name, other.name) or target[0] != "force":
+            whole = Candidate((one.name, other.name), *target, level, shapes, NOT_TESTED, pair=True)
+            found += _tested(tests, whole, parts, finer, between)
     return found
 
 
 def candidate_of(term: Term, pair: Sequence[Channel], rows: Rows, p_value: float) -> Candidate:
     """Return a candidate of a pair of channels for a term that no test suggested, with a given p-value."""
     level = flip_level(min((c.unit for c in pair), key=FINER.get), rows)
-    test = ScoreTestResult(0.0, len(term.effect.parameters), rows.groups.starts[level].size, 0.0)
+    test = NOT_TESTED._replace(df=len(term.effect.parameters), units=rows.groups.starts[level].size)
     return Candidate(term.channels, *term.target, level, np.empty((0, 0)), test, p_value, pair=True)
 
 
