@@ -80,67 +80,56 @@ class Proposal:
         return (kind, self.size, position, effect.acts_on.index(self.term.target) if effect.physical else 0)
 
 
-class Linearised:
-    """Fits terms to the residual in the tangent space of a model.
+def linearised(
+    fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate
+) -> list[Proposal]:
+    """Return a term fitted to the residual in the tangent space of a model, at the best point of its grid.
 
-    Amplitudes are fitted exactly, other parameters on a grid.
+    The list is empty if none of the grid is identifiable. Amplitudes are fitted exactly.
     """
+    effect, rows = term.effect, fitted.rows
+    points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
+    at = (effect.id, term.channels, points, term.fixed)  # the shapes are the same for every target
+    shapes = rows.cache.once(("shapes on a grid",), lambda: _shapes(term, points, rows), at=at)
+    point, most, shape = _best(fitted, term, points, shapes)
+    finer = _between(term, point, search, rows)
+    if finer:
+        point, most, shape = _best(fitted, term, finer, _shapes(term, finer, rows))
+    if not most > 0:
+        return []
+    left = project(fitted, fitted.slope(*term.target)[:, None] * shape)
+    size = None
+    if term.smoothness is None:
+        amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
+    else:
+        term, amplitude, size = _smooth(term, left, fitted.white_residual)
+    column = left @ amplitude
+    chosen = {**effect.start(), **point, **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
+    values = {p.name: chosen[p.name] for p in effect.parameters}
+    found = float(2 * column @ fitted.white_residual - column @ column)
+    units, p_value = candidate.test_result.units, candidate.p_value
+    return [Proposal(term, values, candidate.unit, units, found, p_value, column, candidate.key, size)]
 
-    def __init__(self, fitted: Fitted) -> None:
-        self.fitted = fitted
-        self._kept: tuple[tuple, np.ndarray] | None = None  # shapes are the same for every target
 
-    def __call__(self, term: Term, search: Mapping[str, tuple], candidate: Candidate) -> list[Proposal]:
-        """Return the term at the best point of its grid; an empty list if none of it is identifiable."""
-        fitted, effect = self.fitted, term.effect
-        points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
-        point, most, shape = self._best(term, points, self._shapes(term, points))
-        finer = _between(term, point, search, fitted.rows)
-        if finer:
-            point, most, shape = self._best(term, finer, self._made(term, finer))
-        if not most > 0:
-            return []
-        left = project(fitted, fitted.slope(*term.target)[:, None] * shape)
-        size = None
-        if term.smoothness is None:
-            amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
-        else:
-            term, amplitude, size = _smooth(term, left, fitted.white_residual)
-        column = left @ amplitude
-        chosen = {**effect.start(), **point, **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
-        values = {p.name: chosen[p.name] for p in effect.parameters}
-        found = float(2 * column @ fitted.white_residual - column @ column)
-        units = candidate.test_result.units
-        return [
-            Proposal(
-                term, values, candidate.unit, units, found, candidate.p_value, column, candidate.key, size
-            )
-        ]
+def _shapes(term: Term, points: list[dict[str, float]], rows: Rows) -> np.ndarray:
+    """Return the shapes per unit amplitude at every point of a grid, (n, points * amplitudes)."""
+    start = term.effect.start()
+    with np.errstate(all="ignore"):
+        made = [mean_derivatives(term, {**start, **point}, rows, only_linear=True) for point in points]
+    return np.column_stack([column for columns in made for column in columns])
 
-    def _best(
-        self, term: Term, points: list[dict[str, float]], shapes: np.ndarray
-    ) -> tuple[dict[str, float], float, np.ndarray]:
-        """Return the best point of a grid, the sum of squares it explains and its shapes, (n, amplitudes)."""
-        slope, count = self.fitted.slope(*term.target), len(term.effect.linear)
-        parts = range(0, shapes.shape[1], PART * count)
-        chi2 = np.concatenate(
-            [_explained(self.fitted, slope[:, None] * shapes[:, k : k + PART * count], count) for k in parts]
-        )
-        best = int(np.argmax(chi2))
-        return points[best], float(chi2[best]), shapes[:, best * count : (best + 1) * count]
 
-    def _shapes(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
-        """Return the shapes per unit amplitude at every point, (n, points * amplitudes), from a cache."""
-        key = (term.effect.id, term.channels, points, term.fixed)
-        if self._kept is None or self._kept[0] != key:
-            self._kept = (key, self._made(term, points))
-        return self._kept[1]
-
-    def _made(self, term: Term, points: list[dict[str, float]]) -> np.ndarray:
-        start, rows = term.effect.start(), self.fitted.rows
-        with np.errstate(all="ignore"):
-            made = [mean_derivatives(term, {**start, **point}, rows, only_linear=True) for point in points]
-        return np.column_stack([column for columns in made for column in columns])
+def _best(
+    fitted: Fitted, term: Term, points: list[dict[str, float]], shapes: np.ndarray
+) -> tuple[dict[str, float], float, np.ndarray]:
+    """Return the best point of a grid, the sum of squares it explains and its shapes, (n, amplitudes)."""
+    slope, count = fitted.slope(*term.target), len(term.effect.linear)
+    parts = range(0, shapes.shape[1], PART * count)
+    chi2 = np.concatenate(
+        [_explained(fitted, slope[:, None] * shapes[:, k : k + PART * count], count) for k in parts]
+    )
+    best = int(np.argmax(chi2))
+    return points[best], float(chi2[best]), shapes[:, best * count : (best + 1) * count]
 
 
 def _between(

@@ -31,7 +31,7 @@ from sealfit.closure.criteria import (
 )
 from sealfit.closure.errors_and_intervals import robust_covariance
 from sealfit.closure.forms import CHANGES_A_WAVE, periodic_terms, terms_of
-from sealfit.closure.linearised import ZERO_OFFSET, Linearised, Proposal
+from sealfit.closure.linearised import ZERO_OFFSET, Proposal, linearised
 from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
@@ -59,14 +59,13 @@ def propose(
 
     The `significant` candidates are sorted, strongest first. `also` are further proposals.
     """
-    linearised = Linearised(fitted)
     forms = [
         (t, search, c)
         for c in _contenders(significant)
         for t, search in terms_of(c, channels, fitted, effects)
     ]
     forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # all quantities share a shape
-    found = [*also, *(p for form in forms for p in linearised(*form))]
+    found = [*also, *(p for form in forms for p in linearised(fitted, *form))]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
     if not (
@@ -98,8 +97,7 @@ def propose_ripples(
 
     Changes of its amplitude that are not the best are no rivals: none of them was found.
     """
-    linearised = Linearised(fitted)
-    found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(*form)]
+    found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(fitted, *form)]
     refitted = _refitted(fitted, _best_few(found), found)
     best, *others = _ordered(fitted, [p for p in refitted if len(p.term.channels) == 1 or _changes(p)])
     return [best, *(p for p in others if len(p.term.channels) == 1)]

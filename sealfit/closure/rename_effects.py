@@ -18,7 +18,7 @@ from sealfit.closure.channels import Channel
 from sealfit.closure.confirm import AcceptedEffect, Context, confirmed, heldout_gain
 from sealfit.closure.criteria import EQUAL_BIC, MOST_PROPOSALS, RIVAL_BIC
 from sealfit.closure.forms import main_effects_identifiable, surface_term
-from sealfit.closure.linearised import Linearised, Proposal
+from sealfit.closure.linearised import Proposal, linearised
 from sealfit.closure.naming import deviance_under, named_among, propose
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import MAIN_TARGETS, candidate_of, channel_candidates, search_pairs
@@ -152,12 +152,12 @@ class Renaming:
             if names <= {one.name, other.name} | (along if along & {one.name, other.name} else set())
         ]
         p_value = min(p.p_value for p in parts)
-        linearised, found = Linearised(without), []
+        found = []
         for pair in pairs:
             if main_effects_identifiable(pair, without):
                 for target in dict.fromkeys((*MAIN_TARGETS, *(p.term.target for p in parts))):
                     term = surface_term(*pair, *target)
-                    found += linearised(term, {}, candidate_of(term, pair, without.rows, p_value))
+                    found += linearised(without, term, {}, candidate_of(term, pair, without.rows, p_value))
         return sorted(found, key=lambda p: p.bic)[:MOST_PROPOSALS]
 
     def _proposals_on(
@@ -173,7 +173,7 @@ class Renaming:
         own, values = fitted.model.terms[number], fitted.model.values[number]
         at_own_values = {p.name: (values[p.name],) for p in own.effect.nonlinear}
         same_target = next((c for c in found if c.target == own.target), None)
-        own_form = Linearised(without)(own, at_own_values, same_target) if same_target is not None else ()
+        own_form = linearised(without, own, at_own_values, same_target) if same_target is not None else ()
         return propose(without, found, self.channels, self.context.effects, own_form)
 
     def _gain_N(self, without: Fitted, proposal: Proposal) -> float:

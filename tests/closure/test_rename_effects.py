@@ -7,7 +7,7 @@ from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import AcceptedEffect, Context
 from sealfit.closure.criteria import PAIR_PENALTY
 from sealfit.closure.forms import terms_of
-from sealfit.closure.linearised import Linearised, Proposal
+from sealfit.closure.linearised import Proposal, linearised
 from sealfit.closure.ripple_selection import numbered, steady_samples
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.search import search
@@ -70,12 +70,12 @@ def test_a_load_that_does_not_vary_may_be_read_where_that_is_another_equation():
 def test_two_channels_together_pay_for_being_one_of_many():
     fitted = fitted_of(run_channels=OIL)
     channels = {c.name: c for c in find_channels(fitted.rows)}
-    test_result, linearised = ScoreTestResult(1.0, 1, 72, -1.0), Linearised(fitted)
+    test_result = ScoreTestResult(1.0, 1, 72, -1.0)
     bic_penalty = {}
     for names, pair in ((("oil_ppm",), False), (("oil_ppm", "time_s"), True)):
         candidate = Candidate(names, "mu", "multiply", "run", np.empty((0, 1)), test_result, pair=pair)
         for term, searched in terms_of(candidate, channels, fitted, EFFECTS):
-            for proposal in linearised(term, searched, candidate):
+            for proposal in linearised(fitted, term, searched, candidate):
                 bic_penalty[term.effect.id] = proposal.bic_penalty
     assert bic_penalty["product"] - bic_penalty["linear"] == pytest.approx(PAIR_PENALTY)
 
