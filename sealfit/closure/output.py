@@ -368,5 +368,5 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
 def _averaged(groups: SeriesGroupBy) -> pd.Series:
     """Return the mean of a numeric channel, or the most frequent category, in each group of rows."""
     if pd.api.types.is_float_dtype(groups.obj) or groups.obj.name in ("repeat", "stroke"):
-        return groups.mean().astype(float)
+        return groups.agg(lambda own: own.mean())
     return groups.agg(lambda own: own.mode().iloc[0])
