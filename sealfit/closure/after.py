@@ -62,7 +62,6 @@ def at_reference(model: Model, config: Config) -> Model:
 
 
 def _with_terms(model: Model, kept: Sequence[int]) -> Model:
-    """Return a model with some of its terms."""
     terms, values = (tuple(own[k] for k in kept) for own in (model.terms, model.values))
     return replace(model, terms=terms, values=values)
 

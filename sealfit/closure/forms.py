@@ -364,8 +364,8 @@ def richer_laws(
     by_specimen = AGING in channels and channels[AGING].unit == "specimen"
     lawful = by_specimen and any(fitted.model.declared.law.values())
     spare = specimens - fitted.model.declared.mu_parameter_count
-    later = np.unique(fitted.rows.days[fitted.rows.days > 0])[1:]
-    if not lawful or specimens >= criteria.JACKKNIFE_UNITS or spare <= FEWEST or not later.size:
+    before_last = np.unique(fitted.rows.days[fitted.rows.days > 0])[:-1]  # days at which the search starts
+    if not lawful or specimens >= criteria.JACKKNIFE_UNITS or spare <= FEWEST or not before_last.size:
         return []
     known = {t.effect.id for t in fitted.model.terms}
     laws = [e for e in effects.values() if e.physical and e.reads == (AGING,) and TARGET in e.acts_on]
@@ -377,7 +377,6 @@ def richer_laws(
 
 
 def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[Candidate, Proposal] | None:
-    """Return one law's candidate and proposal."""
     term = Term(effect, effect.reads, *TARGET, fixed={})
     after = _best(before, term)
     place = len(after.model.terms) - 1

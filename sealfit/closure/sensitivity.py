@@ -113,7 +113,6 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
 
 
 def _channels_in_model(selection: Selection) -> set[str]:
-    """Return the channels of all effects that were added."""
     return {name for added in selection.added for name in added.proposal.term.channels}
 
 

@@ -181,7 +181,6 @@ def reselect_on_all(
 
 
 def _first_rivals(item: AcceptedEffect) -> list[Proposal]:
-    """Return the first rivals of an effect."""
     return [rival for rival, _ in item.rivals[:MOST_RIVALS] if not rival.term.effect.periodic]
 
 
