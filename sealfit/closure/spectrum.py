@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, reduce
-from operator import add
+from functools import lru_cache
 
 import numpy as np
 import pandas as pd
 from scipy.fft import next_fast_len
-from scipy.sparse import csr_array
 from scipy.special import digamma, polygamma
 
 from sealfit.closure.criteria import LEAST_SAMPLES_OF_STROKE, LOBE, NEIGHBOURS, REACHED
@@ -135,12 +133,9 @@ def background(power: np.ndarray) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- spectrum
-# The spectrum of strokes along an axis, summed over units. Amplitudes of single units are not kept.
-#
-# Strokes that share a grid are transformed together, and units are added block by block, so that memory does
-# not grow with the campaign.
+# The spectrum of strokes along an axis, summed over units. Amplitudes of single units are not kept, so that
+# memory does not grow with the campaign.
 
-MOST_NUMBERS = 1 << 19  # Grid points of a block: 4 MB.
 LEAST_STROKES = 3  # Fewest strokes of a spectrum.
 LEAST_FREQUENCIES = 4  # Fewest frequencies of a spectrum.
 
@@ -175,14 +170,32 @@ def spectrum_of(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -
     grid = _Grid.of(Strokes.of(samples, axis))
     if grid is None:
         return None
-    parts = (_sums(grid, chosen) for chosen in _parts(grid.strokes.unit, grid.points))
-    sums = reduce(lambda one, other: list(map(add, one, other)), parts)
-    passes, power, square, total, scaled, amplitude, units = sums
+    sides, unit = np.unique(grid.strokes.direction), grid.strokes.unit
+    shape = min(sides.size, 2), grid.numbers.size
+    passes, power, square = np.zeros((3, grid.numbers.size))
+    total, mean = np.zeros((2, *shape), dtype=complex)
+    scaled, units = np.zeros(shape), np.zeros(shape[0], dtype=int)
+    order = np.argsort(unit, kind="stable")
+    for strokes in np.split(order, np.flatnonzero(np.diff(unit[order])) + 1):
+        wave, reached = _passes(grid, strokes, sides)
+        width = wave.shape[1]
+        passes[:width] += reached.sum(axis=0)
+        own = _power(wave)
+        typical = own.sum(axis=1) / np.maximum(reached.sum(axis=1), 1)
+        power[:width] += (own / np.maximum(typical, 1e-300)[:, None]).sum(axis=0)
+        square[:width] += own.sum(axis=0)
+        for mode, both in enumerate([wave.sum(axis=0), sides @ wave][: shape[0]]):
+            mean[mode, :width] += both
+            units[mode] += both.any()
+            typical = np.median(_power(both)) if width else 0.0
+            if typical > 0:  # units are scaled, so that one noisy file does not dominate
+                total[mode, :width] += both / np.sqrt(typical)
+                scaled[mode, :width] += _power(both) / typical
     frequency, count = grid.numbers / grid.longest, np.maximum(passes, 1)
     taken = np.zeros(frequency.size, dtype=bool)
     for wavelength in known:
         taken |= np.abs(frequency - 1 / wavelength) <= LOBE / grid.longest
-    means = (power / count, np.sqrt(square / count), total, scaled, amplitude / count)
+    means = (power / count, np.sqrt(square / count), total, scaled, mean / count)
     return Spectrum(axis, frequency, taken, passes, *means, units)
 
 
@@ -221,70 +234,30 @@ class _Grid:
         return cls(strokes, points, reached, numbers, longest)
 
 
-def _parts(unit: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Return indices of strokes in blocks of whole units with a limited number of points, sorted by grid."""
-    own, code = np.unique(unit, return_inverse=True)
-    finest = np.zeros(own.size, dtype=int)
-    np.maximum.at(finest, code, points)
-    order = np.lexsort((code, finest[code]))
-    begin = np.flatnonzero(np.r_[True, np.diff(code[order]) != 0])
-    part = np.cumsum(points[order])[begin] // MOST_NUMBERS
-    return np.split(order, begin[1:][np.diff(part) > 0])
+def _passes(grid: _Grid, strokes: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean complex amplitudes of a unit's strokes in each direction, and where any reaches them.
 
-
-def _sums(grid: _Grid, chosen: np.ndarray) -> list[np.ndarray]:
-    """Return the sums of a `Spectrum` over the chosen strokes, which are those of whole units.
-
-    They are those over passes (number, scaled power, power), shape (f,), and those over units in each mode
-    (scaled amplitude, scaled power, amplitude), shape (modes, f), and the number of units, (modes,).
+    Both have the shape (directions, f), up to the highest frequency that one of the strokes reaches.
     """
-    direction, reach = grid.strokes.direction[chosen], grid.reach[chosen]
-    sides, width = np.unique(grid.strokes.direction), int(reach.max())
-    units, unit = np.unique(grid.strokes.unit[chosen], return_inverse=True)
-    passes = unit * sides.size + np.searchsorted(sides, direction)
-    each = np.arange(unit.size)
-    summing = csr_array((np.ones(unit.size), (passes, each)), (units.size * sides.size, unit.size))
-    known = summing @ (np.arange(width) < reach[:, None]).astype(float)
-    wave = summing @ _transformed(grid, chosen) / np.maximum(known, 1)
-    wave, known = (part.reshape(units.size, sides.size, width) for part in (wave, known > 0))
-    power = _power(wave)
-    mean = power.sum(axis=2) / np.maximum(known.sum(axis=2), 1)
-    scaled = power / np.maximum(mean, 1e-300)[:, :, None]
-    over_passes = [own.sum(axis=(0, 1)) for own in (known, scaled, power)]
-    most = np.zeros(units.size, dtype=int)
-    np.maximum.at(most, unit, reach)
-    modes = [wave.sum(axis=1), np.einsum("usf,s->uf", wave, sides)][: min(sides.size, 2)]
-    over_units = [np.stack(own) for own in zip(*(_sums_of_mode(own, most) for own in modes), strict=True)]
-    beyond = grid.numbers.size - width  # frequencies that none of the strokes reach
-    padded = [np.pad(own, [(0, 0)] * (own.ndim - 1) + [(0, beyond)]) for own in (*over_passes, *over_units)]
-    return [*padded, np.array([own.any(axis=1).sum() for own in modes])]
+    wave = np.zeros((sides.size, int(grid.reach[strokes].max())), dtype=complex)
+    count = np.zeros(wave.shape)
+    for k in strokes:
+        side = np.searchsorted(sides, grid.strokes.direction[k])
+        wave[side, : grid.reach[k]] += _amplitudes(grid, k)
+        count[side, : grid.reach[k]] += 1
+    return wave / np.maximum(count, 1), count > 0
 
 
-def _sums_of_mode(own: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the sums over units of one mode from their amplitudes, (units, f), reaching `most`, (units,)."""
-    power = _power(own)
-    square = _medians(power, most)  # units are scaled, so that one noisy file does not dominate
-    kept = square > 0
-    total = (own[kept] / np.sqrt(square[kept])[:, None]).sum(axis=0)
-    return total, (power[kept] / square[kept, None]).sum(axis=0), own.sum(axis=0)
-
-
-def _transformed(grid: _Grid, chosen: np.ndarray) -> np.ndarray:
-    """Return complex amplitudes of strokes with phases from place 0, (strokes, most); 0 beyond reach."""
-    strokes, points, reach = grid.strokes, grid.points[chosen], grid.reach[chosen]
-    found = np.zeros((reach.size, int(reach.max())), dtype=complex)
-    size = np.ceil(strokes.span[chosen] * points / grid.longest).astype(int)
-    for length, count in np.unique(np.column_stack([points, size]), axis=0):
-        same_size = np.flatnonzero((points == length) & (size == count))
-        trend, taper = _on_grid(count)
-        at = grid.longest / length * np.arange(count)  # from the start of a stroke
-        value = np.stack([np.interp(strokes.low[k] + at, *strokes.along(k)) for k in chosen[same_size]])
-        value -= (value @ trend) @ trend.T
-        width = int(reach[same_size].max())
-        wave = np.fft.rfft(value * taper, length)[:, grid.numbers[0] : grid.numbers[0] + width]
-        found[same_size, :width] = np.where(np.arange(width) < reach[same_size, None], wave, 0.0)
-    low = strokes.low[chosen, None]
-    return found * np.exp(-2j * np.pi / grid.longest * low * grid.numbers[: found.shape[1]])
+def _amplitudes(grid: _Grid, k: int) -> np.ndarray:
+    """Return a stroke's complex amplitudes at the frequencies that it reaches, with phases from place 0."""
+    strokes, points, numbers = grid.strokes, grid.points[k], grid.numbers[: grid.reach[k]]
+    size = int(np.ceil(strokes.span[k] * points / grid.longest))
+    trend, taper = _on_grid(size)
+    place = strokes.low[k] + grid.longest / points * np.arange(size)
+    value = np.interp(place, *strokes.along(k))
+    value -= (value @ trend) @ trend.T
+    wave = np.fft.rfft(value * taper, points)[numbers]
+    return wave * np.exp(-2j * np.pi / grid.longest * strokes.low[k] * numbers)
 
 
 @lru_cache(maxsize=512)  # strokes of one speed share their grid
@@ -297,12 +270,3 @@ def _on_grid(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _power(wave: np.ndarray) -> np.ndarray:
     return wave.real**2 + wave.imag**2
-
-
-def _medians(values: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the median of the first `count` values of each row, shape (rows,); 0 if there are none."""
-    found = np.zeros(count.size)
-    for size in np.unique(count[count > 0]):
-        same_size = count == size
-        found[same_size] = np.median(values[same_size, :size], axis=1)
-    return found

@@ -3,7 +3,6 @@ import numpy.testing as npt
 import pandas as pd
 import pytest
 
-from sealfit.closure import spectrum
 from sealfit.closure.spectrum import spectrum_of
 
 LENGTH_MM, A_N, PHASE = 2.5, 0.3, 0.8
@@ -57,16 +56,6 @@ def test_a_wave_keeps_its_amplitude_and_phase_whatever_the_sampling():
     assert found.count[k] == 18
 
 
-def test_sums_do_not_depend_on_how_many_strokes_are_transformed_together(monkeypatch):
-    samples = samples_of(many_strokes())
-    whole = spectrum_of(samples, "displacement_mm")
-    monkeypatch.setattr(spectrum, "MOST_NUMBERS", 1)
-    one_by_one = spectrum_of(samples, "displacement_mm")
-    for name in ("frequency", "count", "power", "amplitude"):
-        npt.assert_allclose(getattr(one_by_one, name), getattr(whole, name), rtol=1e-9, err_msg=name)
-    npt.assert_allclose(one_by_one.total, whole.total, rtol=1e-9, atol=1e-9)
-
-
 def test_frequencies_that_a_stroke_cannot_show_are_none_of_it():
     fine = [(unit, 1.0, 0.3 * unit, 0.05, 400) for unit in range(6)]
     coarse = [(unit, 1.0, 0.3 * unit, 0.5, 40) for unit in range(6, 10)]
@@ -77,8 +66,7 @@ def test_frequencies_that_a_stroke_cannot_show_are_none_of_it():
     npt.assert_array_equal(found.count[found.frequency > 1.1], 6)
 
 
-def test_a_block_of_strokes_that_reach_no_frequency_adds_nothing(monkeypatch):
-    monkeypatch.setattr(spectrum, "MOST_NUMBERS", 1)
+def test_a_unit_whose_strokes_reach_no_frequency_adds_nothing():
     fine = [(unit, 1.0, 0.3 * unit, 0.05, 400) for unit in range(12)]
     coarse = [(unit, 1.0, 0.3 * unit, 18.0, 17) for unit in range(12, 14)]
     short = [(unit, 1.0, 0.3 * unit, 0.05, 400) for unit in range(12, 14)]
