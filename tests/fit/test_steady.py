@@ -419,6 +419,16 @@ def test_a_condition_with_too_few_speeds_leaves_the_others_their_curve(campaign)
     assert found["identified"].tolist() == (found["aging_days"] != 8).tolist()
 
 
+def test_few_speeds_do_not_tell_a_sigma_2_of_zero_from_the_fall_of_a_stribeck_curve(campaign):
+    """Friction rises between the faster two of three speeds only: the line through all falls."""
+    truth = {"mu_s": 0.9, "mu_c": 0.3, "v_s": 2.0, "sigma_2": 0.15}
+    fits = fit_conditions(campaign(speeds=(1, 10, 40), days=(0,), model=truth), Config())
+    row = steady(fits, "sigma_2")
+    assert row.value == 0
+    assert not row.identified
+    assert row.reason.startswith("3 speeds in one direction: the Stribeck curve needs four")
+
+
 @pytest.mark.filterwarnings("error")
 def test_few_speeds_with_forces_along_the_motion_have_no_friction_and_say_so(campaign):
     table = campaign(speeds=(1, 5, 25), days=(0, 1, 4), ways=(1,))
