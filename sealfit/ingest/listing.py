@@ -28,7 +28,8 @@ KNOWN = (
 )  # fmt: skip
 
 
-MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?"}
+# Words, and codes of loggers, for no value.
+MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?", "-999", "-9999", "-99999"}
 PASSED_OVER = {"severity": "info", "action": "file left out"}
 FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
 _BLANK = " \t,;"  # a line of nothing else is none
@@ -136,8 +137,12 @@ def read_table(
     if delimiter != ",":
         columns = {name: mapped(column, with_point) for name, column in columns.items()}
     for name in columns.keys() - {needed}:
-        columns[name] = [None if cell is None or cell.lower() in MISSING else cell for cell in columns[name]]
+        columns[name] = mapped(columns[name], _unless_missing)
     return lines, columns, faults + found
+
+
+def _unless_missing(cell: str) -> str | None:
+    return None if cell.lower().removesuffix(".0") in MISSING else cell
 
 
 def _rows(

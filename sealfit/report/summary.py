@@ -128,7 +128,7 @@ def _of_property(values: pd.DataFrame, fit: pd.DataFrame, laws: pd.DataFrame) ->
 
     The lack of fit of the laws per series is their smallest p-value times their number (Bonferroni).
     """
-    from sealfit.fit.aging.property import means_of
+    from sealfit.fit.aging.property import far_off, means_of
 
     first, means = values.iloc[0], means_of(values)
     own = fit[(fit["rubber"] == first["rubber"]) & fit["parameter"].str.startswith(f"{first['quantity']}:")]
@@ -145,6 +145,7 @@ def _of_property(values: pd.DataFrame, fit: pd.DataFrame, laws: pd.DataFrame) ->
         "mean": float(values["value"].mean()),
         "replicate_sd": means.specimen_sd if means.df else None,
         "batch_sd": means.batch_sd if means.batch_sd == means.batch_sd else None,
+        "far_off": far_off(values).to_dict("records"),
         "lack_of_fit_p": min(1.0, len(p_values) * float(p_values.min())) if len(p_values) else None,
         "law": None
         if best.empty

@@ -14,6 +14,8 @@ NOT_TRACES = {  # why a file in the campaign's folder is none of its traces, by 
 }
 # Level of the test for lack of fit.
 LACKING = 0.05
+# Largest activation energy of aging that is plausible, in kJ/mol; rubbers have 20 to 150.
+MOST_E = 300.0
 
 
 def lines(summary: Mapping) -> list[str]:
@@ -86,6 +88,8 @@ def property_lines(properties: Sequence[Mapping]) -> list[str]:
     for one in properties:
         of = f"rubber {one['rubber']}: " if several else ""
         found.append(line(one["quantity"], of + values_clause(one)))
+        if one["far_off"]:
+            found.append(line("", far_off_clause(one["far_off"])))
         if clause := lack_of_fit_clause(one["lack_of_fit_p"]):
             found.append(line("", f"law per series: it {clause}"))
         if one["law"]:
@@ -104,6 +108,14 @@ def values_clause(one: Mapping) -> str:
     return f"{_count(one['values'], 'value')} in {_count(one['conditions'], 'condition')}; {scatter}"
 
 
+def far_off_clause(values: Sequence[Mapping]) -> str:
+    """Return which values of a property its other values contradict, and what to do."""
+    named = [f"line {v['line']} ({v['value']:.4g} beside {v['others']:.4g})" for v in values[:EXAMPLES]]
+    more = f" and {len(values) - EXAMPLES} more" if len(values) > EXAMPLES else ""
+    said = f"far off the other specimens of the condition: {', '.join(named)}{more}"
+    return f"{said}; correct the cell, or empty it to leave the value out"
+
+
 PER_SERIES = "mu_0 - a ln(1 + t/b)"  # the aging law of a series
 
 
@@ -111,7 +123,8 @@ def property_sentences(one: Mapping) -> str:
     """Return in sentences whether the law per series fits a property, and the law for all series."""
     clause = lack_of_fit_clause(one["lack_of_fit_p"]) or "has no replicates to be judged by"
     law = f" One law for all series: {_property_law(one['law'])}." if one["law"] else ""
-    return f"{one['quantity']}: the law {PER_SERIES}, series by series, {clause}.{law}"
+    far = f" Values {far_off_clause(one['far_off'])}." if one["far_off"] else ""
+    return f"{one['quantity']}: the law {PER_SERIES}, series by series, {clause}.{law}{far}"
 
 
 def _property_law(law: Mapping) -> str:
@@ -119,6 +132,8 @@ def _property_law(law: Mapping) -> str:
     if law["E"]:
         value, low, high = law["E"]
         text += f", E = {value:.3g} kJ/mol [{low:.3g}, {high:.3g}]"
+        if high < 0 or low > MOST_E:
+            text += f" (implausible for rubber, 0 to {MOST_E:g}: look for wrong values)"
     elif "E" in law["drivers"]:
         text += ", E not identified"
     clause = lack_of_fit_clause(law["lack_of_fit_p"])

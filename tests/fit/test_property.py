@@ -10,10 +10,10 @@ import pytest
 
 from sealfit.config import Config, parse_config
 from sealfit.errors import RequestError
-from sealfit.fit.aging.property import fit_properties, laws_of_property, means_of
+from sealfit.fit.aging.property import far_off, fit_properties, laws_of_property, means_of
 from sealfit.ingest.property_table import read_properties
 from sealfit.report.summary import of_properties
-from sealfit.report.summary_lines import property_lines
+from sealfit.report.summary_lines import property_lines, property_sentences
 
 DAYS = (0.0, 1.0, 4.0, 16.0, 32.0, 64.0)
 
@@ -40,6 +40,7 @@ def specimens(value, *, days=DAYS, temperatures=(60.0, 80.0), count=4, sd=0.5, b
                         "temperature_C": t,
                         "aging_days": day,
                         "value": value(t, day) + shift + rng.normal(0, sd),
+                        "line": len(rows) + 2,
                     }
                 )
     return pd.DataFrame(rows)
@@ -126,6 +127,34 @@ def test_a_law_that_does_not_fit_says_so_beside_its_numbers(value, fits):
     said = property_lines([one])[1]
     assert ("does not fit (lack of fit" in said) != fits
     assert ("fits within the scatter of replicates" in said) == fits
+
+
+def test_values_that_the_other_specimens_contradict_are_named_with_what_to_do():
+    table = specimens(law)
+    assert "far off" not in " ".join(property_lines([summary(table, fit_properties(table, Config()))]))
+    table.loc[9, "value"] += 8.0
+    table.loc[30, "value"] *= 1000.0
+    one = summary(table, fit_properties(table, Config()))
+    assert [value["line"] for value in one["far_off"]] == [11, 32]
+    others = table.loc[[8, 10, 11], "value"].mean()
+    assert one["far_off"][0]["others"] == pytest.approx(others)
+    said = property_lines([one])[1]
+    assert f"line 11 ({table.loc[9, 'value']:.4g} beside {others:.4g}), line 32" in said
+    assert "empty it to leave the value out" in said
+    assert "line 32" in property_sentences(one)
+
+
+def test_values_are_rarely_far_off_by_chance_and_rounded_ones_never():
+    named = [len(far_off(specimens(law, count=3, seed=seed))) for seed in range(300)]
+    assert sum(named) <= 2
+    rounded = specimens(law, sd=0.2, count=3).assign(value=lambda t: t["value"].round())
+    assert far_off(rounded).empty
+
+
+def test_an_energy_that_no_rubber_has_is_said_to_be_implausible():
+    table = specimens(lambda t, day: 100.0 - 8.0 * np.log1p(day * (1.0 if t > 70 else 30.0)), sd=0.1)
+    law_line = property_lines([summary(table, fit_properties(table, Config()))])[-1]
+    assert "implausible for rubber, 0 to 300: look for wrong values" in law_line
 
 
 def test_without_replicates_nothing_shows_whether_the_law_fits():

@@ -51,11 +51,11 @@ def test_names_units_and_computed_columns_are_those_of_the_config(tmp_path):
 
 
 def test_a_row_without_a_value_is_left_out_and_said(tmp_path):
-    table, faults = read(tmp_path, PLAIN + "8,70,\n16,70,n/a\n")
+    table, faults = read(tmp_path, PLAIN + "8,70,\n16,70,n/a\n32,70,-9999.0\n")
     assert len(table) == 3
     (fault,) = faults
     assert (fault.line, fault.action, fault.severity) == (5, "row left out", "warning")
-    assert fault.reason == "2 rows have no value and are left out: 5, 6."
+    assert fault.reason == "3 rows have no value and are left out: 5, 6, 7."
 
 
 def test_a_column_that_looks_like_that_of_the_batch_is_named(tmp_path):

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from scipy.optimize import minimize_scalar
-from scipy.special import stdtrit
+from scipy.special import stdtr, stdtrit
 
 from sealfit.config import Config
 from sealfit.fit.aging import SMALLEST, aging_curves, laws_of_series
@@ -32,6 +32,8 @@ MOST_RATIO = 1e6
 ROUNDING = 1e-9
 # Smallest variance. It keeps the weights finite if all values are zero.
 TINY = 1e-300
+# Level of the test for values that are far off, of all values together (Bonferroni).
+FAR_OFF = 0.001
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,34 @@ def _variances(specimens: pd.DataFrame) -> tuple[float, float, tuple[int, int]]:
     found = minimize_scalar(deviance, bounds=(-np.log(MOST_RATIO), np.log(MOST_RATIO)), method="bounded")
     ratio = float(np.exp(found.x)) if found.fun < deviance(-np.log(MOST_RATIO)) else 0.0
     return variance(ratio), ratio * variance(ratio), (df - d.size, d.size)
+
+
+def far_off(specimens: pd.DataFrame) -> pd.DataFrame:
+    """Return the values of one property of one rubber that the others contradict, by line of the table.
+
+    Column `others` is the mean of the other specimens of the condition. Each value is tested by its deletion
+    residual about a free mean for every condition, and the farthest one is left out until none is
+    significant; of two specimens either may be wrong. Scatter is at least that of rounding.
+    """
+    left = specimens[["condition", "line", "value"]].astype({"value": float})
+    step = np.diff(np.unique(left["value"]), append=np.inf).min(initial=np.inf)
+    found = [left[:0].assign(others=0.0)]
+    while True:
+        of = left.groupby("condition")["value"]
+        count, rest = of.transform("size"), left["value"] - of.transform("mean")
+        # Deletion residual, and the square of the residual about the mean that it accounts for.
+        apart = rest * count / (count - 1).clip(lower=1)
+        gain, df = rest * apart, len(left) - of.ngroups - 1
+        if df < 1 or not gain.max() > 0:
+            break
+        variance = np.maximum(((rest**2).sum() - gain) / df, step**2 / 12)
+        t = np.sqrt(gain / variance)
+        if not 2 * len(left) * stdtr(df, -t.max()) < FAR_OFF:
+            break
+        far = t >= t.max() * (1 - ROUNDING)
+        found.append(left[far].assign(others=left["value"] - apart))
+        left = left[~far]
+    return pd.concat(found).sort_values("line", ignore_index=True)[["line", "value", "others"]]
 
 
 def fit_properties(specimens: pd.DataFrame, config: Config) -> dict[str, pd.DataFrame]:
