@@ -18,6 +18,7 @@ from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint import Fitted
+from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.model import Model, Term, evaluate, mean_derivatives
 from sealfit.fit.joint.rows import ALONG, POWER, Rows, sliding_power
 from sealfit.fit.joint.search import bounds_of
@@ -114,8 +115,8 @@ LONGER_STROKES = (
     "length of the rise to 63 %"
 )
 SECOND_SPECIMEN = (
-    "would show the scatter of specimens, which is unknown in this campaign and in no interval: "
-    "a second specimen of a tested condition"
+    "would show the scatter of specimens, which these do not determine, and no interval has it: "
+    "another specimen of a tested condition"
 )
 ROWS = 4  # Rows per stroke at which forces are compared.
 
@@ -153,6 +154,7 @@ def next_runs(
     if rows.has_aging and not selection.after.scatter.estimates("specimen"):
         last = rows.table.iloc[int(np.argmax(rows.days))]
         wanted.append({"why": SECOND_SPECIMEN, "conditions": _settings(last, condition_columns(config))})
+    wanted += _slower_speed(selection.after, config)
     if too_short(rows):
         wanted.append({"why": LONGER_STROKES, "conditions": {}})
     return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
@@ -186,6 +188,20 @@ def _run_to_repeat(one: OutlierFile, config: Config) -> dict:
     }
 
 
+def _slower_speed(fitted: Fitted, config: Config) -> list[dict]:
+    """Return a run at a new speed where several speeds are too few for a Stribeck curve; none elsewhere."""
+    rows, forms = fitted.rows, fitted.model.declared.stribeck
+    few = [name for name, form in forms.items() if form in ("interpolated", "viscous")]
+    if not few:
+        return []
+    series = series_of_curve(rows.conditions, rows.has_aging)[rows.condition]
+    row = rows.table.iloc[int(np.argmax(series == few[0]))].copy()
+    row["speed_mm_s"] = float(np.abs(rows.speed[series == few[0]]).min()) / 2
+    why = "would help to determine the Stribeck curve, which needs four speeds in one direction, two of them "
+    why += "below about 2 v_s: a slower speed at every condition"
+    return [{"why": why, "conditions": _settings(row, (*condition_columns(config), "speed_mm_s"))}]
+
+
 def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
     """Yield the run that would show each alias; one run for aliases of the same channels."""
     taken = tuple(name for name in condition_columns(config) if name != "aging_days")
@@ -194,7 +210,8 @@ def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effe
         by_channel.setdefault(alias.term.channels, []).append(alias)
     for channels, aliases in by_channel.items():
         first = aliases[0]
-        found = largest_difference(first.holding, first.lacking, fitted.rows, channels, config)
+        models = first.holding, first.lacking
+        found = largest_difference(*models, fitted.rows, channels, config, untested=True)
         if found is not None and found[1] > SHOWN * first.size_N:
             names = " or ".join(describe(a.term, fitted.rows) for a in aliases)
             yield {
@@ -218,15 +235,21 @@ def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
 
 
 def largest_difference(
-    chosen: Model, rival: Model, rows: Rows, channels: Sequence[str], config: Config
+    chosen: Model,
+    rival: Model,
+    rows: Rows,
+    channels: Sequence[str],
+    config: Config,
+    *,
+    untested: bool = False,
 ) -> tuple[dict, float] | None:
     """Return the run at which two models differ most, and the difference (force unit); None if there is none.
 
     Every tested run is tried with each combination of low, median and high values of the channels of their
     effects, so that channels which were confounded in the campaign (a condition and the calendar) are
-    separated.
+    separated. With `untested`, a combination whose largest difference is at a tested run is passed over.
     """
-    rows = rows.sparse(ROWS)
+    every, rows = rows, rows.sparse(ROWS)
     channels = tuple(dict.fromkeys(channels))
     best: tuple[dict, float] | None = None
     for changes in ({}, *_combinations(chosen, rows, channels)):
@@ -236,7 +259,9 @@ def largest_difference(
         k = int(np.argmax(apart >= apart.max() * (1 - TIE)))  # the first of those equal but for rounding
         if apart[k] > (0.0 if best is None else best[1] * (1 + TIE)):
             names = (*condition_columns(config), "speed_mm_s", *channels)
-            best = (_settings(moved.table.iloc[k], names), float(apart[k]))
+            settings = _settings(moved.table.iloc[k], names)
+            if not (untested and _is_tested(settings, every)):
+                best = settings, float(apart[k])
     return best
 
 
@@ -287,11 +312,12 @@ def _rows_with(rows: Rows, changes: Mapping[str, object]) -> Rows:
 
 
 def _settings(row: Mapping[str, object], names: Sequence[str]) -> dict[str, object]:
-    """Return the settings of a run that are known, numbers to four digits."""
+    """Return the settings of a run that are known, numbers to four digits, speeds as magnitudes."""
     found = {}
     for name in dict.fromkeys(names):
         value = row.get(name)
         value = value.item() if isinstance(value, np.generic) else value
         if not pd.isna(value):
+            value = abs(value) if name == "speed_mm_s" else value
             found[name] = float(f"{value:.4g}") if isinstance(value, float) else value
     return found

@@ -88,6 +88,14 @@ def test_repeats_are_asked_where_the_models_differ_most_at_a_tested_run(rival, b
     assert run["why"].startswith(begins)
 
 
+def test_no_run_that_was_made_is_said_to_show_what_these_runs_cannot():
+    fitted = fit_declared(make_rows(make_bins(bins=4, repeats=3), has_aging=True))
+    models = [bound(fitted, "linear", "repeat", A=size).fitted.model for size in (0.01, 0.02)]
+    found, _ = largest_difference(*models, fitted.rows, ("repeat",), Config())
+    assert _is_tested(found, fitted.rows)
+    assert largest_difference(*models, fitted.rows, ("repeat",), Config(), untested=True) is None
+
+
 def test_an_offset_is_friction_where_all_runs_go_one_way():
     fitted = fit_declared(make_rows(make_bins(bins=4, repeats=2, noise_N=0.05), has_aging=True))
     alias = next(
@@ -96,8 +104,19 @@ def test_an_offset_is_friction_where_all_runs_go_one_way():
     force = 49.03 * 0.6
     assert alias.size_N == pytest.approx(0.01 * force, rel=0.3)
     where, apart = largest_difference(alias.holding, alias.lacking, fitted.rows, ("direction",), Config())
-    assert where["speed_mm_s"] < 0  # the other way, where the offset helps the friction it stood for
+    assert where["direction"] < 0  # the other way, where the offset helps the friction it stood for
+    assert where["speed_mm_s"] > 0  # runs.csv has magnitudes
     assert apart == pytest.approx(2 * alias.size_N, rel=0.05)
+
+
+def test_a_slower_speed_is_wanted_where_speeds_are_too_few():
+    bins = make_bins(speeds=(2.0, 10.0, 40.0), directions=(1, -1), bins=4, repeats=2)
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    selection = SimpleNamespace(added=(), inconclusive=None, after=fitted)
+    wanted = next_runs(selection, Config(), EFFECTS)
+    (slower,) = (run["conditions"] for run in wanted if "four speeds in one direction" in run["why"])
+    assert slower["speed_mm_s"] == 1.0
+    assert all(run["conditions"].get("speed_mm_s", 1.0) > 0 for run in wanted)
 
 
 def test_an_offset_is_no_alias_where_runs_go_both_ways():
