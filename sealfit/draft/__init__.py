@@ -11,7 +11,7 @@ from sealfit.draft import run_keys, trace_keys
 from sealfit.draft.columns import columns_of, find_roles
 from sealfit.draft.config_text import Doubt, Guess, Notes, config_text
 from sealfit.draft.file_names import read_names
-from sealfit.draft.files_found import find_table, look, read_tables
+from sealfit.draft.files_found import VALUES, find_table, look, read_tables
 from sealfit.errors import RequestError
 
 # Guesses that the summary repeats: the others are in the draft.
@@ -42,7 +42,7 @@ def draft(folder: Path) -> Draft:
     if roles.time is None and roles.force is None:
         tables = f"{len(found.traces)} files hold tables of numbers, such as {found.traces[0]}"
         fix = "Give the folder that holds traces: time, displacement and force in columns."
-        raise RequestError(f"{tables}, but no time and no force.", file=folder, fix=fix)
+        raise RequestError(f"{tables}, but no time and no force.", file=folder, fix=f"{fix} {VALUES}")
     units = trace_keys.settled_units(roles, notes)
     speeds = trace_keys.motion_keys(roles, units, list(tables), notes)
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)

@@ -215,6 +215,9 @@ def _holds(one: Dialect, usual: Dialect) -> bool:
     return by_name and one.delimiter == usual.delimiter and set(usual.names) <= set(one.names)
 
 
+VALUES = "A table of values over aging days is fitted by: sealfit fit-aging --values TABLE --out OUT."
+
+
 def _no_traces(
     folder: Path, files: Sequence[str], formats: Counter, unreadable: dict[str, str]
 ) -> RequestError:
@@ -229,7 +232,7 @@ def _no_traces(
         return RequestError(f"holds {what} and no trace file that can be read.", file=folder, fix=fix)
     shown = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
     reason = f"none of {len(files)} files holds a table of numbers with two columns or more ({shown})."
-    return RequestError(reason, file=folder, fix=fix)
+    return RequestError(reason, file=folder, fix=f"{fix} {VALUES}")
 
 
 # ---------------------------------------------------------------- numbers

@@ -32,6 +32,7 @@ KNOWN = (
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?", "-999", "-9999", "-99999"}
 PASSED_OVER = {"severity": "info", "action": "file left out"}
 FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
+TITLE_LINES = 30  # lines in which the header of a table is looked for
 _BLANK = " \t,;"  # a line of nothing else is none
 
 # Ending of the files that LabVIEW writes beside its traces.
@@ -121,14 +122,13 @@ def read_table(
         raise stopped(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
     whole = text.decode().split("\n")
     numbered = [(number, line) for number, line in enumerate(whole, start=1) if line.strip(_BLANK)]
-    head = numbered[0][1] if numbered else ""
-    delimiter = delimiter or max(",;\t", key=head.count)
-    header = [cell.strip() for cell in split_line(head, delimiter)] if head else []
-    names, faults = _our_names(header, table, config)
+    place, delimiter, header = _header(numbered[:TITLE_LINES], delimiter, config)
+    names, faults = _our_names(header, {"file": table, "line": place}, config)
     if needed and needed not in names:
         fix = suggestion(needed, header)
-        raise stopped("missing_column", NO_COLUMN, fix, file=table, line=1, column=needed)
-    lines, columns, found = _rows(numbered[1:], names, delimiter, table, needed)
+        raise stopped("missing_column", NO_COLUMN, fix, file=table, line=place, column=needed)
+    below = [line for line in numbered if line[0] > place]
+    lines, columns, found = _rows(below, names, delimiter, table, needed)
 
     def with_point(cell: str) -> str:
         return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
@@ -139,6 +139,24 @@ def read_table(
     for name in columns.keys() - {needed}:
         columns[name] = mapped(columns[name], _unless_missing)
     return lines, columns, faults + found
+
+
+def _header(numbered: list[tuple[int, str]], delimiter: str, config: Config) -> tuple[int, str, list[str]]:
+    """Return number, delimiter and cells of the first line with the name of a known column, or of the first.
+
+    Lines above it are titles. The delimiter is found out where it is "".
+    """
+    theirs = (str(own.name) for own in config.files.runs_columns.values())
+    known = {"file", *KNOWN, *config.condition, *theirs}
+    found = []
+    for number, line in numbered:
+        own = delimiter or max(",;\t", key=line.count)
+        found.append((number, own, _cells(line, own)))
+    return next((one for one in found if known & set(one[-1])), (found or [(1, ",", [])])[0])
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in split_line(line, delimiter)]
 
 
 def _unless_missing(cell: str) -> str | None:
@@ -152,7 +170,7 @@ def _rows(
     lines, rows, faults = [], [], []
     named = max((i for i, name in enumerate(names, start=1) if name), default=0)
     for number, line in numbered:
-        cells = [cell.strip() for cell in split_line(line, delimiter)]
+        cells = _cells(line, delimiter)
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         place = {"file": table, "line": number}
         # A cell that begins with a quotation mark which is not closed holds the end of the line.
@@ -175,14 +193,16 @@ def _rows(
     return lines, {name: [row.get(name) for row in rows] for name in names if name}, faults
 
 
-def _our_names(header: list[str], table: str, config: Config) -> tuple[list[str], list[Fault]]:
+def _our_names(
+    header: list[str], place: Mapping[str, str | int], config: Config
+) -> tuple[list[str], list[Fault]]:
     """Return our name of every column of a table, and faults: missing, doubled, or misspelt columns."""
     ours = {str(theirs.name): name for name, theirs in config.files.runs_columns.items()}
     names = [ours.get(name, name) for name in header]
     faults = []
 
     def add(check: str, name: str, reason: str, fix: str, **done) -> None:
-        faults.append(Fault(check, reason, file=table, line=1, column=name, fix=fix, **done))
+        faults.append(Fault(check, reason, column=name, fix=fix, **place, **done))
 
     for name in sorted({name for name in names if name and names.count(name) > 1}):
         add("duplicate_column", name, f"stands {names.count(name)} times in the header.", "Rename one.")
@@ -190,7 +210,7 @@ def _our_names(header: list[str], table: str, config: Config) -> tuple[list[str]
         if theirs not in header:
             reason = "there is no such column, but files.runs_columns names it."
             add("missing_column", theirs, reason, suggestion(theirs, header))
-    faults += misspelt(names, names, config, {"file": table, "line": 1})
+    faults += misspelt(names, names, config, place)
     return names, faults
 
 

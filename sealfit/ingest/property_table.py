@@ -67,7 +67,7 @@ def read_properties(
     faults += found
     if DAYS not in columns:
         fix = suggestion(DAYS, [*columns, *words]) + " Name it in files.runs_columns of a --config."
-        raise stopped("missing_column", NO_COLUMN, fix.strip(), file=table, line=1, column=DAYS)
+        raise stopped("missing_column", NO_COLUMN, fix.strip(), file=table, column=DAYS)
     config = _of_table(config, columns)
     try:
         chosen = _properties(table, columns, config, properties)
@@ -75,10 +75,10 @@ def read_properties(
         raise CampaignError([*(f for f in faults if f.severity != "info"), *error.faults]) from error
     if batch != BATCH and batch not in words:
         fix = suggestion(batch, [*columns, *words])
-        raise stopped("missing_column", NO_COLUMN, fix, file=table, line=1, column=batch)
+        raise stopped("missing_column", NO_COLUMN, fix, file=table, column=batch)
     if batch not in words and (close := nearest(batch, list(columns))):
         reason, fix = f"is not used; it looks like '{batch}'.", f"Write '{batch}' if that is meant."
-        faults.append(Fault("column_name", reason, file=table, line=1, column=close, fix=fix, **KEPT))
+        faults.append(Fault("column_name", reason, file=table, column=close, fix=fix, **KEPT))
     faults += out_of_range(entries, columns) + _lacking(entries, columns, config)
     if stopping := [f for f in faults if f.severity == "error" and f.action == "stopped"]:
         raise CampaignError(stopping)
@@ -108,20 +108,22 @@ def _properties(table: str, columns: Columns, config: Config, named: Sequence[st
         and known(cells).any()
         and not where(cells, lambda value: isinstance(value, str)).any()
     ]
+    # Names in one option, between commas, are several, unless a column is called so.
+    named = [own for name in named for own in ([name] if name in columns else name.split(","))]
     for name in named:
         if name not in numbers:
             what = "is no column of numbers." if name in columns else NO_COLUMN
-            raise stopped("missing_column", what, suggestion(name, numbers), file=table, line=1, column=name)
+            raise stopped("missing_column", what, suggestion(name, numbers), file=table, column=name)
     if named:
         return list(dict.fromkeys(named))
     if len(numbers) == 1:
         return numbers
     if not numbers:
         fix = "Add one of numbers, or correct the cells that are none."
-        raise stopped("missing_column", "there is no column of a property.", fix, file=table, line=1)
+        raise stopped("missing_column", "there is no column of a property.", fix, file=table)
     reason = f"which column is the property is not said: {', '.join(numbers)}."
-    fix = f"Name it, or several: --property {numbers[0]}."
-    raise stopped("missing_column", reason, fix, file=table, line=1)
+    fix = "Name it, or several with commas: --property COLUMN."
+    raise stopped("missing_column", reason, fix, file=table)
 
 
 def _lacking(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:

@@ -9,6 +9,7 @@ import io
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 from datetime import timedelta
+from itertools import takewhile
 from pathlib import Path
 
 from sealfit.config import Config
@@ -42,9 +43,8 @@ def read_sheet(
     with _book(raw, formulas=True, by_row=merged) as book:
         title = _title(book, sheet)
         lines, formulas = _lines(book[title], decimal, head)
-        if not merged and (ranges := sorted(book[title].merged_cells.ranges, key=lambda one: one.min_row)):
-            fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
-            raise bad_file("merged_cells", f"the cells {ranges[0]} are merged.", fix, line=ranges[0].min_row)
+        if not merged:
+            _refuse_merged(book[title])
     if formulas:
         with _book(raw, formulas=False) as book:
             lines, _ = _lines(book[title], decimal, head, formulas)
@@ -158,6 +158,16 @@ def _cell(value: object, decimal: str) -> str:
     if isinstance(value, int | float | timedelta):
         return text.replace(".", decimal)
     return '"' + text.replace('"', '""') + '"' if '"' in text else text
+
+
+def _refuse_merged(sheet) -> None:
+    """Raise `BadFile` if cells are merged, other than those of title lines at the top."""
+    rows = sheet.iter_rows(values_only=True)
+    titles = sum(1 for _ in takewhile(lambda row: sum(cell is not None for cell in row) < 2, rows))
+    below = [cells for cells in sheet.merged_cells.ranges if cells.max_row > titles]
+    if merged := sorted(below, key=lambda cells: cells.min_row):
+        fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
+        raise bad_file("merged_cells", f"the cells {merged[0]} are merged.", fix, line=merged[0].min_row)
 
 
 # ---------------------------------------------------------------- tables of runs

@@ -50,6 +50,29 @@ def test_names_units_and_computed_columns_are_those_of_the_config(tmp_path):
     assert table["temperature_C"].iloc[1] == 70.0
 
 
+def test_title_lines_above_the_header_are_passed_over(tmp_path):
+    text = "Report 2009;;\n;;\naging_days;temperature_C;hardness\n0;RT;60,5\n2;70;58\n4;70;soft\n"
+    with pytest.raises(CampaignError, match=r":6: column 'hardness': 'soft'"):
+        read(tmp_path, text)
+    table, _ = read(tmp_path, text.replace("soft", "57"))
+    assert table["value"].tolist() == [60.5, 58.0, 57.0]
+    assert table["line"].tolist() == [4, 5, 6]
+
+
+def test_a_merged_title_of_a_workbook_is_passed_over(tmp_path):
+    book = pytest.importorskip("openpyxl").Workbook()
+    for row in (["Report 2009"], ["aging_days", "hardness"], [0, 60], [2, 58]):
+        book.active.append(row)
+    book.active.merge_cells("A1:C1")
+    book.save(tmp_path / "values.xlsx")
+    table, _ = read_properties(tmp_path / "values.xlsx", Config())
+    assert table["value"].tolist() == [60.0, 58.0]
+    book.active.merge_cells("A3:A4")
+    book.save(tmp_path / "values.xlsx")
+    with pytest.raises(CampaignError, match="A3:A4 are merged"):
+        read_properties(tmp_path / "values.xlsx", Config())
+
+
 def test_a_row_without_a_value_is_left_out_and_said(tmp_path):
     table, faults = read(tmp_path, PLAIN + "8,70,\n16,70,n/a\n32,70,-9999.0\n")
     assert len(table) == 3
@@ -67,9 +90,9 @@ def test_a_column_that_looks_like_that_of_the_batch_is_named(tmp_path):
 
 def test_several_properties_are_named(tmp_path):
     text = "aging_days,hardness,strength\n0,60,20\n2,58,18\n"
-    with pytest.raises(CampaignError, match=r"hardness, strength.*--property hardness"):
+    with pytest.raises(CampaignError, match=r"hardness, strength.*--property COLUMN"):
         read(tmp_path, text)
-    table, _ = read(tmp_path, text, properties=("strength", "hardness"))
+    table, _ = read(tmp_path, text, properties=("strength,hardness",))
     assert sorted(set(table["quantity"])) == ["hardness", "strength"]
 
 
@@ -78,7 +101,7 @@ def test_several_properties_are_named(tmp_path):
     [
         ("", {}, "is empty"),
         ("aging_days,hardness\n", {}, "no rows"),
-        ("days,hardness\n1,2\n", {}, r"values\.csv:1: column 'aging_days'.*files\.runs_columns"),
+        ("days,hardness\n1,2\n", {}, r"values\.csv: column 'aging_days'.*files\.runs_columns"),
         ("aging_days,temperature_C,hardness\n0,23,60\n2,,58\n", {}, r":3: column 'temperature_C'.*empty"),
         ("aging_days,hardness\n0,60\nsoon,58\n", {}, r":3: column 'aging_days'.*'soon'.*not a number"),
         ("aging_days,hardness\n0,60\n-2,58\n", {}, r":3: column 'aging_days'"),
