@@ -322,7 +322,8 @@ def cell_faults(
         value = cell.strip()
         check, reason, fix = "not_a_number", "is not a number.", ""
         if not value:
-            check, reason, fix = "empty_cell", "the cell is empty.", "Fill it or delete the line."
+            check, reason = "empty_cell", "holds no value: empty, n/a or the like."
+            fix = "Fill it or delete the line."
         elif as_number(value, decimal) is not None:
             check, reason, fix = "not_finite", "is not a measured number.", "Delete the line."
         elif remark := _remark(cell):

@@ -188,7 +188,10 @@ def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Col
 def empty_cells(entries: list[Entry], name: str, rows: np.ndarray) -> list[Fault]:
     """Return the faults of files, by their numbers, that lack a value in a condition column."""
     about = {"value": "", "fix": "Fill it: it is one of the config's condition columns."}
-    return [entries[i].fault("empty_cell", "the cell is empty.", name, **about) for i in rows.tolist()]
+    return [
+        entries[i].fault("empty_cell", "holds no value: empty, n/a or the like.", name, **about)
+        for i in rows.tolist()
+    ]
 
 
 ABSOLUTE_ZERO_C = -273.15

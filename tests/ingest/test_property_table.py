@@ -102,7 +102,11 @@ def test_several_properties_are_named(tmp_path):
         ("", {}, "is empty"),
         ("aging_days,hardness\n", {}, "no rows"),
         ("days,hardness\n1,2\n", {}, r"values\.csv: column 'aging_days'.*files\.runs_columns"),
-        ("aging_days,temperature_C,hardness\n0,23,60\n2,,58\n", {}, r":3: column 'temperature_C'.*empty"),
+        (
+            "aging_days,temperature_C,hardness\n0,23,60\n2,n/a,58\n",
+            {},
+            r":3: column 'temperature_C'.*holds no value: .*n/a",
+        ),
         ("aging_days,hardness\n0,60\nsoon,58\n", {}, r":3: column 'aging_days'.*'soon'.*not a number"),
         ("aging_days,hardness\n0,60\n-2,58\n", {}, r":3: column 'aging_days'"),
         ("aging_days,hardness\n0,60\n0,58\n", {}, "no value of an aged specimen"),

@@ -59,6 +59,14 @@ def test_a_bad_cell_costs_its_row_and_is_named_with_line_value_and_fix(
     npt.assert_array_equal(np.delete(np.arange(2, 102), 10), trace.line)
 
 
+@pytest.mark.parametrize("cell", ["", "n/a", "NULL"])
+def test_a_word_for_no_value_in_a_channel_is_not_called_an_empty_cell(tmp_path, cell):
+    content = csv_of([f"{row},{cell if k == 10 else 20.5}" for k, row in enumerate(ROWS)])
+    (fault,) = read(tmp_path, content.replace(HEADER, f"{HEADER},oil_C")).faults
+    assert (fault.line, fault.column) == (12, "oil_C")
+    assert "holds no value: empty, n/a or the like" in fault.reason
+
+
 def test_a_rate_gives_the_time_of_files_without_one(tmp_path):
     content = csv_of([row.partition(",")[2] for row in changed(10, "0.9,x,1.0").splitlines()[1:]])
     content = content.replace(HEADER, "displacement_mm,force_N")
