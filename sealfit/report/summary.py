@@ -332,5 +332,6 @@ def untold_clause(closure: Mapping, units: Units) -> str:
             size, more = "no effect is detectable", f"; at least {files} files are needed"
         else:
             size, more = f"detection limit {smallest:.2g} % of the force", f"; 1 % needs about {files} files"
-        texts.append(f"{units.label(entry['variable'])} ({size}{more if files else ''})")
+        variable = f"{units.label(entry['variable'])} {level_words(entry['level'])}"
+        texts.append(f"{variable} ({size}{more if files else ''})")
     return ", ".join(texts)

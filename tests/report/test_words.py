@@ -152,13 +152,20 @@ def test_nothing_missing_states_the_sensitivity():
 
 
 def test_cannot_tell_says_of_what_and_what_would_do():
-    unseen = {**SEEN, "variable": "oil temp", "smallest_N": None, "smallest_pct": None, "files_needed": 12}
+    unseen = {
+        **SEEN,
+        "variable": "oil temp",
+        "level": "run",
+        "smallest_N": None,
+        "smallest_pct": None,
+        "files_needed": 12,
+    }
     closure = {**document("cannot_tell", effects=()), "sensitivity": [SEEN, unseen]}
     text = said(closure, empty("shapes"))
     assert text.startswith(
-        "These files do not decide whether an effect is missing: displacement (mm) "
+        "These files do not decide whether an effect is missing: displacement (mm) along strokes "
         "(detection limit 1.2 % of the force; 1 % needs about 40 files), "
-        "oil temp (no effect is detectable; at least 12 files are needed). The rms error"
+        "oil temp between runs (no effect is detectable; at least 12 files are needed). The rms error"
     )
 
 
@@ -250,7 +257,7 @@ def test_what_is_not_decided_has_names_in_words():
     assert text.startswith(
         "Not decided by these files: linear in time (s), factor on <i>μ</i><sub>s</sub> (p"
     )
-    assert "dust mg (no effect" in text
+    assert "dust mg along strokes (no effect" in text
     untold = verdict(closure | {"verdict": "cannot_tell"}, empty("shapes"), Config())
     assert "is missing: linear in time (s), factor on <i>μ</i><sub>s</sub> (p" in untold
 
