@@ -128,8 +128,8 @@ EXPRESSIONS = """
 
 `compute` and `keep` know `+ - * / **`, parentheses, `pi`, `abs`, `sqrt`, `exp`, `log`, `sin`, `cos`, `tanh`,
 `sign`, `min`, `max`, `where`, comparisons with `and`, `or`, `not` (1 or 0 in a number), columns, parts of the
-file name and constants. A text is compared with `==` or `!=`: `keep = "status == 'ok'"`. They are not run as
-Python.
+file name and constants. A text is compared with `==` or `!=`: `keep = "status == 'ok'"`. `days(tested_on)` is
+the number of the day of a date (ISO 8601 or 17.04.2025). They are not run as Python.
 """
 
 TABLES = """

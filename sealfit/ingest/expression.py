@@ -8,9 +8,12 @@ with.
 from __future__ import annotations
 
 import ast
+import math
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime
 from functools import lru_cache, reduce
 
 import numpy as np
@@ -48,8 +51,9 @@ _OPERATORS = {
 }
 _FIX = (
     "Allowed are numbers, column names, pi, + - * / **, parentheses, comparisons, and, or, not, "
-    f"a category as in batch == 'B', and {', '.join(FUNCTIONS)}."
+    f"a category as in batch == 'B', days of a column of dates, and {', '.join(FUNCTIONS)}."
 )
+GERMAN = "%d.%m.%Y"
 Values = Mapping[str, object]
 Computed = Callable[[Values], np.ndarray]
 
@@ -146,6 +150,9 @@ class _Checked:
             case ast.Name(id=name) if not name.startswith("__"):
                 self.names.add(name)
                 return lambda values: _as_number(values[name], name, self.text)
+            case ast.Call(func=ast.Name(id="days"), args=[ast.Name(id=name)], keywords=[]):
+                self.names.add(name)
+                return lambda values: np.vectorize(_day, otypes=[float])(values[name])
             case ast.Compare(
                 left=ast.Name(id=name),
                 ops=[ast.Eq() | ast.NotEq() as op],
@@ -199,9 +206,24 @@ class _Checked:
 def _as_number(value: object, name: str, text: str) -> np.ndarray:
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
-        fix = f"Map it to numbers first, or compare it: {name} == 'B'."
+        fix = f"Map it to numbers first, or compare it: {name} == 'B'. The day of a date is days({name})."
         raise ConfigError(f"in {text!r}: '{name}' is text, not a number.", column=name, fix=fix)
     return array.astype(float, copy=False)
+
+
+def _day(date: object) -> float:
+    """Return the number of the day of a date, ISO 8601 or as 17.04.2025, without its time; NaN for others.
+
+    Examples
+    --------
+    >>> _day("2025-04-17 08:07") - _day("10.04.2025")
+    7.0
+    """
+    with suppress(ValueError):
+        return float(datetime.fromisoformat(str(date)).toordinal())
+    with suppress(ValueError):
+        return float(datetime.strptime(str(date).partition(" ")[0], GERMAN).toordinal())
+    return math.nan
 
 
 def _compared(ops: Sequence[ast.cmpop], sides: Sequence[np.ndarray]) -> np.ndarray:

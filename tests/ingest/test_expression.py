@@ -43,6 +43,14 @@ def test_pressure_force_of_the_piston_by_hand():
     npt.assert_allclose(force, [8.12524, 3.12524], atol=1e-4)
 
 
+def test_dates_become_days_without_their_time():
+    put_in = np.array(["2025-04-10", "10.04.2025", "2025-04-17T06:00:00", "soon"])
+    days = value("days(tested) - days(put_in)", tested="17.04.2025 08:07:00", put_in=put_in)
+    npt.assert_array_equal(days, [7.0, 7.0, 0.0, np.nan])
+    with pytest.raises(ConfigError, match="days of a column of dates"):
+        value("days(tested - 1)", tested="17.04.2025")
+
+
 def test_row_filter_compares_joins_and_chains():
     load = np.array([4.0, 5.0, 6.0])
     npt.assert_array_equal(value("load_N > 4.9", True, load_N=load), [False, True, True])

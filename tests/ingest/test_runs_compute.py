@@ -32,6 +32,14 @@ def test_a_constant_stands_where_the_log_has_no_value(tmp_path):
     assert column(folder, "mass_kg", rig) == [5.0, 5.0, 6.0]
 
 
+def test_days_are_computed_from_two_dates(tmp_path):
+    log = "file,run_id,tested_on,put_in_on\na.csv,r1,2025-04-17,2025-04-10\nb.csv,r2,2025-05-08,10.04.2025"
+    rig = "[runs]\ncompute = {aging_days = 'days(tested_on) - days(put_in_on)'}\n"
+    assert column(campaign(tmp_path, log), "aging_days", rig) == [7.0, 28.0]
+    (fault,) = faults(tmp_path, DAYS + rig.replace("days(put_in_on)", "put_in_on"))
+    assert "days(put_in_on)" in fault.fix
+
+
 def test_a_misspelt_name_of_the_config_is_said(tmp_path):
     text = DAYS + "[runs]\nconstants = {loads_N = 49.03}\n"
     _, (fault,) = list_traces(campaign(tmp_path, LOG), config(text))
