@@ -26,7 +26,7 @@ class Trace:
     `columns` are float64 arrays, or object arrays of text (None where empty), by our names; `line` is the
     1-based line in the file of every row; `bad` marks rows that are still to be left out; `rows_read` is the
     number of data rows in the file. `faults` are what was found; `channels` is what is known of the whole
-    file.
+    file; `number` is that of every row before the config's `keep` filtered them, None before that.
     """
 
     columns: Mapping[str, np.ndarray]
@@ -35,11 +35,13 @@ class Trace:
     rows_read: int
     faults: tuple[Fault, ...] = ()
     channels: Mapping[str, float | str] = field(default_factory=dict)
+    number: np.ndarray | None = None
 
     def where(self, keep: np.ndarray) -> Trace:
         """Return the trace with some of its rows."""
         columns = {name: values[keep] for name, values in self.columns.items()}
-        return replace(self, columns=columns, line=self.line[keep], bad=self.bad[keep])
+        number = None if self.number is None else self.number[keep]
+        return replace(self, columns=columns, line=self.line[keep], bad=self.bad[keep], number=number)
 
     def having(self, columns: Mapping[str, np.ndarray]) -> Trace:
         """Return the trace with further columns."""

@@ -54,12 +54,18 @@ MEASURE_AGAIN = "Check the cable and the logger, and measure again."
 
 
 def stroke_faults(
-    stroke: Stroke, time_s: np.ndarray, force_N: np.ndarray, line: np.ndarray, settings: Quality
+    stroke: Stroke,
+    time_s: np.ndarray,
+    force_N: np.ndarray,
+    line: np.ndarray,
+    settings: Quality,
+    number: np.ndarray | None = None,
 ) -> list[Fault]:
     """Return what is wrong with one stroke by itself: too short, gappy, saturated, stuck.
 
     Findings of this module do not say which file and stroke they belong to; whoever asks adds that. The
-    arrays, shape (n,), are the whole trace, and the line in the file of each of its rows.
+    arrays, shape (n,), are the whole trace, the line in the file of each of its rows, and the number of each
+    before the config's `keep`: rows that it filters out are no gap.
     """
     if stroke.short is not None:
         reason, samples = stroke.short, float(len(stroke.rows))
@@ -75,7 +81,8 @@ def stroke_faults(
         speed = float(stroke.speed_mm_s)
         found = [Fault("no_plateau", reason, column="speed_mm_s", value=speed, fix=fix, **KEPT)]
     whole, steady = slice(stroke.start, stroke.stop), stroke.rows
-    found += _gaps(time_s[whole], line[whole], settings)
+    number = np.arange(len(line)) if number is None else number
+    found += _gaps(time_s[whole], line[whole], number[whole], settings)
     force_N, line = force_N[steady], line[steady]
     return found + (_saturated(force_N, line, settings) or _stuck(force_N, line, settings))
 
@@ -94,13 +101,14 @@ def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
     return [Fault("never_steady", reason, column="force_N", value=abs(left_N), fix=fix, **NOTED)]
 
 
-def _gaps(time_s: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fault]:
-    steps = np.diff(time_s)
+def _gaps(time_s: np.ndarray, line: np.ndarray, number: np.ndarray, settings: Quality) -> list[Fault]:
+    rows = np.diff(number)
+    steps = np.diff(time_s) / rows
     usual = float(np.median(steps))
     gaps = steps > settings.max_gap_factor * usual
     if not gaps.any():
         return []
-    hidden = float((steps[gaps] - usual).sum() / (time_s[-1] - time_s[0]))
+    hidden = float(((steps - usual) * rows)[gaps].sum() / (time_s[-1] - time_s[0]))
     widest, count = int(np.argmax(steps)), int(gaps.sum())
     reason = f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; "
     reason += f"the longest, after this line, is {steps[widest]:.3g} where {usual:.3g} is usual."

@@ -158,6 +158,7 @@ def _trace(rows: Trace, layout: Layout, ref: TraceRef, config: Config) -> Trace:
     counted = len(rows.line)
     rows = _derive(rows.where(~rows.bad), known, settings, layout)
     _refuse_too_many(counted, rows, config)
+    rows = replace(rows, number=np.arange(len(rows.line)))
     if settings.keep is not None:
         keep = _evaluate(parse(settings.keep, condition=True), {**known, **rows.columns})
         rows = rows.where(np.broadcast_to(keep, rows.line.shape))

@@ -4,6 +4,8 @@ import pytest
 
 from sealfit.config import Config, Quality, Strokes, parse_config
 from sealfit.errors import Fault
+from sealfit.ingest.averages import read_strokes
+from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.quality import (
     improbable_loads,
     incomplete_columns,
@@ -119,6 +121,17 @@ def test_gaps_are_told_and_too_much_hidden_time_leaves_the_stroke_out():
     keep[500:700] = False
     (fault,) = checks(time[keep], x[keep], force[keep])
     assert (fault.severity, fault.action) == ("error", "stroke left out")
+
+
+def test_rows_that_the_config_filters_out_are_no_gap(tmp_path):
+    time, x, force = trace()
+    valve = np.r_[np.ones(400), np.zeros(300), np.ones(300)]
+    table = pd.DataFrame({"time_s": time, "displacement_mm": x, "force_N": force, "valve": valve})
+    rig = parse_config('[trace]\nkeep = "valve == 1"\n', "rig.toml")
+    for lost, expected in ((0, []), (60, [("gaps", "kept")])):
+        table.drop(index=range(100, 100 + lost)).to_csv(tmp_path / "t.csv", index=False)
+        found = read_strokes(TraceRef("t.csv", {}), tmp_path, rig).faults
+        assert [(fault.check, fault.action) for fault in found] == expected
 
 
 def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
