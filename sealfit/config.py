@@ -189,8 +189,10 @@ class TraceFormat(Strict):
     """Column = expression over columns, parts of the file name and constants."""
     constants: dict[str, float] = Field(default_factory=dict)
     """Numbers that expressions may name."""
-    drop_columns: list[str] = Field(default_factory=list)
-    """Columns that expressions read and that are no channels."""
+    drop_columns: list[str] | None = None
+    """Columns that expressions read and that are no channels. Without this list, the loop does not search
+    those that `force_N` is computed from.
+    """
     integrate_displacement: str | None = None
     """Speed column whose integral over time is the displacement."""
     integrate_per: Literal["s", "min"] = "s"

@@ -18,6 +18,7 @@ from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.declared import SAME_SPEED
 from sealfit.fit.joint.rows import ALONG, LEVELS, POWER, Rows, one_load, open_columns
+from sealfit.ingest.columns import force_inputs
 from sealfit.ingest.quality import STILL_RISING
 from sealfit.tables import CALENDAR
 
@@ -49,7 +50,8 @@ class Channel:
 def channels_of(rows: Rows, config: Config) -> list[Channel]:
     """Return the channels that the loop searches by a campaign's config: see `find_channels`."""
     on_rig = config.position_origin == "rig"
-    return find_channels(rows, config.loop.ignore_channels, conditions=config.condition, rig_position=on_rig)
+    ignored = {*config.loop.ignore_channels, *force_inputs(config)}
+    return find_channels(rows, ignored, conditions=config.condition, rig_position=on_rig)
 
 
 def searched(channels: Iterable[Channel], rows: Rows) -> list[Channel]:

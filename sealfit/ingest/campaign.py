@@ -15,9 +15,10 @@ import pyarrow as pa
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
+from sealfit.ingest.columns import force_inputs
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, Part, plan_parts, shaped
-from sealfit.ingest.quality import improbable_loads, incomplete_columns, quality_table
+from sealfit.ingest.quality import computed_force, improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import (
     constant_strokes,
     copied_strokes,
@@ -169,9 +170,10 @@ def ingest_campaign(
         raise CampaignError(turned)
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
-    seen = steady.drop(columns=config.loop.ignore_channels, errors="ignore")
+    inputs = force_inputs(config)
+    seen = steady.drop(columns=[*config.loop.ignore_channels, *inputs], errors="ignore")
     faults += incomplete_columns(seen, config.series_columns if config.aging else ())
-    faults += improbable_loads(steady, config)
+    faults += improbable_loads(steady, config) + computed_force(inputs & {*steady.columns})
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)
     strokes = strokes.assign(used=used)

@@ -178,6 +178,21 @@ def numeric_names(settings: TraceFormat) -> set[str]:
     return names | {settings.integrate_displacement} if settings.integrate_displacement else names
 
 
+def force_inputs(config: Config) -> set[str]:
+    """Return the columns that `force_N` is computed from and that are no channels; none with `drop_columns`.
+
+    An effect of one of them would give the force back that was computed from it.
+    """
+    settings = config.trace
+    if settings.drop_columns is not None:
+        return set()
+    read: set[str] = set()
+    for name in reversed(settings.compute):  # each may read those that are computed before it
+        if name == "force_N" or name in read:
+            read |= parse(settings.compute[name]).names
+    return {beside(name, RESERVED) for name in read - {*SLOTS, *condition_columns(config)}}
+
+
 def locate(layout: Layout, width: int, settings: TraceFormat) -> dict[int, str]:
     """Return our name for each position (from 0) of a file with `width` columns.
 

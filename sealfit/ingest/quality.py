@@ -287,6 +287,15 @@ def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
     return faults
 
 
+def computed_force(inputs: Collection[str]) -> list[Fault]:
+    """Return that the columns from which the force is computed are not searched for effects, if there are."""
+    if not inputs:
+        return []
+    reason = f"is computed from {', '.join(sorted(inputs))}: the search for effects leaves these columns out."
+    fix = "List them as drop_columns under [trace]; a column that is not in the list is searched."
+    return [Fault("computed_force", reason, column="force_N", fix=fix, **KEPT)]
+
+
 def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame:
     """Return table `quality`: a row per finding, and one "ok" for every file of `files` without any.
 

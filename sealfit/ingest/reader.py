@@ -226,7 +226,7 @@ def _computed(rows: Trace, compute: Mapping[str, Expression], known: Mapping[str
 def _not_computed(rows: Trace, settings: TraceFormat) -> list[Fault]:
     """Return a warning for each computed channel that is no number in some rows."""
     faults = []
-    for name in settings.compute.keys() - {*SLOTS, *settings.drop_columns}:
+    for name in settings.compute.keys() - {*SLOTS, *(settings.drop_columns or ())}:
         if lacking := np.count_nonzero(~np.isfinite(rows.columns[name])):
             reason = f"is computed in the rig config, and is no number in {lacking} of {len(rows.line)} rows."
             fix = "Correct the expression, or the cells that it reads."
@@ -261,7 +261,7 @@ def _named_beside(rows: Trace, ref: TraceRef, settings: TraceFormat) -> dict[str
     """
     columns = {name: rows.columns[name] for name in SLOTS if name in rows.columns}
     for name, values in rows.columns.items():
-        if name in SLOTS or name in settings.drop_columns:
+        if name in SLOTS or name in (settings.drop_columns or ()):
             continue
         if name in ref.channels and (values == values[0]).all():
             continue

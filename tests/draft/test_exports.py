@@ -198,7 +198,7 @@ def test_units_of_columns_are_named_in_the_config(tmp_path):
     trace = parse_config(draft(tmp_path).text, "rig.toml").trace
     units = {name: column.unit for name, column in trace.columns.items()}
     assert units == {"time_s": "ms", "displacement_mm": "um", "force_N": "kN"}
-    assert (trace.compute, trace.drop_columns) == ({}, [])
+    assert (trace.compute, trace.drop_columns) == ({}, None)
 
 
 def test_settings_and_dates_in_the_header_are_enough(tmp_path):

@@ -7,10 +7,12 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
+from sealfit.closure.channels import channels_of
 from sealfit.config import Bins, Config, Strokes, load_config
 from sealfit.errors import CampaignError
 from sealfit.fit.joint.rows import LEVELS, make_rows
 from sealfit.ingest.campaign import ingest_campaign
+from sealfit.ingest.columns import force_inputs
 from sealfit.report import summary, summary_lines
 from sealfit.tables import SCHEMAS
 
@@ -321,6 +323,31 @@ def test_nothing_is_said_of_empty_cells_in_a_column_that_the_loop_ignores(campai
     for ignored, said in (([], ["Remark"]), (["Remark"], [])):
         made = ingest_campaign(campaign, Config(loop={"ignore_channels": ignored}))
         assert [fault.column for fault in made.faults if fault.check == "incomplete_column"] == said
+
+
+def test_columns_that_the_force_is_computed_from_are_said_and_not_searched(campaign):
+    rng = np.random.default_rng(1)
+    for path in (campaign / "traces").iterdir():
+        table = pd.read_csv(path)
+        cylinder = rng.normal(3.0, 0.1, len(table)).round(4)
+        table = table.assign(p_bar=cylinder, cell_N=10.0 * cylinder - table["force_N"], oil_C=cylinder)
+        table.drop(columns="force_N").to_csv(path, index=False)
+    columns = {"time_s": "time_s", "displacement_mm": "displacement_mm"}
+    compute = {"pressure_N": "10 * p_bar", "force_N": "pressure_N - cell_N"}
+    for given, unsearched in (({}, {"pressure_N", "p_bar", "cell_N"}), ({"drop_columns": ["cell_N"]}, set())):
+        rig = Config(trace={"columns": columns, "compute": compute, **given})
+        made = ingest_campaign(campaign, rig)
+        said = [fault.reason for fault in made.faults if fault.check == "computed_force"]
+        assert bool(said) == bool(unsearched)
+        searched = {
+            channel.name for channel in channels_of(make_rows(made.tables["bins"], has_aging=True), rig)
+        }
+        assert searched & {"pressure_N", "p_bar", "cell_N", "oil_C"} == (
+            {"oil_C"} if unsearched else {"pressure_N", "p_bar", "oil_C"}
+        )
+        assert not said or "from cell_N, p_bar, pressure_N: " in said[0]
+    of_conditions = Config(condition=["p_bar"], trace={"columns": columns, "compute": compute})
+    assert force_inputs(of_conditions) == {"pressure_N", "cell_N"}
 
 
 def test_a_platform_that_does_not_move_is_named(campaign):
