@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from sealfit.ingest.strokes import Stroke, find_strokes, turning_rows
 SMOOTHED = 7  # samples, as `strokes.smooth_samples`
 MOVING = 0.3  # of the highest smoothed speed: slower samples belong to rests, ramps and turns
 STROKE = 0.2  # of the range: a smaller way back is no turn
-SPEEDS_APART = 1.25  # ratio of two steady speeds in one file; plateaus of one speed differ by far less
 
 DIMENSION = {
     "time": ("time",),
@@ -133,36 +131,6 @@ def moving_strokes(time: np.ndarray, displacement: np.ndarray) -> list[Stroke]:
     rows = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0
     found = find_strokes(time[rows], displacement[rows], np.zeros(np.count_nonzero(rows)), Strokes())
     return [stroke for stroke in found if np.isfinite(stroke.speed_mm_s) and stroke.speed_mm_s != 0]
-
-
-def several_speeds(speeds: list[float]) -> list[float]:
-    """Return the speeds of one direction in a file that holds several, none otherwise.
-
-    One stroke that is off is no speed of its own; each direction may have its speed.
-
-    Examples
-    --------
-    >>> several_speeds([5.0, 5.0, 1.0, 1.0]), several_speeds([5.0, 5.0, 5.0, 1.0])
-    ([1.0, 5.0], [])
-    >>> several_speeds([1.0, 2.0, 4.0])
-    [1.0, 2.0, 4.0]
-    >>> several_speeds([5.0, -8.0, 5.0, -8.0])
-    []
-    """
-    forward = _several([speed for speed in speeds if speed > 0])
-    return forward or _several([-speed for speed in speeds if speed < 0])
-
-
-def _several(speeds: list[float]) -> list[float]:
-    groups: list[list[float]] = []  # that differ by a quarter or more, the slowest first
-    for speed in sorted(speeds):
-        if not groups or speed > SPEEDS_APART * groups[-1][0]:
-            groups.append([])
-        groups[-1].append(speed)
-    own = all(len(group) == 1 for group in groups)
-    kept = groups if own else [group for group in groups if len(group) > 1]
-    apart = all(a[-1] * SPEEDS_APART < b[0] for a, b in pairwise(kept))
-    return [group[0] for group in kept] if len(kept) > 1 and apart else []
 
 
 # ---------------------------------------------------------------- roles

@@ -15,7 +15,6 @@ from sealfit.draft.columns import (
     mean_speed,
     moving_strokes,
     rises,
-    several_speeds,
     stroke_count,
 )
 from sealfit.draft.config_text import Notes, date_lines, file_column
@@ -25,6 +24,7 @@ from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
 from sealfit.ingest.formats import kind_of
+from sealfit.ingest.strokes import several_speeds
 from sealfit.ingest.workbooks import rows_of_sheets
 from sealfit.units import Units, conversion
 
@@ -414,7 +414,7 @@ def motion_keys(
         notes.guess("strokes.speed_tolerance", 0.1, evidence)
     if others := {file: found for file, found in several.items() if file not in steps}:
         reason = f"strokes in one direction have several speeds, {_shown_speeds(others, files)}."
-        fix = "The strokes of a file in one direction are one run: write each speed into a file of its own."
+        fix = "Those of each speed are a run, unless names or a table give the file a speed: take that out."
         notes.doubt("strokes", reason, fix)
     if roles.dimension("displacement") == "angle":  # these speeds are not in mm/s
         return {}

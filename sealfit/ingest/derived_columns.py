@@ -279,7 +279,8 @@ def add_runs(
 
     Where none is given there is one per condition, commanded speed, load (of several) and (named) specimen.
     Without a commanded speed it is that `measured`, in `unit` (nan where one is commanded): files within 5 %
-    share a run. So do strokes there and back of one record, a file each, as the column `stroke` tells them.
+    share a run. So do files with several speeds each (nan), and strokes there and back of one record, a file
+    each, as the column `stroke` tells them.
     """
     none = [None] * len(conditions)
     given = columns.get("run_id", none)

@@ -20,6 +20,7 @@ from sealfit.ingest.columns import columns_of, condition_columns, keys_of
 from sealfit.ingest.derived_columns import of_one_speed
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.files import as_number
+from sealfit.ingest.strokes import several_speeds
 from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints
 from sealfit.store.parquet import as_dictionary, to_arrow
@@ -192,7 +193,7 @@ def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, li
     """Return everything that is known of every stroke, the keys included; run_id with its direction.
 
     A run with strokes both ways is two: `<run_id>+` and `<run_id>-`. One with several steady speeds in a
-    stroke is one for each of them: `<run_id> at 42.1`.
+    stroke, or in strokes of a file for which none is commanded, is one for each of them: `<run_id> at 42.1`.
     """
     rows = [row for made in files for row in made.strokes]
     columns = columns_of(rows)
@@ -206,16 +207,21 @@ def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, li
 
 
 def _at_speeds(strokes: Mapping[str, list], tolerance: float) -> dict[str, list]:
-    """Return `run_id` with the speed where strokes of the run have several, and that as the speed set.
+    """Return `run_id` with the speed where the run has several in a file, and that as the speed set.
 
     Speeds of a run are different ones where those next to each other differ by more than the tolerance.
     """
     names = np.array(strokes["run"], object)
-    if not any(strokes["several_speeds"]):
-        return {"run_id": names.tolist()}
     commanded = strokes.get("speed_set_mm_s", [None] * len(names)).copy()
+    known = np.array(strokes["used"], bool)
+    of_file = defaultdict(list)
+    for i in np.flatnonzero(known & [one is None for one in commanded]):
+        of_file[strokes["file"][i]].append(strokes["speed_mm_s"][i])
+    by_file = {file: bool(several_speeds(speeds)) for file, speeds in of_file.items()}
+    several = np.array(strokes["several_speeds"]) | [by_file.get(file, False) for file in strokes["file"]]
+    if not several.any():
+        return {"run_id": names.tolist()}
     speed = np.abs(np.array(strokes["speed_mm_s"], float))
-    several, known = np.array(strokes["several_speeds"], bool), np.array(strokes["used"], bool)
     for run in dict.fromkeys(names[several]):
         own = np.flatnonzero((names == run) & known)
         for part in (own[places] for places in of_one_speed(speed[own], tolerance)):

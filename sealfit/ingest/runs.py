@@ -58,6 +58,7 @@ from sealfit.ingest.files import as_number, bad_file, cut_files, placed, read_by
 from sealfit.ingest.formats import kind_of, require_libraries
 from sealfit.ingest.listing import Entry, list_entries, misspelt
 from sealfit.ingest.reader import read_header, read_trace
+from sealfit.ingest.strokes import several_speeds
 from sealfit.ingest.trace_checks import measured_speeds
 from sealfit.units import Conversion, conversion
 
@@ -324,7 +325,8 @@ def _from_traces(
 ) -> tuple[Columns, list[float], set[int], list[Fault]]:
     """Return the columns with what constant columns of traces add, reading only files that lack something.
 
-    Also the measured speed of each file read (nan of the others), the files to leave out, and their faults.
+    Also the measured speed of each file read (nan of the others, and with several speeds), the files to leave
+    out, and their faults.
     """
     none = [None] * len(entries)
     refs = Listing([entry.file for entry in entries], _set_speed(columns), [])
@@ -343,7 +345,9 @@ def _from_traces(
                 left_out.add(i)
                 faults += error.faults
             continue
-        measured[i], table = measured_speeds(trace, strokes, config.units)[1], trace.table
+        table = trace.table
+        if not several_speeds([stroke.speed_mm_s for stroke in strokes]):
+            measured[i] = measured_speeds(trace, strokes, config.units)[1]
         sources = {name: beside(name, RESERVED) for name in FROM_TRACES} | {name: name for name in wanted}
         for name, column in sources.items():
             if columns.get(name, none)[i] is not None or column not in table:

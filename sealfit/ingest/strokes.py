@@ -11,6 +11,7 @@ it later shows counts as one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -36,6 +37,8 @@ MOST_OFF_SPEED = 0.3
 FEWEST_SAMPLES = 10
 # Share of a turn below which what comes before the first or after the last whole turn is no turn of its own.
 PART_OF_TURN = 0.05
+# Ratio of two steady speeds of strokes of one file; those of one speed differ by far less.
+SPEEDS_APART = 1.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,6 +234,36 @@ def steady_speeds(
         rested = speed[cut] < STANDSTILL * np.median(speed[rows])
         begins.append(cut if rested else rows.start)
     return list(zip(map(slice, [0, *cuts], [*cuts, n]), [0, *begins], strict=True))
+
+
+def several_speeds(speeds: Sequence[float]) -> list[float]:
+    """Return the speeds of one direction in a file that holds several, none otherwise.
+
+    One stroke that is off is no speed of its own; each direction may have its speed.
+
+    Examples
+    --------
+    >>> several_speeds([5.0, 5.0, 1.0, 1.0]), several_speeds([5.0, 5.0, 5.0, 1.0])
+    ([1.0, 5.0], [])
+    >>> several_speeds([1.0, 2.0, 4.0])
+    [1.0, 2.0, 4.0]
+    >>> several_speeds([5.0, -8.0, 5.0, -8.0])
+    []
+    """
+    forward = _several([speed for speed in speeds if speed > 0])
+    return forward or _several([-speed for speed in speeds if speed < 0])
+
+
+def _several(speeds: list[float]) -> list[float]:
+    groups: list[list[float]] = []  # that differ by a quarter or more, the slowest first
+    for speed in sorted(speeds):
+        if not groups or speed > SPEEDS_APART * groups[-1][0]:
+            groups.append([])
+        groups[-1].append(speed)
+    own = all(len(group) == 1 for group in groups)
+    kept = groups if own else [group for group in groups if len(group) > 1]
+    apart = all(a[-1] * SPEEDS_APART < b[0] for a, b in pairwise(kept))
+    return [group[0] for group in kept] if len(kept) > 1 and apart else []
 
 
 def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strokes) -> Stroke:

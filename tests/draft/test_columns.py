@@ -153,6 +153,7 @@ def test_strokes_of_a_file_at_different_speeds_are_a_doubt(tmp_path):
         exports.write(tmp_path, f"d4_r{number}.csv", "time_s,position_mm,force_N\n" + body)
     (doubt,) = [doubt for doubt in draft(tmp_path).doubts if doubt.key == "strokes"]
     assert "1, 4 mm/s" in doubt.reason
+    assert doubt.fix.startswith("Those of each speed are a run, ")
 
 
 @pytest.mark.parametrize("strokes", [1, 2, 4, 7])

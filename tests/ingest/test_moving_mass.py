@@ -76,6 +76,18 @@ def test_a_run_with_several_speeds_is_a_run_for_each(tmp_path):
     assert set(steady["stroke"].iloc[begun]) == {1, 5}
 
 
+def test_strokes_of_a_file_at_several_speeds_are_a_run_for_each_unless_a_speed_is_given(tmp_path):
+    legs = [leg for speed in (20.0, 80.0, 20.0, 80.0) for leg in steps([speed])[1:]]
+    traces = [moved([(0.3, 0.0), *legs], seed=seed, mass_kg=0.0) for seed in range(2)]
+    own = ONE.replace(', run_id = "A"', "")
+    steady = ingested(tmp_path / "c", traces, own).tables["steady"]
+    runs = [f"lot=A at {v}{d}" for v in (20, 80) for d in "+-"]
+    assert steady.groupby("run_id").size().to_dict() == dict.fromkeys(runs, 4)
+    npt.assert_allclose(steady["speed_set_mm_s"], steady["speed_mm_s"].abs(), rtol=0.01)
+    given = own.replace("lot =", "speed_mm_s = 30, lot =") + "quality.speed_disagreement = 0.9\n"
+    assert set(ingested(tmp_path / "c", traces, given).tables["steady"]["speed_set_mm_s"]) == {30.0}
+
+
 def test_a_speed_that_never_settles_is_in_quality_and_kept(tmp_path):
     time = np.arange(0.0, 12.0, 0.005)
     x = 30.0 * (1.0 - np.cos(2.0 * np.pi * time / 4.0))
