@@ -314,11 +314,12 @@ def _other_columns(found: Found, roles: Roles, clock: str, notes: Notes) -> None
 
 def _channel(column: Column, taken: set[str]) -> str:
     """Return a name for a column as a channel, none of those taken; "" for a ratio, a counter or a copy."""
-    if column.copy_of or column.role not in CHANNELS or all(rises(values) for values in column.values):
+    role = column.role or (column.unit.dimension if column.unit is not None else "")
+    if column.copy_of or role not in CHANNELS or all(rises(values) for values in column.values):
         return ""
     unit = f"_{column.unit.suffix}" if column.unit is not None else ""
     label = "_".join(plain(name_and_unit(column.label)[0]).split())
-    bases = (f"{column.role}_sensor", label, f"{column.role}_column_{column.position}")
+    bases = (f"{role}_sensor", label, f"{role}_column_{column.position}")
     return next(name for base in bases if (name := base + unit) not in taken)
 
 

@@ -241,6 +241,14 @@ def test_sensors_beside_the_motion_are_channels_with_names_of_their_own(tmp_path
     assert len(named) == 7
 
 
+def test_a_unit_makes_a_column_a_channel_whose_name_does_not_say_what_it_is(tmp_path):
+    def columns(one):
+        return [*exports.slots(one), 40 + np.random.default_rng(one.number).normal(size=len(one.time_s))]
+
+    named = slots(campaign(tmp_path, columns, "Zeit s;Weg mm;Kraft N;T_oil [degC]\n", delimiter=";"))
+    assert named["temperature_sensor_C"] == "T_oil [degC]"
+
+
 def test_a_measured_load_goes_before_that_of_the_header(tmp_path):
     def columns(one):
         return [one.time_s, one.displacement_mm, one.force_N, one.further["load"]]
