@@ -209,8 +209,9 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
     for i in dialect.numbers:
         label = dialect.names[i] if i < len(dialect.names) else ""
         base, unit = name_and_unit(label)
-        said = dialect.units[i].strip("[]() ") if unit is None and i < len(dialect.units) else ""
-        unit = unit or unit_of(said)
+        said = dialect.units[i].strip("[]() ") if i < len(dialect.units) else ""
+        if unit_of(said) not in (None, unit):  # Druck A is not in amperes
+            base, unit = label, unit_of(said)
         role, sure = column_role(base)
         if role == "torque":
             role = "force"

@@ -318,7 +318,8 @@ def _channel(column: Column, taken: set[str]) -> str:
     if column.copy_of or role not in CHANNELS or all(rises(values) for values in column.values):
         return ""
     unit = f"_{column.unit.suffix}" if column.unit is not None else ""
-    label = "_".join(plain(name_and_unit(column.label)[0]).split())
+    base, said = name_and_unit(column.label)
+    label = "_".join(plain(base if said == column.unit else column.label).split())
     bases = (f"{role}_sensor", label, f"{role}_column_{column.position}")
     return next(name for base in bases if (name := base + unit) not in taken)
 

@@ -249,6 +249,17 @@ def test_a_unit_makes_a_column_a_channel_whose_name_does_not_say_what_it_is(tmp_
     assert named["temperature_sensor_C"] == "T_oil [degC]"
 
 
+def test_a_row_of_units_goes_before_a_letter_of_a_name(tmp_path):
+    def columns(one):
+        rng = np.random.default_rng(one.number)
+        return [*exports.slots(one), *(3 + rng.normal(size=(3, len(one.time_s))))]
+
+    header = "Zeit;Weg;Kraft;Druck A;Druck B;Druck C\ns;mm;N;bar;bar;bar\n"
+    named = slots(campaign(tmp_path, columns, header, delimiter=";"))
+    others = {"pressure_sensor_bar": "Druck A", "druck_b_bar": "Druck B", "druck_c_bar": "Druck C"}
+    assert {name: named.get(name) for name in others} == others
+
+
 def test_a_measured_load_goes_before_that_of_the_header(tmp_path):
     def columns(one):
         return [one.time_s, one.displacement_mm, one.force_N, one.further["load"]]
