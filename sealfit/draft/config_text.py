@@ -71,13 +71,12 @@ def file_column(name: str | int, unit: Unit | None, ours: str) -> Value:
 
 
 def date_lines(when: When) -> list[str]:
-    """Return the lines of config that a date needs which is not ISO 8601."""
-    day = "started_day" if when.clock else "started_at"
-    lines = [f"[trace.header_fields] {day} = {literal(when.pattern)}"]
+    """Return the lines of config that a date needs which is not ISO 8601; those of `[files]` come last."""
+    lines = [f"started_at = {literal(when.pattern)}"]
     if when.clock:
-        lines.append(f"[trace.header_fields] started_clock = {literal(when.clock)}")
-        lines.append(f"[files] started_at = {toml({'date': day, 'time': 'started_clock'})}")
-    return [*lines, f"[files] date_format = {literal(when.format)}"]
+        lines = [f"started_day = {literal(when.pattern)}", f"started_clock = {literal(when.clock)}"]
+        lines.append(f"started_at = {toml({'date': 'started_day', 'time': 'started_clock'})}")
+    return [*lines, f"date_format = {literal(when.format)}"]
 
 
 # ---------------------------------------------------------------- text

@@ -370,7 +370,8 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
     if when is not None and "started_at" not in given:
         if when.format:
             reason = f"header line {when.line} gives a date that is not ISO 8601: {_shown(when.text)}."
-            fix = "Put the lines below into their tables if day and month are in this order."
+            of_files = "started_at and date_format" if when.clock else "date_format"
+            fix = f"If day and month are in this order, uncomment its lines, and move {of_files} to [files]."
             notes.doubt("trace.header_fields", reason, fix, date_lines(when))
         else:
             evidence = f"header line {when.line}, in every file looked at: '{when.text}'"

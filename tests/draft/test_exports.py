@@ -151,7 +151,12 @@ def test_the_order_of_day_and_month_is_the_one_that_fits_all_files(dates, order)
 def test_the_format_of_a_date_in_the_header_is_found(name, date_format, tmp_path):
     exports.EXPORTS[name](tmp_path)
     (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "ISO 8601" in doubt.reason]
-    assert doubt.lines[-1] == f"[files] date_format = '{date_format}'"
+    assert doubt.lines[-1] == f"date_format = '{date_format}'"
+    moved = 1 + ("started_at and date_format" in doubt.fix)  # lines that the fix moves to [files]
+    lines = ["[trace.header_fields]", *doubt.lines[:-moved], "[files]", *doubt.lines[-moved:]]
+    config = parse_config("\n".join(lines), "rig.toml")
+    two = config.files.started_at
+    assert set(config.trace.header_fields) == ({"started_at"} if two is None else {two.date, two.time})
 
 
 def test_a_compression_of_20_is_taken_as_a_height_of_80_and_said(tmp_path):
