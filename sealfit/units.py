@@ -186,6 +186,26 @@ def conversion(unit: str, to: str) -> Conversion:
     return Conversion((converted(_FAR) - offset) / _FAR, offset)
 
 
+def other_unit(said: str, unit: str) -> str | None:
+    """Return the unit that a header says, if it is not `unit`: "" for one of another dimension; else None.
+
+    A unit that is not known says nothing; kg stands for kgf, and lbs for lbf.
+
+    Examples
+    --------
+    >>> other_unit("kN", "N"), other_unit("kg", "N"), other_unit("V", "N")
+    ('kN', 'kgf', '')
+    >>> other_unit("kg", "kgf"), other_unit("Sek", "s")
+    (None, None)
+    """
+    if said == unit or not said[:1].isalpha() or None in (_dimension(said), _dimension(unit)):
+        return None
+    known = [one for one in (said, f"{said.removesuffix('s')}f") if _dimension(one) == _dimension(unit)]
+    if any(abs(conversion(one, unit).factor - 1.0) < 1e-9 for one in known):
+        return None
+    return known[0] if known else ""
+
+
 @cache
 def _registry():
     import pint  # here, as it takes half a second to load and few configs name a unit

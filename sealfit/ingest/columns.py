@@ -15,6 +15,7 @@ from sealfit.ingest.cells import OVERLOAD, Trace, cell_faults, listed, numbers_o
 from sealfit.ingest.expression import parse
 from sealfit.ingest.files import Layout, bad_file, split_line
 from sealfit.tables import BINS, RUNS
+from sealfit.units import other_unit
 
 Value = float | str
 Column = list[Value | None]  # a value of every file, None where it has none
@@ -275,6 +276,29 @@ def missing_column(column: str | int, layout: Layout, fix: str, reason: str = NO
     """Return the fault of a file that lacks a column, and is left out."""
     place = {"line": layout.names_line, "column": str(column)}
     return bad_file("missing_column", reason, fix, **place).fault
+
+
+def header_units(layout: Layout, config: Config) -> list[Fault]:
+    """Return a warning for each slot with another unit in the header than that its numbers are taken in."""
+    settings, faults = config.trace, []
+    row = split_line(layout.header[-1], settings.delimiter) if settings.units_row and layout.header else []
+    for ours in SLOTS:
+        column = settings.columns.get(ours)
+        if column is None or column.name not in (*layout.names, *range(1, len(layout.names) + 1)):
+            continue
+        at = column.name - 1 if isinstance(column.name, int) else layout.names.index(column.name)
+        cell = row[at].strip(" []") if at < len(row) else ""
+        said = cell or layout.names[at].rpartition("[")[2].rpartition("]")[0].strip()
+        taken = column.unit or config.units.of(ours)
+        unit = other_unit(said, taken)
+        if unit is not None:
+            fix = f'set {ours} = {{name = {column.name!r}, unit = "{unit}"}} under [trace.columns].'
+            if not unit:
+                fix = f"name the column otherwise under [trace.columns], and compute {ours} from it."
+            reason = f"the header says '{said}', and the config takes the numbers in {taken}."
+            place = {"line": layout.names_line, "column": layout.names[at]}
+            faults.append(Fault("unit", reason, fix=f"If the header is right, {fix}", **place, **KEPT))
+    return faults
 
 
 def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat) -> Fault:

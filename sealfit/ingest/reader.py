@@ -17,6 +17,7 @@ from sealfit.ingest.columns import (
     SLOTS,
     beside,
     channel_columns,
+    header_units,
     locate,
     numeric_names,
     required,
@@ -162,7 +163,7 @@ def _trace(rows: Trace, layout: Layout, ref: TraceRef, config: Config) -> Trace:
     if settings.keep is not None:
         keep = _evaluate(parse(settings.keep, condition=True), {**known, **rows.columns})
         rows = rows.where(np.broadcast_to(keep, rows.line.shape))
-    rows = rows.with_faults(_not_computed(rows, settings))
+    rows = rows.with_faults([*_not_computed(rows, settings), *header_units(layout, config)])
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(read)} data rows are left; a trace needs {MIN_ROWS}."
         fix = "Check drop_first_rows, keep and the export."

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, faults, read, refused, trace
 
+from sealfit.draft.vocabulary import UNITS
 from sealfit.errors import ConfigError
-from sealfit.units import conversion
+from sealfit.units import conversion, other_unit
 
 BY_HAND = [  # (unit, ours, number, the number in our unit)
     ("kgf", "N", 5.0, 49.03325),  # standard gravity, 9.80665 m/s2
@@ -149,3 +150,33 @@ def test_a_torque_is_no_force():
 def test_a_misspelt_key_of_a_column_is_named():
     with pytest.raises(ConfigError, match=r"unknown key 'trace.columns.force_N.units'"):
         config('[trace.columns]\nforce_N = {name = "F", units = "kgf"}\n')
+
+
+@pytest.mark.parametrize(
+    ("header", "settings", "column", "fix"),
+    [
+        ("t [s],x [mm],F [kN]", 'force_N = "F [kN]"', "F [kN]", 'unit = "kN"} under [trace.columns].'),
+        ("t [s],x [mm],F [kg]", "force_N = 3", "F [kg]", 'unit = "kgf"} under [trace.columns].'),
+        ("t [s],x [mm],F [V]", 'force_N = "F [V]"', "F [V]", "compute force_N from it."),
+        ("t,x,F\ns,mm,kN", 'force_N = "F"', "F", 'unit = "kN"} under [trace.columns].'),
+        ("t [s],x [mm],F [kN]", 'force_N = {name = "F [kN]", unit = "kN"}', None, ""),
+        ("t [s],x [mm],F [kg]", 'force_N = {name = "F [kg]", unit = "kgf"}', None, ""),
+        ("t [sec],x (s),F [left]", 'force_N = "F [left]"', None, ""),
+    ],
+)
+def test_a_unit_of_the_header_that_is_not_the_config_s_is_a_warning(tmp_path, header, settings, column, fix):
+    text = f"trace.units_row = {str('mm,kN' in header).lower()}\n[trace.columns]\n"
+    text += f"time_s = 1\ndisplacement_mm = 2\n{settings}\n"
+    found = read(tmp_path, csv_of(ROWS, header), text).faults
+    assert [(fault.check, fault.column, fault.action) for fault in found] == (
+        [("unit", column, "kept")] if column else []
+    )
+    assert all(
+        fault.fix.startswith("If the header is right, ") and fault.fix.endswith(fix) for fault in found
+    )
+
+
+def test_units_as_a_draft_writes_them_are_those_of_the_header():
+    slots = ("time", "length", "force", "torque")
+    spelled = {text: unit for text, unit in UNITS.items() if unit.dimension in slots}
+    assert {text for text, unit in spelled.items() if other_unit(text, unit.name) is not None} == set()
