@@ -118,12 +118,18 @@ def require_columns(expression: Expression, known: Collection[str]) -> None:
             raise ConfigError(f"in {expression.text!r}: there is no column '{name}'.", column=name, fix=fix)
 
 
+def read_by(compute: Mapping[str, str]) -> set[str]:
+    """Return the columns that any of a config's expressions reads."""
+    return set().union(*(parse(text).names for text in compute.values()))
+
+
 def evaluate(expression: Expression, values: Values) -> np.ndarray:
     """Return the expression's value: an array of shape (n,), or of shape () if only constants are read.
 
     Arithmetic is in double precision; what is undefined (0/0, the root of a negative number) gives NaN and
     what is too large gives infinity, without a warning: the rows concerned are reported where cells are
-    checked. ConfigError if a name is not in `values`, or stands for text where a number is wanted.
+    checked. ConfigError if a name is not in `values`, or stands for text where a number is wanted; the text ""
+    is NaN.
     """
     require_columns(expression, values)
     with np.errstate(all="ignore"):
@@ -204,9 +210,10 @@ class _Checked:
 
 
 def _as_number(value: object, name: str, text: str) -> np.ndarray:
-    array = np.asarray(value)
+    array = np.asarray(np.nan if isinstance(value, str) and value == "" else value)
     if array.dtype.kind not in "fiub":
-        fix = f"Map it to numbers first, or compare it: {name} == 'B'. The day of a date is days({name})."
+        fix = f"Compare it: {name} == 'B'. The day of a date is days({name}). Or map a part of file names to "
+        fix += "numbers under [files.values]; run_id, specimen_id and started_at stay text."
         raise ConfigError(f"in {text!r}: '{name}' is text, not a number.", column=name, fix=fix)
     return array.astype(float, copy=False)
 

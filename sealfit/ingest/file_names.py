@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -112,16 +112,18 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
                 say(name, mapped, mapped if stays else _value(mapped))
     for name, expression in settings.compute.items():
         value = float(evaluate(parse(expression), values))
-        say(name, f"{value:g}", value)
+        absent = np.isnan(value) and any(values[part] == "" for part in parse(expression).names)
+        say(name, *(("", "") if absent else (f"{value:g}", value)))
     for name, template in settings.columns.items():
         text = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
         say(name, text, text if name in TEXT_COLUMNS else _value(text))
     return {name: value for name, value in values.items() if value != "" or name.startswith("_")}
 
 
-def channels_of(named: Named | None) -> dict[str, float | str]:
-    """Return what a name says without the helpers; nothing where it does not match."""
-    return {name: value for name, value in (named or {}).items() if not name.startswith("_")}
+def channels_of(named: Named | None, helpers: Collection[str] = ()) -> dict[str, float | str]:
+    """Return what a name says, of the helpers only those asked for; nothing where it does not match."""
+    said = (named or {}).items()
+    return {name: v for name, v in said if v != "" and (not name.startswith("_") or name in helpers)}
 
 
 def fits_up_to(pattern: str, file: str) -> str:

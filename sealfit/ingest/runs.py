@@ -53,6 +53,7 @@ from sealfit.ingest.derived_columns import (
     with_computed,
     with_day_0,
 )
+from sealfit.ingest.expression import read_by
 from sealfit.ingest.file_names import Listing, channels_of, fits_up_to, name_parts, unmatched
 from sealfit.ingest.files import as_number, bad_file, cut_files, placed, read_bytes
 from sealfit.ingest.formats import kind_of, require_libraries
@@ -288,7 +289,7 @@ def _named(entries: list[Entry], config: Config) -> tuple[list[int], Columns, li
             faults.append(Fault("not_matched", reason, file=entry.file, **place))
         if named is not None or listed:
             kept.append(i)
-            parts.append(channels_of(named))
+            parts.append(channels_of(named, read_by(config.runs.compute)))
     if not kept:
         pattern = config.files.name_pattern
         nearest = max(faults, key=lambda fault: len(fits_up_to(pattern, fault.file)))
@@ -305,7 +306,7 @@ def _headers(campaign: Path, entries: list[Entry], config: Config) -> Columns:
             found = read_header(campaign, entry.file, config)
         except BadFile:
             found = {}
-        rows.append({name: value for name, value in channels_of(found).items() if value != ""})
+        rows.append(channels_of(found, read_by(config.runs.compute)))
     return columns_of(rows)
 
 

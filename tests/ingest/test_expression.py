@@ -163,7 +163,7 @@ def test_unknown_and_text_names_are_told_with_what_is_known():
         value("batch * 2", batch="A")
     with pytest.raises(ConfigError, match="'batch' is text"):
         value("batch * 2", batch=np.array(["1", "x"], dtype=object))
-    with pytest.raises(ConfigError, match="compare it: batch == 'B'"):
+    with pytest.raises(ConfigError, match="Compare it: batch == 'B'"):
         value("batch * 2", batch="A")
 
 

@@ -1,5 +1,5 @@
 import pytest
-from trace_helpers import DAYS, campaign, channels, config, faults
+from trace_helpers import DAYS, campaign, channels, config, faults, trace
 
 from sealfit.errors import ConfigError
 from sealfit.ingest.runs import list_traces
@@ -63,6 +63,23 @@ def test_an_expression_that_cannot_be_meant_stops_the_run(tmp_path, text, said):
     assert (fault.file, fault.column) == ("config 'default'", "runs.compute.load_N")
     assert said in fault.reason
     assert fault.fix
+
+
+def test_parts_for_expressions_only_are_read_by_those_of_runs_too_and_absent_ones_say_nothing(tmp_path):
+    for file in ("c25_V1.csv", "new_V2.csv"):
+        trace(tmp_path, file)
+    pattern = "(?:c(?P<_c>\\d+)|new)_(?P<specimen_id>V(?P<_piece>\\d))[.]csv"
+    rig = DAYS + f"files.glob = '*.csv'\nfiles.name_pattern = '{pattern}'\n"
+    for table in ("files", "runs"):
+        computed = f"{table}.compute.compression_ratio_pct = '100 - _c'\n"
+        computed += "runs.compute.aging_days = '7 * (_piece == 1)'\n"
+        found = channels(tmp_path, computed + rig)
+        assert [ref["aging_days"] for ref in found.values()] == [7, 0]
+        assert [ref.get("compression_ratio_pct") for ref in found.values()] == [75, None]
+        assert not any(name.startswith("_") for ref in found.values() for name in ref)
+    (fault,) = faults(tmp_path, "runs.compute.aging_days = '7 * specimen_id'\n" + rig)
+    assert fault.fix.startswith("Compare it: specimen_id == 'B'. ")
+    assert "specimen_id and started_at stay text" in fault.fix
 
 
 def test_a_mistyped_column_of_an_expression_is_answered_with_the_nearest(tmp_path):
