@@ -128,8 +128,8 @@ def evaluate(expression: Expression, values: Values) -> np.ndarray:
 
     Arithmetic is in double precision; what is undefined (0/0, the root of a negative number) gives NaN and
     what is too large gives infinity, without a warning: the rows concerned are reported where cells are
-    checked. ConfigError if a name is not in `values`, or stands for text where a number is wanted; the text ""
-    is NaN.
+    checked. ConfigError if a name is not in `values`, or stands for text where a number is wanted. The text
+    "" is NaN.
     """
     require_columns(expression, values)
     with np.errstate(all="ignore"):
