@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.engine.run_map import on_cluster
-from sealfit.errors import CampaignError, Fault, OutError, RequestError, StaleError
+from sealfit.errors import CampaignError, Fault, OutError, ParameterError, RequestError, StaleError
 from sealfit.progress import Silent
 from sealfit.store import Store, paths
 from sealfit.store.manifest import ConfigCopy
@@ -119,7 +119,10 @@ def answers_to(points: pd.DataFrame, store: Store) -> pd.DataFrame:
     """Return points with their answers, by the model that `store`'s loop recorded; errors as `predict`."""
     from sealfit.closure.predict import predict as answer
 
-    return answer(store.read_json("model"), points, _own_effects(store.effects))
+    try:
+        return answer(store.read_json("model"), points, _own_effects(store.effects))
+    except ParameterError as error:  # of a model that no loop writes
+        raise store.not_ours("model") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -303,12 +303,18 @@ def _report(store: Store, staged: Staged, options: Options, progress: Silent) ->
 
 
 def reported(store: Store) -> tuple[dict[str, pd.DataFrame], dict | None]:
-    """Return what the report shows and draws of the tables, by name, and closure.json, None of properties."""
+    """Return what the report shows and draws of the tables, by name, and closure.json, None of properties.
+
+    OutError if closure.json lacks an effect whose shape is in the tables.
+    """
     if store.state.properties is not None:
         return {name: store.read(name) for name in OF_PROPERTIES}, None
     tables = {name: store.read(name) for name in TABLES if name not in UNREPORTED}
     tables |= _example_traces(store, tables["runs"])
-    return tables, store.read_json("closure")
+    closure = store.read_json("closure")
+    if tables["shapes"]["effect"].nunique() > len(closure["effects"]):
+        raise store.not_ours("closure")
+    return tables, closure
 
 
 def _example_traces(store: Store, runs: pd.DataFrame) -> dict[str, pd.DataFrame]:

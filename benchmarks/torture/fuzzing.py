@@ -11,7 +11,7 @@ they do of the undamaged folder or say in one line what is wrong. Where `run` su
 identical to those of the undamaged folder. Pure computations are done once for equal arguments.
 
 Crafted results, whose JSON names effects of their own in OUT, in the campaign or behind a link, are asked
-everything: no Python of theirs is run. Forged tables, with right checksums, are in forged.py.
+everything: no Python of theirs is run. Forged ones, with right checksums, are in forged.py.
 
 Hypothesis draws from a seed, keeps no examples and does not shrink: the mutation is printed as it is.
 """
@@ -520,10 +520,10 @@ INPUTS = ("trace", "runs.csv", "config", "points", "values", "xlsx", "tdms", "ma
 
 def _part(job: tuple) -> list[Found]:
     name, *rest = job
-    if name == "forged_tables":
-        from forged import forged_tables
+    if name.startswith("forged"):
+        import forged
 
-        return forged_tables(*rest)
+        return getattr(forged, name)(*rest)
     if name == "crafted":
         return crafted(*rest)
     return fuzzed_results(*rest) if name == "results" else fuzzed_input(name, *rest)
@@ -559,7 +559,8 @@ def main() -> int:
         closed(work, asked.seed)
         parts = asked.jobs  # each makes results of its own
         jobs = [("results", work, asked.seed, asked.results, (i, parts), asked.heal) for i in range(parts)]
-        jobs += [("crafted", work, asked.seed), ("forged_tables", work, asked.seed, asked.step)]
+        jobs += [("crafted", work, asked.seed), ("forged", work, asked.seed, asked.step)]
+        jobs += [("forged_tables", work, asked.seed, asked.step)]
         jobs += ((name, work, asked.inputs, asked.seed) for name in INPUTS)
         with ProcessPoolExecutor(asked.jobs, mp_context=get_context("fork")) as pool:
             found = [one for part in pool.map(_part, jobs) for one in part]

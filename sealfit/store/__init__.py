@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -283,15 +282,20 @@ class Store:
         return by_conditions(conditions)
 
     def read_json(self, name: str) -> dict:
-        """Return closure.json ("closure") or model.json ("model"); OutError if it is no JSON."""
-        path = self.out / f"{name}.json"
+        """Return closure.json ("closure") or model.json ("model"); OutError if no loop writes such a one."""
+        from sealfit.store.documents import read_document
+
         try:
-            return json.loads(path.read_text("utf-8"))
+            return read_document(name, (self.out / f"{name}.json").read_text("utf-8"))
         except (ValueError, RecursionError) as error:
-            fix = f"Run: {self.command('close-loop')} --force"
-            raise OutError("is not what sealfit wrote.", file=path, fix=fix) from error
+            raise self.not_ours(name) from error
         finally:
             self._require_unchanged()
+
+    def not_ours(self, name: str) -> OutError:
+        """Return the error of a document that no loop writes."""
+        fix = f"Run: {self.command('close-loop')} --force"
+        return OutError("is not what sealfit wrote.", file=self.out / f"{name}.json", fix=fix)
 
     def seen_config(self, step: str) -> Config:
         """Return the config as `step` uses it."""

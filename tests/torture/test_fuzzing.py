@@ -4,7 +4,7 @@ import forged as forging
 import fuzzing
 import pytest
 from drawing_helpers import undrawn
-from forged import forged_tables
+from forged import forged, forged_tables
 from fuzzing import BAD, INPUTS, crafted, drawn, fuzzed_input, fuzzed_results, limited
 
 
@@ -73,6 +73,12 @@ def test_no_python_is_run_from_crafted_results(tmp_path):
     found = crafted(tmp_path, 1)
     assert len(found) > 50
     assert [one for one in found if one.verdict in BAD] == []
+
+
+def test_forged_results_with_right_checksums_end_in_an_answer_or_a_line(tmp_path, one_folder):
+    found = forged(tmp_path, 1, 300)
+    assert len(found) > 60
+    assert {"read", "refused"} == {one.verdict for one in found}
 
 
 def test_forged_tables_with_right_checksums_end_in_an_answer_or_a_line(tmp_path, one_folder):
