@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
-from sealfit.closure.left_out import outlier_files
+from sealfit.closure.left_out import foldable, outlier_files
 from sealfit.fit.joint.rows import make_rows
 
 
@@ -98,3 +98,11 @@ def test_no_file_is_left_out_where_the_rest_does_not_predict_it_without_another(
         (one,) = outlier_files(make_rows(bins, has_aging=True))
         assert one.instead
         assert files[number] in (one.file, *one.instead)
+
+
+@pytest.mark.parametrize(("days", "level"), [((1.0, 4.0), "run"), ((1.0, 4.0, 16.0), "specimen")])
+def test_specimens_are_held_out_only_where_an_aging_law_predicts_them(days, level):
+    """One specimen a condition: two days without unaged rubber have no law that predicts them."""
+    bins = make_bins(bins=4, repeats=1, days=days)
+    rows = make_rows(bins[bins["aging_days"] > 0], has_aging=True)
+    assert foldable(rows, "specimen") == level
