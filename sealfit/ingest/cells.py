@@ -207,7 +207,9 @@ def checked_cells(
             faults += cell_faults(name, values, wrong, line, decimal, count)
             made[name] = numbers
         elif values.dtype.kind == "O":
-            made[name] = np.array([(cell or "").strip() or None for cell in values], dtype=object)
+            cells = np.array([(cell or "").strip() or None for cell in values], dtype=object)
+            words = any(cell is not None and as_number(cell, decimal) is None for cell in cells)
+            made[name] = cells if words else numbers_of(cells, decimal)
         else:
             made[name] = values
     return Trace(made, line, bad, len(line), tuple(faults))

@@ -67,6 +67,18 @@ def test_a_word_for_no_value_in_a_channel_is_not_called_an_empty_cell(tmp_path, 
     assert "holds no value: empty, n/a or the like" in fault.reason
 
 
+@pytest.mark.parametrize("cell", ["NaN", "inf"])
+@pytest.mark.parametrize("settings", ["", 'hum_C = {name = "hum", unit = "degF"}'])
+def test_cells_that_are_no_number_are_no_labels_beside_a_faulty_cell(tmp_path, cell, settings):
+    rows = [f"{row},{cell if i % 2 else 20 + i}" for i, row in enumerate(ROWS)]
+    rows[50] = "5.0,25.0,,21"
+    text = f"[trace.columns]\n{settings}" if settings else ""
+    found = read(tmp_path, csv_of(rows, f"{HEADER},hum"), text)
+    assert list(found.columns) == ["time_s", "displacement_mm", "force_N"]
+    (fault,) = (fault for fault in found.faults if fault.check == "channel_left_out")
+    assert "of 99 cells hold no number" in fault.reason
+
+
 def test_a_rate_gives_the_time_of_files_without_one(tmp_path):
     content = csv_of([row.partition(",")[2] for row in changed(10, "0.9,x,1.0").splitlines()[1:]])
     content = content.replace(HEADER, "displacement_mm,force_N")
