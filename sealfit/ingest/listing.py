@@ -173,8 +173,7 @@ def _rows(
         cells = _cells(line, delimiter)
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         place = {"file": table, "line": number}
-        # A cell that begins with a quotation mark which is not closed holds the end of the line.
-        if '"' in line and next(csv.reader([f"{line}\n"], delimiter=delimiter))[-1].endswith("\n"):
+        if '"' in line and _left_open(line, delimiter):
             check, reason, fix = "open_quote", "a quotation mark is left open.", "Close or delete it."
         elif any(cells[len(names) :]):
             reason = f"the line has {len(cells)} cells where {len(names)} are named."
@@ -191,6 +190,14 @@ def _rows(
             continue
         faults.append(Fault(check, reason, fix=fix, **place))
     return lines, {name: [row.get(name) for row in rows] for name in names if name}, faults
+
+
+def _left_open(line: str, delimiter: str) -> bool:
+    """Whether a cell that begins with a quotation mark holds the end of the line, or is too long to tell."""
+    try:
+        return next(csv.reader([f"{line}\n"], delimiter=delimiter))[-1].endswith("\n")
+    except csv.Error:
+        return True
 
 
 def _our_names(

@@ -191,6 +191,12 @@ def test_a_quotation_mark_left_open_in_runs_csv_is_said(tmp_path):
         channels(tmp_path)
 
 
+def test_a_long_cell_with_a_quotation_mark_is_a_fault_of_its_line(tmp_path):
+    campaign(tmp_path, f'file,aging_days\na.csv,4\nb.csv,"{"y" * 200000}')
+    with pytest.raises(CampaignError, match=r"runs.csv:3: a quotation mark is left open"):
+        channels(tmp_path)
+
+
 def test_a_quotation_mark_within_a_cell_is_a_mark_like_any_other(tmp_path):
     campaign(tmp_path, 'file,aging_days,speed_mm_s,hose\na.csv,0,5,1/2" wide\nb.csv,1,5,"1"" wide"\n')
     assert [c["hose"] for c in channels(tmp_path, 'condition = ["aging_days"]\n').values()] == [
