@@ -15,7 +15,7 @@ from sealfit.ingest.cells import OVERLOAD, Trace, cell_faults, listed, numbers_o
 from sealfit.ingest.expression import parse
 from sealfit.ingest.files import Layout, bad_file, split_line
 from sealfit.tables import BINS, RUNS
-from sealfit.units import other_unit
+from sealfit.units import Units, other_unit
 
 Value = float | str
 Column = list[Value | None]  # a value of every file, None where it has none
@@ -278,9 +278,9 @@ def missing_column(column: str | int, layout: Layout, fix: str, reason: str = NO
     return bad_file("missing_column", reason, fix, **place).fault
 
 
-def header_units(layout: Layout, config: Config) -> list[Fault]:
+def header_units(layout: Layout, settings: TraceFormat, units: Units) -> list[Fault]:
     """Return a warning for each slot with another unit in the header than that its numbers are taken in."""
-    settings, faults = config.trace, []
+    faults = []
     row = split_line(layout.header[-1], settings.delimiter) if settings.units_row and layout.header else []
     for ours in SLOTS:
         column = settings.columns.get(ours)
@@ -289,7 +289,7 @@ def header_units(layout: Layout, config: Config) -> list[Fault]:
         at = column.name - 1 if isinstance(column.name, int) else layout.names.index(column.name)
         cell = row[at].strip(" []") if at < len(row) else ""
         said = cell or layout.names[at].rpartition("[")[2].rpartition("]")[0].strip()
-        taken = column.unit or config.units.of(ours)
+        taken = column.unit or units.of(ours)
         unit = other_unit(said, taken)
         if unit is not None:
             fix = f'set {ours} = {{name = {column.name!r}, unit = "{unit}"}} under [trace.columns].'

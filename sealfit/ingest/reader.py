@@ -64,7 +64,7 @@ def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
             rows = _read_arrays(content, layout, settings)
         else:
             rows = _read_text(content, layout, settings, ref.cut)
-        trace = _trace(rows, layout, ref, config)
+        trace = _trace(rows, layout, ref, config).with_faults(header_units(layout, settings, config.units))
     return replace(trace, faults=placed(trace.faults, ref.file))
 
 
@@ -163,7 +163,7 @@ def _trace(rows: Trace, layout: Layout, ref: TraceRef, config: Config) -> Trace:
     if settings.keep is not None:
         keep = _evaluate(parse(settings.keep, condition=True), {**known, **rows.columns})
         rows = rows.where(np.broadcast_to(keep, rows.line.shape))
-    rows = rows.with_faults([*_not_computed(rows, settings), *header_units(layout, config)])
+    rows = rows.with_faults(_not_computed(rows, settings))
     if len(rows.line) < MIN_ROWS:
         reason = f"{len(rows.line)} of {len(read)} data rows are left; a trace needs {MIN_ROWS}."
         fix = "Check drop_first_rows, keep and the export."

@@ -177,7 +177,7 @@ def test_a_sheet_has_header_units_rows_dates_and_decimal_commas(tmp_path):
     npt.assert_allclose(trace.columns["time_s"], wanted["time_s"].round(3), rtol=0, atol=1e-9)
     npt.assert_array_equal(trace.columns["displacement_mm"], wanted["displacement_mm"])
     npt.assert_array_equal(trace.columns["force_N"], wanted["force_N"])
-    assert trace.line[0] == 5
+    assert (trace.line[0], trace.faults) == (5, ())
     assert read_header(tmp_path, "t.xlsx", config(text)) == {"started_at": "2024-03-01T09:30:00"}
 
 
