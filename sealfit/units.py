@@ -189,7 +189,8 @@ def conversion(unit: str, to: str) -> Conversion:
 def other_unit(said: str, unit: str) -> str | None:
     """Return the unit that a header says, if it is not `unit`: "" for one of another dimension; else None.
 
-    A unit that is not known says nothing; kg stands for kgf, and lbs for lbf.
+    A unit that is not known says nothing; kg stands for kgf, and lbs for lbf. Headers spell units in any
+    case: MM stands for mm.
 
     Examples
     --------
@@ -200,10 +201,17 @@ def other_unit(said: str, unit: str) -> str | None:
     """
     if said == unit or not said[:1].isalpha() or None in (_dimension(said), _dimension(unit)):
         return None
-    known = [one for one in (said, f"{said.removesuffix('s')}f") if _dimension(one) == _dimension(unit)]
-    if any(abs(conversion(one, unit).factor - 1.0) < 1e-9 for one in known):
+    lower = said.lower()
+    spelled = (lower, said, f"{lower.removesuffix('s')}f")
+    known = [one for one in spelled if _dimension(one) == _dimension(unit)]
+    alike = _letters(unit) in map(_letters, spelled)
+    if alike or any(abs(conversion(one, unit).factor - 1.0) < 1e-9 for one in known):
         return None
     return known[0] if known else ""
+
+
+def _letters(unit: str) -> str:
+    return re.sub("[ *·]", "", unit).lower()
 
 
 @cache
@@ -213,6 +221,7 @@ def _registry():
     registry = pint.UnitRegistry(on_redefinition="ignore")
     for length in ("", "c", "m"):  # pint's own Nm is one of textiles, metres per gram
         registry.define(f"newton_{length}m = newton * {length}m = N{length}m")
+    registry.define("umdrehung = turn = U")  # pint's own U is one of enzymes
     return registry
 
 

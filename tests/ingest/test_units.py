@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, faults, read, refused, trace
 
-from sealfit.draft.vocabulary import UNITS
+from sealfit.draft.vocabulary import UNITS, unit_of
 from sealfit.errors import ConfigError
 from sealfit.units import conversion, other_unit
 
@@ -177,6 +177,9 @@ def test_a_unit_of_the_header_that_is_not_the_config_s_is_a_warning(tmp_path, he
 
 
 def test_units_as_a_draft_writes_them_are_those_of_the_header():
-    slots = ("time", "length", "force", "torque")
-    spelled = {text: unit for text, unit in UNITS.items() if unit.dimension in slots}
-    assert {text for text, unit in spelled.items() if other_unit(text, unit.name) is not None} == set()
+    slots = ("time", "length", "force", "torque", "angle")
+    texts = [text for text, unit in UNITS.items() if unit.dimension in slots]
+    spelled = {way(text) for text in texts for way in (str, str.upper, str.lower, str.title)} - {"u"}
+    said = {text: unit.name for text in spelled if (unit := unit_of(text)) is not None}
+    assert {text for text, unit in said.items() if other_unit(text, unit) is not None} == set()
+    assert [other_unit(text, "N") for text in ("kN", "G", "MN")] == ["kN", "gf", "MN"]
