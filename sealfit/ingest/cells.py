@@ -26,7 +26,8 @@ class Trace:
     `columns` are float64 arrays, or object arrays of text (None where empty), by our names; `line` is the
     1-based line in the file of every row; `bad` marks rows that are still to be left out; `rows_read` is the
     number of data rows in the file. `faults` are what was found; `channels` is what is known of the whole
-    file; `number` is that of every row before the config's `keep` filtered them, None before that.
+    file; `number` is that of every row before the config's `keep` filtered them, None before that; `clock`
+    says that the times are times of day.
     """
 
     columns: Mapping[str, np.ndarray]
@@ -36,6 +37,7 @@ class Trace:
     faults: tuple[Fault, ...] = ()
     channels: Mapping[str, float | str] = field(default_factory=dict)
     number: np.ndarray | None = None
+    clock: bool = False
 
     def where(self, keep: np.ndarray) -> Trace:
         """Return the trace with some of its rows."""
@@ -191,7 +193,7 @@ def checked_cells(
     number is needed, and else text in ISO 8601. A row without a needed number is bad, and is named. `count`
     is the number of cells of each line of a text, in which None stands for a cell beyond its end.
     """
-    bad, made, faults = np.zeros(len(line), bool), {}, []
+    bad, made, faults, clock = np.zeros(len(line), bool), {}, [], False
     for i, name in ours.items():
         if i not in columns:
             continue
@@ -200,6 +202,7 @@ def checked_cells(
             values = _seconds(values) if name in must else _iso(values)
         if name in must:
             numbers = seconds_of_day(values) if name == "time_s" and values.dtype.kind == "O" else None
+            clock |= numbers is not None
             if numbers is None:
                 numbers = values if values.dtype.kind == "f" else numbers_of(values, decimal)
             wrong = ~np.isfinite(numbers)
@@ -212,7 +215,7 @@ def checked_cells(
             made[name] = cells if words else numbers_of(cells, decimal)
         else:
             made[name] = values
-    return Trace(made, line, bad, len(line), tuple(faults))
+    return Trace(made, line, bad, len(line), tuple(faults), clock=clock)
 
 
 def _seconds(times: np.ndarray) -> np.ndarray:

@@ -278,11 +278,14 @@ def missing_column(column: str | int, layout: Layout, fix: str, reason: str = NO
     return bad_file("missing_column", reason, fix, **place).fault
 
 
-def header_units(layout: Layout, settings: TraceFormat, units: Units) -> list[Fault]:
-    """Return a warning for each slot with another unit in the header than that its numbers are taken in."""
+def header_units(layout: Layout, settings: TraceFormat, units: Units, clock: bool) -> list[Fault]:
+    """Return a warning for each slot with another unit in the header than that its numbers are taken in.
+
+    With `clock` the times are times of day, whatever the header says.
+    """
     faults = []
     row = split_line(layout.header[-1], settings.delimiter) if settings.units_row and layout.header else []
-    for ours in SLOTS:
+    for ours in SLOTS[1:] if clock else SLOTS:
         column = settings.columns.get(ours)
         if column is None or column.name not in (*layout.names, *range(1, len(layout.names) + 1)):
             continue

@@ -64,7 +64,8 @@ def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
             rows = _read_arrays(content, layout, settings)
         else:
             rows = _read_text(content, layout, settings, ref.cut)
-        trace = _trace(rows, layout, ref, config).with_faults(header_units(layout, settings, config.units))
+        trace = _trace(rows, layout, ref, config)
+        trace = trace.with_faults(header_units(layout, settings, config.units, trace.clock))
     return replace(trace, faults=placed(trace.faults, ref.file))
 
 

@@ -176,6 +176,12 @@ def test_a_unit_of_the_header_that_is_not_the_config_s_is_a_warning(tmp_path, he
     )
 
 
+def test_times_of_day_are_in_seconds_whatever_the_header_says(tmp_path):
+    rows = [f"12:00:{i:02d}.5,{i},2" for i in range(60)]
+    text = 'trace.columns = {time_s = "Zeit [h]", displacement_mm = 2, force_N = 3}'
+    assert read(tmp_path, csv_of(rows, "Zeit [h],x [mm],F [N]"), text).faults == ()
+
+
 def test_units_as_a_draft_writes_them_are_those_of_the_header():
     slots = ("time", "length", "force", "torque", "angle")
     texts = [text for text, unit in UNITS.items() if unit.dimension in slots]
