@@ -210,8 +210,9 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
         label = dialect.names[i] if i < len(dialect.names) else ""
         base, unit = name_and_unit(label)
         said = dialect.units[i].strip("[]() ") if i < len(dialect.units) else ""
-        if unit_of(said) not in (None, unit):  # Druck A is not in amperes
-            base, unit = label, unit_of(said)
+        below = unit_of(said)
+        if below not in (None, unit) and (unit is None or below.name != "1"):  # Druck A is not in amperes
+            base, unit = label, below
         role, sure = column_role(base)
         if role == "torque":
             role = "force"

@@ -291,7 +291,7 @@ def header_units(layout: Layout, settings: TraceFormat, units: Units, clock: boo
             continue
         at = column.name - 1 if isinstance(column.name, int) else layout.names.index(column.name)
         cell = row[at].strip(" []") if at < len(row) else ""
-        said = cell or layout.names[at].rpartition("[")[2].rpartition("]")[0].strip()
+        said = cell if cell[:1].isalpha() else layout.names[at].rpartition("[")[2].rpartition("]")[0].strip()
         taken = column.unit or units.of(ours)
         unit = other_unit(said, taken)
         if unit is not None:

@@ -260,6 +260,15 @@ def test_a_row_of_units_goes_before_a_letter_of_a_name(tmp_path):
     assert {name: named.get(name) for name in others} == others
 
 
+def test_a_row_of_dashes_leaves_the_units_of_names(tmp_path):
+    def columns(one):
+        time_s, x, force_N = exports.slots(one)
+        return [time_s, x / 10, force_N]
+
+    made = campaign(tmp_path, columns, "Time [s];Weg [cm];Kraft [N]\n-;-;-\n", delimiter=";")
+    assert parse_config(made.text, "rig.toml").trace.columns["displacement_mm"].unit == "cm"
+
+
 def test_a_measured_load_goes_before_that_of_the_header(tmp_path):
     def columns(one):
         return [one.time_s, one.displacement_mm, one.force_N, one.further["load"]]

@@ -158,6 +158,7 @@ def test_a_misspelt_key_of_a_column_is_named():
         ("t [s],x [mm],F [kN]", 'force_N = "F [kN]"', "F [kN]", 'unit = "kN"} under [trace.columns].'),
         ("t [s],x [mm],F [kg]", "force_N = 3", "F [kg]", 'unit = "kgf"} under [trace.columns].'),
         ("t [s],x [mm],F [V]", 'force_N = "F [V]"', "F [V]", "compute force_N from it."),
+        ("t [s],x [mm],F [kN]\n-,-,-", "force_N = 3", "F [kN]", 'unit = "kN"} under [trace.columns].'),
         ("t,x,F\ns,mm,kN", 'force_N = "F"', "F", 'unit = "kN"} under [trace.columns].'),
         ("t [s],x [mm],F [kN]", 'force_N = {name = "F [kN]", unit = "kN"}', None, ""),
         ("t [s],x [mm],F [kg]", 'force_N = {name = "F [kg]", unit = "kgf"}', None, ""),
@@ -165,7 +166,7 @@ def test_a_misspelt_key_of_a_column_is_named():
     ],
 )
 def test_a_unit_of_the_header_that_is_not_the_config_s_is_a_warning(tmp_path, header, settings, column, fix):
-    text = f"trace.units_row = {str('mm,kN' in header).lower()}\n[trace.columns]\n"
+    text = f"trace.units_row = {str(chr(10) in header).lower()}\n[trace.columns]\n"
     text += f"time_s = 1\ndisplacement_mm = 2\n{settings}\n"
     found = read(tmp_path, csv_of(ROWS, header), text).faults
     assert [(fault.check, fault.column, fault.action) for fault in found] == (
