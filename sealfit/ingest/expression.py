@@ -60,11 +60,12 @@ Computed = Callable[[Values], np.ndarray]
 
 @dataclass(frozen=True, slots=True)
 class Expression:
-    """A checked expression: its text, the columns it reads, and what computes it."""
+    """A checked expression: its text, the columns it reads, what computes it, and the columns of numbers."""
 
     text: str
     names: frozenset[str]
     compute: Computed
+    numbers: Collection[str]
 
 
 @lru_cache(maxsize=256)
@@ -104,9 +105,9 @@ def parse(text: str, *, condition: bool = False) -> Expression:
     checked = _Checked(text)
     compute = checked.number(tree, 0)
     if not condition:
-        return Expression(text, frozenset(checked.names), compute)
+        return Expression(text, frozenset(checked.names), compute, checked.numbers)
     checked.require_conditions([tree])
-    return Expression(text, frozenset(checked.names), lambda values: compute(values) != 0.0)
+    return Expression(text, frozenset(checked.names), lambda values: compute(values) != 0.0, checked.numbers)
 
 
 def require_columns(expression: Expression, known: Collection[str]) -> None:
@@ -140,7 +141,7 @@ class _Checked:
     """Builds what computes an expression, node by node, and refuses what is not on the list."""
 
     def __init__(self, text: str) -> None:
-        self.text, self.names = text, set()
+        self.text, self.names, self.numbers = text, set(), set()
 
     def number(self, node: ast.expr, depth: int) -> Computed:
         """Return what computes a number; a condition gives 1 or 0."""
@@ -155,9 +156,11 @@ class _Checked:
                 return lambda values: np.float64(np.pi)
             case ast.Name(id=name) if not name.startswith("__"):
                 self.names.add(name)
+                self.numbers.add(name)
                 return lambda values: _as_number(values[name], name, self.text)
             case ast.Call(func=ast.Name(id="days"), args=[ast.Name(id=name)], keywords=[]):
                 self.names.add(name)
+                self.numbers.add(name)
                 return lambda values: np.vectorize(_day, otypes=[float])(values[name])
             case ast.Compare(
                 left=ast.Name(id=name),

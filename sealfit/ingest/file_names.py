@@ -79,8 +79,9 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
 
     Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the
     map has one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty
-    parts say nothing. Numbers in other units than ours are converted, those of parts first. ConfigError if a
-    template or an expression reads a part that the pattern does not have, or as `found_by`.
+    parts say nothing, nor does what is computed from their numbers. Numbers in other units than ours are
+    converted, those of parts first. ConfigError if a template or an expression reads a part that the pattern
+    does not have, or as `found_by`.
 
     Examples
     --------
@@ -112,7 +113,7 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
                 say(name, mapped, mapped if stays else _value(mapped))
     for name, expression in settings.compute.items():
         value = float(evaluate(parse(expression), values))
-        absent = np.isnan(value) and any(values[part] == "" for part in parse(expression).names)
+        absent = any(values[part] == "" for part in parse(expression).numbers)
         say(name, *(("", "") if absent else (f"{value:g}", value)))
     for name, template in settings.columns.items():
         text = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023

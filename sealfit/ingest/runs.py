@@ -53,7 +53,7 @@ from sealfit.ingest.derived_columns import (
     with_computed,
     with_day_0,
 )
-from sealfit.ingest.expression import read_by
+from sealfit.ingest.expression import parse, read_by
 from sealfit.ingest.file_names import Listing, channels_of, fits_up_to, name_parts, unmatched
 from sealfit.ingest.files import as_number, bad_file, cut_files, placed, read_bytes
 from sealfit.ingest.formats import kind_of, require_libraries
@@ -378,6 +378,11 @@ def _missing(entries: list[Entry], columns: Columns, config: Config) -> list[Fau
             reason = "there is no such column in runs.csv, file names, header lines or traces."
             fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."
             fix = (table and _in_other_unit(name, columns, config)) or fix
+            if (text := config.files.compute.get(name)) is not None:
+                reason = f"files.compute.{name} gives no value in any file, such as {entries[0].file}."
+                parts = ", ".join(f'{part} = {{"" = 0}}' for part in sorted(parse(text).numbers))
+                fix = "Correct files.name_pattern, or "
+                fix += f"give the part that is absent there a number under [files.values]: {parts}."
             place = {"file": table, "line": 1 if table else None, "column": name}
             faults.append(Fault("missing_column", reason, fix=fix.strip(), **place))
     return faults

@@ -82,6 +82,19 @@ def test_parts_for_expressions_only_are_read_by_those_of_runs_too_and_absent_one
     assert "specimen_id and started_at stay text" in fault.fix
 
 
+@pytest.mark.parametrize("text", ["where(_d > 0, _d, 0)", "2 * _d"])
+def test_an_absent_part_is_no_number_and_the_message_says_how_to_make_it_one(tmp_path, text):
+    for file in ("a0.csv", "a1.csv"):
+        trace(tmp_path, file)
+    rig = DAYS + f"files.glob = '*.csv'\nfiles.compute.aging_days = '{text}'\n"
+    rig += "files.name_pattern = 'a(?P<_n>\\d)(_(?P<_d>\\d+)d)?[.]csv'\n"
+    (fault,) = faults(tmp_path, rig)
+    assert fault.reason == "files.compute.aging_days gives no value in any file, such as a0.csv."
+    assert fault.fix.endswith('under [files.values]: _d = {"" = 0}.')
+    found = channels(tmp_path, rig + 'files.values = {_d = {"" = 0}}\n')
+    assert [ref["aging_days"] for ref in found.values()] == [0, 0]
+
+
 def test_a_mistyped_column_of_an_expression_is_answered_with_the_nearest(tmp_path):
     (fault,) = faults(campaign(tmp_path, LOG), DAYS + "[runs]\ncompute = {load_N = '2 * mas_kg'}\n")
     assert fault.fix.startswith("Did you mean 'mass_kg'? Known: ")
