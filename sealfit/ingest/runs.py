@@ -83,12 +83,12 @@ def join_date_and_time(entries: list[Entry], columns: Columns, config: Config) -
     two = config.files.started_at
     if two is None:
         return columns, []
-    place = {"file": entries[0].table, "line": 1} if entries[0].line is not None else {}
+    file = entries[0].table if entries[0].line is not None else None
     missing = [name for name in (two.date, two.time) if name not in columns]
     if missing:
         reason = "there is no such column, but files.started_at names it."
         return columns, [
-            Fault("missing_column", reason, column=name, fix=suggestion(name, list(columns)), **place)
+            Fault("missing_column", reason, column=name, fix=suggestion(name, list(columns)), file=file)
             for name in missing
         ]
     joined: Column = []
@@ -383,8 +383,7 @@ def _missing(entries: list[Entry], columns: Columns, config: Config) -> list[Fau
                 parts = ", ".join(f'{part} = {{"" = 0}}' for part in sorted(parse(text).numbers))
                 fix = "Correct files.name_pattern, or "
                 fix += f"give the part that is absent there a number under [files.values]: {parts}."
-            place = {"file": table, "line": 1 if table else None, "column": name}
-            faults.append(Fault("missing_column", reason, fix=fix.strip(), **place))
+            faults.append(Fault("missing_column", reason, file=table, column=name, fix=fix.strip()))
     return faults
 
 

@@ -247,8 +247,8 @@ def test_files_that_cannot_be_opened_are_told_with_the_faults_of_the_table(tmp_p
 
 def test_a_missing_condition_column_is_one_fault_with_the_nearest_name(tmp_path):
     table = FULL.replace("temperature_C", "temprature_C")
-    (fault,) = faults(campaign(tmp_path, table))
-    assert (fault.check, fault.column) == ("missing_column", "temperature_C")
+    (fault,) = faults(campaign(tmp_path, f"Rig 2\n{table.strip()}"))
+    assert (fault.check, fault.column, fault.line) == ("missing_column", "temperature_C", None)
     assert "Did you mean 'temprature_C'?" in fault.fix
 
 

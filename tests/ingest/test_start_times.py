@@ -119,6 +119,7 @@ def test_half_a_time_and_a_missing_column_are_named(tmp_path):
     assert [(fault.line, fault.column, fault.check) for fault in half] == [(3, "Uhrzeit", "empty_cell")]
     (fault,) = faults(log(tmp_path, ["2024-03-01;09:30"] * 3, "Date;Uhrzeit"), rig)
     assert (fault.check, fault.column, fault.fix) == ("missing_column", "Datum", "Did you mean 'Date'?")
+    assert (fault.file, fault.line) == ("runs.csv", None)  # it may have titles above its header
 
 
 @pytest.mark.parametrize("wrong", ["%d.%m.%Y %Q", "%H:%M", "dd.mm.yyyy"])
