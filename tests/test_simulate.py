@@ -53,6 +53,9 @@ def test_a_foreign_truth_file_and_a_plain_file_are_refused(tmp_path):
     (tmp_path / "a.truth.json").write_text("{}")
     with pytest.raises(OutError, match=r"a\.truth\.json: was not written by simulate"):
         simulate(SMALL, tmp_path / "a")
+    (tmp_path / "c.truth.json").mkdir()
+    with pytest.raises(OutError, match=r"c\.truth\.json: was not written by simulate"):
+        simulate(SMALL, tmp_path / "c")
     (tmp_path / "b").write_text("")
     with pytest.raises(OutError, match="is a file"):
         simulate(SMALL, tmp_path / "b")

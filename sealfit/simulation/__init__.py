@@ -148,7 +148,7 @@ def _refuse_foreign(out: Path) -> None:
     if truth.exists():
         try:
             listed = {"runs.csv", *(row["file"] for row in load_truth(truth)["files"])}
-        except (RequestError, KeyError, TypeError) as error:
+        except (OSError, RequestError, KeyError, TypeError) as error:
             raise OutError("was not written by simulate.", file=truth, fix=fix) from error
     if not out.exists():
         return
