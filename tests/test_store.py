@@ -461,12 +461,13 @@ def test_a_config_that_is_a_link_to_itself_is_one_line(tmp_path):
         ConfigCopy.at(tmp_path / "rig.toml")
 
 
-def test_results_of_an_earlier_format_are_made_again(out, campaign):
+@pytest.mark.parametrize(
+    "further", [{"inputs": "written otherwise"}, {"moving": {"folder": ".staging-1", "left_over": []}}]
+)
+def test_results_of_an_earlier_format_are_made_again(out, campaign, further):
     do_all(out, campaign)
     state = json.loads((out / "state.json").read_text())
-    (out / "state.json").write_text(
-        json.dumps({**state, "format": state["format"] - 1, "inputs": "written otherwise"})
-    )
+    (out / "state.json").write_text(json.dumps({**state, "format": 8, **further}))
     assert Store.open(out).why_stale("ingest") == "ingest has not been done"
     do_all(out, campaign, rows=5)
     assert stale(out) == []

@@ -177,7 +177,7 @@ def provenance(state: State) -> dict:
 
 STATE = "state.json"
 STAGING = ".staging-"  # the beginning of the name of a folder of staged files
-FORMAT = 8
+FORMAT = 9
 BATCH = "batch"  # column that names the batch, if nothing else is said
 DEFAULT = "default"
 
