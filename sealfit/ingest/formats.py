@@ -62,12 +62,12 @@ def kind_of(file: str, settings: TraceFormat | None = None) -> str:
     return ENDINGS.get(PurePosixPath(file).suffix.lower(), "csv")
 
 
-def library(name: str) -> ModuleType:
-    """Return a library that reads files of some kind; CampaignError if it is not installed."""
+def library(name: str, kind: str) -> ModuleType:
+    """Return a library that reads files of a kind; CampaignError if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:
-        reason = f"{name}, which reads such files, is not installed."
+        reason = f"{CALLED[kind]} is read by {name}, which is not installed."
         fix = "Install it: pip install 'sealfit[formats]'"
         raise CampaignError([Fault("missing_library", reason, fix=fix)]) from None
 
@@ -75,7 +75,7 @@ def library(name: str) -> ModuleType:
 def require_libraries(files: Sequence[str], settings: TraceFormat) -> None:
     """Raise `CampaignError` if a library that some of the files need is not installed."""
     for kind in {kind_of(file, settings) for file in files} & _LIBRARIES.keys():
-        library(_LIBRARIES[kind])
+        library(_LIBRARIES[kind], kind)
 
 
 @contextmanager
@@ -224,7 +224,7 @@ def _chosen(
 
 
 def _tdms(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
-    nptdms = library("nptdms")
+    nptdms = library("nptdms", "tdms")
     nptdms.log.log_manager.set_level("ERROR")  # what it warns of is a fault below
     read = nptdms.TdmsFile.read_metadata if head else nptdms.TdmsFile.read
     tdms = read(io.BytesIO(raw))
@@ -267,7 +267,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 def _mat(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
     if raw.startswith(_HDF5) or raw[512:520] == _HDF5:  # version 7.3
-        with library("h5py").File(io.BytesIO(raw), "r") as opened:
+        with library("h5py", "mat").File(io.BytesIO(raw), "r") as opened:
             variables = dict(_variables(opened))
     else:
         from scipy.io import loadmat

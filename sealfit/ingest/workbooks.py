@@ -69,7 +69,7 @@ def _book(raw: bytes, *, formulas: bool, by_row: bool = True) -> Iterator:
     Read `by_row` it takes little memory, and does not say which cells are merged.
     """
     _refuse_others(raw)
-    openpyxl = library("openpyxl")
+    openpyxl = library("openpyxl", "xlsx")
     options = {"read_only": by_row, "data_only": not formulas, "keep_links": False}
     with damage_named("xlsx"), closing(openpyxl.load_workbook(io.BytesIO(raw), **options)) as book:
         for sheet in book.worksheets if by_row else ():

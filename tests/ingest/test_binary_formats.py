@@ -429,7 +429,7 @@ def test_a_missing_library_is_one_line_that_names_it(simulated, tmp_path, monkey
     with pytest.raises(CampaignError) as caught:
         ingest(campaign, tmp_path / "out")
     said = str(caught.value)
-    assert f"{name}, which reads such files, is not installed." in said
+    assert f"{formats.CALLED[ending[-4:].lstrip('.')]} is read by {name}, which is not installed." in said
     assert "pip install 'sealfit[formats]'" in said
     assert "\n" not in said
     assert not (tmp_path / "out").exists()
