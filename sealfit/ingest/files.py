@@ -195,11 +195,9 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
             text = decoder.decode(raw, final=not head)  # a head may end in the middle of a character
         except UnicodeError as error:
             if encoding != "utf-8":
-                start = getattr(error, "start", 0)  # none is said of UTF-16 without its byte-order mark
-                reason, line = (
-                    f"is not {encoding}: byte {start} cannot be read.",
-                    raw[:start].count(b"\n") + 1,
-                )
+                start = getattr(error, "start", None)
+                why = "there is no byte-order mark" if start is None else f"byte {start} cannot be read"
+                reason, line = f"is not {encoding}: {why}.", raw[: start or 0].count(b"\n") + 1
                 fix = "Export it again." if automatic else 'Set encoding = "auto".'
                 raise bad_file("wrong_encoding", reason, fix, line=line) from error
             text = raw.decode("latin-1")  # UTF-8 was guessed

@@ -63,8 +63,9 @@ def test_columns_by_their_positions_have_no_names_to_look_for(tmp_path):
 
 
 def test_utf_16_without_its_mark_is_refused(tmp_path):
-    fault = refused(tmp_path, csv_of(ROWS), '[trace]\nencoding = "utf-16"\n')
+    fault = refused(tmp_path, csv_of(ROWS).encode("utf-16-le"), '[trace]\nencoding = "utf-16"\n')
     assert (fault.check, fault.fix) == ("wrong_encoding", 'Set encoding = "auto".')
+    assert fault.reason == "is not utf-16: there is no byte-order mark."
 
 
 def test_a_cell_of_thousands_of_separators_is_read_in_no_time(tmp_path):
