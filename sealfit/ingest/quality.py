@@ -102,16 +102,16 @@ def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
 
 
 def _gaps(time_s: np.ndarray, line: np.ndarray, number: np.ndarray, settings: Quality) -> list[Fault]:
-    rows = np.diff(number)
-    steps = np.diff(time_s) / rows
+    rows, lengths = np.diff(number), np.diff(time_s)
+    steps = lengths / rows
     usual = float(np.median(steps))
     gaps = steps > settings.max_gap_factor * usual
     if not gaps.any():
         return []
     hidden = float(((steps - usual) * rows)[gaps].sum() / (time_s[-1] - time_s[0]))
-    widest, count = int(np.argmax(steps)), int(gaps.sum())
+    widest, count = int(np.argmax(lengths * gaps)), int(gaps.sum())
     reason = f"{count} gap{'s' if count > 1 else ''} in time, {hidden:.1%} of the stroke; "
-    reason += f"the longest, after this line, is {steps[widest]:.3g} where {usual:.3g} is usual."
+    reason += f"the longest, after this line, is {lengths[widest]:.3g} where {usual:.3g} is usual."
     place = {"line": int(line[widest]), "column": "time_s", "value": hidden}
     fix = "Look for lost packets or a full buffer in the logger."
     done = STROKE_OUT if hidden > settings.max_gap_share else KEPT

@@ -134,6 +134,15 @@ def test_rows_that_the_config_filters_out_are_no_gap(tmp_path):
         assert [(fault.check, fault.action) for fault in found] == expected
 
 
+def test_the_longest_gap_is_told_as_long_as_it_is_over_rows_filtered_out():
+    time, x, force = trace()
+    kept = np.r_[0:400, 600:1000]
+    number = np.r_[0:400, 410:810]  # 190 rows are lost, and 10 are filtered out
+    (stroke,) = find_strokes(time[kept], x[kept], force[kept], Strokes())
+    (fault,) = stroke_faults(stroke, time[kept], force[kept], 2 + kept, Quality(), number)
+    assert "after this line, is 1.61 where 0.00801 is usual" in fault.reason
+
+
 def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
     time = np.arange(0.0, 2.0, 0.01)
     x = -10.0 * np.cos(0.5 * np.pi * time)
