@@ -291,7 +291,8 @@ def fit_aging(
     new: Annotated[Path | None, Option("--out", help="With --values: folder of results.")] = None,
     config: ConfigFile = None,
     properties: Annotated[
-        list[str] | None, Option("--property", metavar="COLUMN", help="Property; may be repeated.")
+        list[str] | None,
+        Option("--property", metavar="COLUMN", help="Property; may be repeated, or several with commas."),
     ] = None,
     batch: Annotated[
         str | None, Option("--batch", metavar="COLUMN", help="Batch of a specimen. [default: batch]")

@@ -109,7 +109,8 @@ def _properties(table: str, columns: Columns, config: Config, named: Sequence[st
         and not where(cells, lambda value: isinstance(value, str)).any()
     ]
     # Names in one option, between commas, are several, unless a column is called so.
-    named = [own for name in named for own in ([name] if name in columns else name.split(","))]
+    parts = [own for name in named for own in ([name] if name in columns else name.split(","))]
+    named = [own for part in parts if (own := part.strip())]
     for name in named:
         if name not in numbers:
             what = "is no column of numbers." if name in columns else NO_COLUMN

@@ -92,7 +92,7 @@ def test_several_properties_are_named(tmp_path):
     text = "aging_days,hardness,strength\n0,60,20\n2,58,18\n"
     with pytest.raises(CampaignError, match=r"hardness, strength.*--property COLUMN"):
         read(tmp_path, text)
-    table, _ = read(tmp_path, text, properties=("strength,hardness",))
+    table, _ = read(tmp_path, text, properties=("strength, hardness,",))
     assert sorted(set(table["quantity"])) == ["hardness", "strength"]
 
 
