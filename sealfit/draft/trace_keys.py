@@ -173,10 +173,7 @@ def column_keys(
         value = file_column(column.key, units.get(role), slot)
         notes.guess(f"trace.columns.{name}", value, _evidence(column, role, roles, read))
         if negated:
-            why = (
-                "with the sign of the motion" if role == "force" else "as a load that presses counts above 0"
-            )
-            notes.guess(f"trace.compute.{slot}", f"-{name}", why)
+            notes.guess(f"trace.compute.{slot}", f"-{name}", NEGATED[role])
             helpers.append(name)
         _column_doubts(column, role, f"trace.columns.{name}", roles, notes)
     if roles.displacement is None and roles.speed is not None:

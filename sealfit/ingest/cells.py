@@ -365,7 +365,6 @@ def decimal_fix(cell: str, decimal: str) -> str:
 
 
 def _beyond_faults(at, rows, line, width) -> list[Fault]:
-
     def make(i: int) -> Fault:
         value = " ".join(cell.strip() for cell in rows[i][width:] if cell.strip())
         fix = "Move it to a column with a name of its own, or delete the line."
