@@ -34,19 +34,21 @@ def levenberg_marquardt(
     high: np.ndarray,
     *,
     damping: float = DAMPING,
+    linear: Linear | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the local least-squares optima from starting points, (problems, p), and their sums of squares.
 
     `evaluate(x, rows)` returns weighted residuals, shape (r, n), and their derivatives, shape (r, p, n), of
     the problems `rows`, shape (r,), at x, shape (r, p). Starts are moved inside the closed bounds, shape (p,)
     or (problems, p), which are infinite for none and equal for a fixed parameter. `damping` is that of the
-    first step, small for starts close to the optimum. A sum of squares is infinite if the residual is not
-    finite at the start.
+    first step, small for starts close to the optimum. `linear` has the products of the derivatives, if they
+    are not arrays. A sum of squares is infinite if the residual is not finite at the start.
 
     The scale of each parameter is the largest norm of its column so far (More 1978, Lecture Notes in
     Mathematics 630, 105-116). The damped step is computed by singular values, more accurately than by normal
     equations.
     """
+    linear = linear or Linear()
     low, high = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
     x, todo = np.clip(start, low, high), np.arange(len(start))
     damping = np.full(len(x), damping)
@@ -59,12 +61,12 @@ def levenberg_marquardt(
         for _ in range(STEPS):
             if not todo.size:
                 break
-            at, size = x[todo], np.linalg.norm(slope[todo], axis=2)
+            at, size = x[todo], linear.norms(slope[todo])
             scale[todo] = np.maximum(scale[todo], size)
-            pull = -(slope[todo] @ rest[todo][..., None])[..., 0]
+            pull = -linear.gradient(slope[todo], rest[todo])
             free = ~((at <= low[todo]) & (pull <= 0)) & ~((at >= high[todo]) & (pull >= 0))
             own_scale = np.where(scale[todo] > 0, scale[todo], 1.0)
-            move = _step(slope[todo] * (free / own_scale)[..., None], rest[todo], damping[todo]) / own_scale
+            move = linear.step(slope[todo], free / own_scale, rest[todo], damping[todo]) / own_scale
             trial = np.clip(at + move, low[todo], high[todo])
             trial_rest, trial_slope = evaluate(trial, todo)
             gain, step = rss[todo] - _squares(trial_rest), np.linalg.norm((trial - at) * size, axis=1)
@@ -81,11 +83,27 @@ def levenberg_marquardt(
     return x, rss
 
 
-def _step(slope: np.ndarray, rest: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return x of least |x slope + rest|^2 + damping |x|^2, shape (r, p)."""
-    axes, singular, rows = np.linalg.svd(slope, full_matrices=False)
-    share = np.where(singular > 0, singular / (singular**2 + damping[:, None]), 0.0)
-    return -(axes @ (share * (rows @ rest[..., None])[..., 0])[..., None])[..., 0]
+class Linear:
+    """Products of the derivatives of residuals, here arrays of shape (r, p, n); residuals are (r, n)."""
+
+    def norms(self, slope: np.ndarray) -> np.ndarray:
+        """Return the norm of each parameter's derivative, shape (r, p)."""
+        return np.linalg.norm(slope, axis=2)
+
+    def gradient(self, slope: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        """Return half the derivative of the sum of squares, shape (r, p)."""
+        return (slope @ rest[..., None])[..., 0]
+
+    def step(self, slope: np.ndarray, scale: np.ndarray, rest: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        """Return x of least |x scale slope + rest|^2 + damping |x|^2, shape (r, p); scale is (r, p)."""
+        axes, singular, rows = np.linalg.svd(slope * scale[..., None], full_matrices=False)
+        share = damped_inverse(singular, damping[:, None])
+        return -(axes @ (share * (rows @ rest[..., None])[..., 0])[..., None])[..., 0]
+
+
+def damped_inverse(singular: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Return s / (s^2 + damping) of singular values s, 0 for s = 0."""
+    return np.where(singular > 0, singular / (singular**2 + damping), 0.0)
 
 
 def _squares(rest: np.ndarray) -> np.ndarray:

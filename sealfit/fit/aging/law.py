@@ -21,7 +21,9 @@ from scipy.sparse import block_array, csr_array
 from sealfit.fit.joint.whitening import members, whitening_of
 from sealfit.fit.least_squares import (
     BatchFit,
+    Linear,
     Separable,
+    damped_inverse,
     even_grid,
     global_optimum,
     levenberg_marquardt,
@@ -170,6 +172,7 @@ class Groups:
         self.of_curve = values.curve[rows][:, None] == curves[..., None]
         shared = np.tile(np.arange(self.m), (len(rows), 1))
         self.places = np.hstack([shared, self.m + curves, self.m + values.curves + curves])
+        self.size = self.m + 2 * values.curves
         b = slice(self.m + self.width, None)
         self.bounds = np.full((2, *self.places.shape), np.inf)  # of the parameters
         self.bounds[0] *= -1
@@ -191,6 +194,10 @@ class Groups:
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `evaluate` of all groups; `x`, shape (all,), are all parameters."""
         return self.evaluate(x[self.places], np.arange(len(self.rows)))
+
+    def total(self, each: np.ndarray) -> np.ndarray:
+        """Return what is given for the parameters of each group, shape (g, p), added up for all, (all,)."""
+        return np.bincount(self.places.ravel(), each.ravel(), minlength=self.size)
 
     def free(self, x: np.ndarray) -> np.ndarray:
         """Return which parameters of the groups, shape (g, p), are not at a limit of ln b."""
@@ -265,28 +272,61 @@ def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
 
 
 def _polished(values: Values, start: np.ndarray) -> LawFit:
-    """Return the local optimum from a start.
+    """Return the local optimum from a start."""
+    groups, endless = values.groups, np.full(values.origins + values.curves, np.inf)
 
-    The groups are independent given mu_0. Their residuals at their optimum are functions of mu_0 alone
-    (variable projection).
+    def evaluate(x, _):
+        found = [own.at(x[0]) for own in groups]
+        slope = np.empty(1, object)
+        slope[0] = [one for _, one in found]
+        return np.concatenate([rest.ravel() for rest, _ in found])[None], slope
+
+    low, high = np.r_[-endless, values.limits[0]], np.r_[endless, values.limits[1]]
+    x, rss = levenberg_marquardt(evaluate, start[None], low, high, linear=_Eliminating(groups))
+    return LawFit(values, x[0], float(rss[0]))
+
+
+class _Eliminating(Linear):
+    """Products for one problem, whose derivatives are a list by groups.
+
+    A step eliminates a and b group by group, solves the remaining equations of mu_0 (Schur complement), and
+    substitutes back.
     """
-    x, m = start.copy(), values.origins
 
-    def evaluate(mu_0: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x[:m], residual, slope = mu_0[0], [], []
-        for own in values.groups:
-            low, high = own.bounds.copy()
-            low[:, :m] = high[:, :m] = mu_0
-            x[own.places], _ = levenberg_marquardt(own.evaluate, x[own.places], low, high)
-            rest, _ = own.at(x)
-            residual.append(rest.ravel())
-            slope.append(np.swapaxes(own.eliminated(x, rest)[:, :m], 0, 1).reshape(m, -1))
-        return np.concatenate(residual)[None], np.hstack(slope)[None]
+    def __init__(self, groups: list[Groups]) -> None:
+        self.groups = groups
+        self.ends = np.cumsum([own.rows.size for own in groups])[:-1]
 
-    endless = np.full(m, np.inf)
-    mu_0, rss = levenberg_marquardt(evaluate, start[None, :m], -endless, endless)
-    evaluate(mu_0, mu_0)
-    return LawFit(values, x, float(rss[0]))
+    def _each(self, slope, rest):
+        parts = np.split(rest[0], self.ends)
+        for own, one, part in zip(self.groups, slope[0], parts, strict=True):
+            yield own, one, part.reshape(own.rows.shape)
+
+    def norms(self, slope):
+        squares = (own.total((one**2).sum(axis=2)) for own, one in zip(self.groups, slope[0], strict=True))
+        return np.sqrt(sum(squares))[None]
+
+    def gradient(self, slope, rest):
+        parts = (own.total((one @ part[..., None])[..., 0]) for own, one, part in self._each(slope, rest))
+        return sum(parts)[None]
+
+    def step(self, slope, scale, rest, damping):
+        m, found = self.groups[0].m, np.zeros(scale.shape)
+        normal, kept = np.zeros((m + 1, m + 1)), []
+        for own, one, part in self._each(slope, rest):
+            one = one * scale[0, own.places, None]
+            columns = np.concatenate([one[:, :m], part[:, None]], axis=1)
+            normal += np.einsum("gin,gjn->ij", columns, columns)
+            if own.width:
+                axes, singular, rows = np.linalg.svd(one[:, m:], full_matrices=False)
+                along, share = columns @ np.swapaxes(rows, 1, 2), damped_inverse(singular, damping)
+                normal -= np.einsum("gik,gk,gjk->ij", along, singular * share, along)
+                kept.append((own, axes * share[:, None], along))
+        found[0, :m] = np.linalg.solve(normal[:m, :m] + damping * np.eye(m), -normal[:m, m])
+        for own, inverse, along in kept:
+            left = along[:, m] + found[0, :m] @ along[:, :m]
+            found[0, own.places[:, m:]] = -(inverse @ left[..., None])[..., 0]
+        return found
 
 
 def _each_alone(values: Values) -> np.ndarray:
