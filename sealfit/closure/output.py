@@ -347,17 +347,18 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     channels = {name for term in (*before.model.terms, *after.model.terms) for name in term.channels}
     read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
     own = {name: rows.values(name) for name in open_columns(rows.table)}
-    table = rows.table.assign(
-        **own, pace=np.abs(rows.speed), at=rows.condition, backward=-np.sign(rows.speed)
-    )
-    groups = table[table["backward"] != 0].groupby(["at", "backward"])  # forward strokes first
-    points = pd.DataFrame({name: _averaged(groups[name]) for name in read}).reset_index()
-    low, high = groups["pace"].min().to_numpy(), groups["pace"].max().to_numpy()
+    moving = rows.speed != 0
+    # Arrays, as a channel may have any name; forward strokes first.
+    keys = [rows.condition[moving], -np.sign(rows.speed[moving])]
+    groups = pd.DataFrame({**rows.table, **own})[moving].groupby(keys)
+    points = pd.DataFrame({name: _averaged(groups[name]) for name in read})
+    low, high = pd.Series(np.abs(rows.speed[moving])).groupby(keys).agg(["min", "max"]).to_numpy().T
     counts = np.where(high > 1.02 * low, POINTS, 1)
     along = np.concatenate([np.geomspace(*own) for own in zip(low, high, counts, strict=True)])
-    points = points.loc[np.repeat(points.index, counts)].assign(direction=lambda own: -own["backward"])
-    points = points.assign(speed_mm_s=points["direction"] * along, file="")
-    at = rows.points(points, points["at"].to_numpy())
+    points = points.iloc[np.repeat(np.arange(len(points)), counts)]
+    condition, backward = (points.index.get_level_values(level).to_numpy() for level in (0, 1))
+    points = points.assign(direction=-backward, speed_mm_s=-backward * along, file="")
+    at = rows.points(points, condition)
     mean, tangent = evaluate(after.model, at)
     reach = mean_half_width(tangent, after.covariance, degrees_of_freedom(after), sandwiches(after))
     forces = {"force_before_N": evaluate(before.model, at, jacobian=False)[0], "force_after_N": mean}

@@ -22,6 +22,7 @@ def test_curves_go_both_ways_over_the_speeds_of_each_condition_at_its_mean_load(
     table = bins_helpers.make_bins(directions=(1, -1), repeats=2, bins=4, temperatures=(60.0,))
     rng = np.random.default_rng(2)
     table["load_N"] += rng.normal(0.0, 0.5, len(table))
+    table[["at", "backward", "pace", "self"]] = 1.0  # channels may have any name
     rows = make_rows(table.sample(frac=1.0, random_state=1), has_aging=True)
     fitted = fit(start_model(rows), rows, turns=1)
     curves = curve_table(fitted, fitted)
