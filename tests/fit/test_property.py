@@ -151,6 +151,14 @@ def test_values_are_rarely_far_off_by_chance_and_rounded_ones_never():
     assert far_off(rounded).empty
 
 
+def test_scatter_in_proportion_to_the_value_makes_no_value_far_off():
+    for seed in range(20):
+        table = specimens(lambda *_: 2.0, sd=0.12, seed=seed)
+        assert far_off(
+            table.assign(value=table["value"].where(table["aging_days"] > 0, 10 * table["value"]))
+        ).empty
+
+
 def test_an_energy_that_no_rubber_has_is_said_to_be_implausible():
     table = specimens(lambda t, day: 100.0 - 8.0 * np.log1p(day * (1.0 if t > 70 else 30.0)), sd=0.1)
     law_line = property_lines([summary(table, fit_properties(table, Config()))])[-1]

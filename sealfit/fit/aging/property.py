@@ -150,21 +150,25 @@ def far_off(specimens: pd.DataFrame) -> pd.DataFrame:
 
     Column `others` is the mean of the other specimens of the condition. Each value is tested by its deletion
     residual about a free mean for every condition, and the farthest one is left out until none is
-    significant; of two specimens either may be wrong. Scatter is at least that of rounding.
+    significant, both with one scatter for all conditions and with scatter in proportion to their means. Of
+    two specimens either may be wrong. Scatter is at least that of rounding.
     """
     left = specimens[["condition", "line", "value"]].astype({"value": float})
     step = np.diff(np.unique(left["value"]), append=np.inf).min(initial=np.inf)
     found = [left[:0].assign(others=0.0)]
     while True:
         of = left.groupby("condition")["value"]
-        count, rest = of.transform("size"), left["value"] - of.transform("mean")
+        count, mean = of.transform("size"), of.transform("mean")
+        rest = left["value"] - mean
         # Deletion residual, and the square of the residual about the mean that it accounts for.
         apart = rest * count / (count - 1).clip(lower=1)
         gain, df = rest * apart, len(left) - of.ngroups - 1
         if df < 1 or not gain.max() > 0:
             break
-        variance = np.maximum(((rest**2).sum() - gain) / df, step**2 / 12)
-        t = np.sqrt(gain / variance)
+        t = np.inf
+        for size in (1.0, mean.abs().replace(0.0, 1.0)):
+            left_over = ((rest / size) ** 2).sum() - gain / size**2
+            t = np.minimum(t, np.sqrt(gain / np.maximum(left_over / df * size**2, step**2 / 12)))
         if not 2 * len(left) * stdtr(df, -t.max()) < FAR_OFF:
             break
         far = t >= t.max() * (1 - ROUNDING)
