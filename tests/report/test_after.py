@@ -2,6 +2,7 @@
 
 import re
 
+import pandas as pd
 import pytest
 from report.made_campaigns import HIGHER, after_campaign, aging_campaign
 from report.test_page import Page
@@ -50,6 +51,15 @@ def test_without_effects_nothing_is_doubled(unsaved):
     page = Page(build_report(*made.arguments).html)
     assert "without the effects" not in page.text
     assert "at the reference state of its effects" not in page.text
+
+
+def test_rubbers_whose_names_differ_in_case_are_named_beside_their_laws(unsaved):
+    made = aging_campaign(verdict="nothing_missing", speeds=(1, 10))
+    laws = made.tables["aging_laws"]
+    made.tables["aging_laws"] = pd.concat([laws.assign(rubber="NBR"), laws.assign(rubber="nbr")])
+    text = Page(build_report(*made.arguments).html).text
+    assert "NBR, μ" in text
+    assert "nbr, μ" in text
 
 
 def test_an_error_that_is_rounding_alone_is_zero():
