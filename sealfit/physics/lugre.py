@@ -32,7 +32,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 # ---------------------------------------------------------------- pressure
 
 
-def load_per_width(zeta_mm, load_N, *, width_mm, shape="uniform", decay=1.0):
+def load_per_width(zeta_mm, load_N, *, width_mm, shape="uniform", decay=None):
     r"""Return the load per unit width at places in the contact (Eqs. 8 to 11), shape (n,), in N/mm.
 
     .. math::
@@ -49,13 +49,13 @@ def load_per_width(zeta_mm, load_N, *, width_mm, shape="uniform", decay=1.0):
         Contact width L in mm.
     shape : str
         "uniform", "sine", "exponential" or "parabolic".
-    decay : float
-        lambda of the exponential shape, dimensionless. At 0 it is uniform; below 0 it increases.
+    decay : float, optional
+        lambda of the exponential shape, dimensionless; default 1. At 0 it is uniform; below 0 it increases.
 
     Raises
     ------
     ParameterError
-        If the width is not positive or zeta lies outside the contact.
+        If the width is not positive, zeta lies outside the contact, or the shape is unknown or has no decay.
 
     Examples
     --------
@@ -67,7 +67,10 @@ def load_per_width(zeta_mm, load_N, *, width_mm, shape="uniform", decay=1.0):
         raise ParameterError(f"width_mm = {width_mm:g}: the contact width must be positive.")
     if np.any((zeta < 0) | (zeta > width_mm)):
         raise ParameterError(f"zeta_mm must lie in the contact, from 0 to {width_mm:g} mm.")
-    x = zeta / width_mm
+    if shape not in PRESSURES or not (decay is None or shape == "exponential"):
+        shapes = f"the shapes are {', '.join(PRESSURES)}; only exponential has a decay"
+        raise ParameterError(f"shape = {shape!r}, decay = {decay}: {shapes}.")
+    x, decay = zeta / width_mm, 1.0 if decay is None else decay
     if shape == "sine":
         relative = np.pi / 2 * np.sin(np.pi * x)
     elif shape == "parabolic":

@@ -5,6 +5,7 @@ from scipy.integrate import quad
 
 from sealfit.errors import ParameterError
 from sealfit.physics import PRESSURES, Contact
+from sealfit.physics.lugre import load_per_width
 
 uniform, sine, exponential, parabolic = PRESSURES.values()
 
@@ -38,3 +39,9 @@ def test_refuses_a_place_outside_the_contact_and_a_width_of_zero():
         uniform(2.1, 10.0, width_mm=2.0)
     with pytest.raises(ParameterError, match="contact width must be positive"):
         sine(0.0, 10.0, width_mm=0.0)
+
+
+@pytest.mark.parametrize("own", [{"shape": "hertz"}, {"shape": "sine", "decay": 2.0}])
+def test_refuses_an_unknown_shape_and_a_decay_of_a_shape_without_one(own):
+    with pytest.raises(ParameterError, match="uniform, sine, exponential, parabolic; only exponential has"):
+        load_per_width(1.0, 10.0, width_mm=2.0, **own)
