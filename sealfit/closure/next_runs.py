@@ -154,10 +154,10 @@ def next_runs(
     if rows.has_aging and not selection.after.scatter.estimates("specimen"):
         last = rows.table.iloc[int(np.argmax(rows.days))]
         wanted.append({"why": SECOND_SPECIMEN, "conditions": _settings(last, condition_columns(config))})
-    wanted += _slower_speed(selection.after, config)
     if too_short(rows):
         wanted.append({"why": LONGER_STROKES, "conditions": {}})
-    return [*wanted, *_runs_for_aliases(selection.after, config, effects)]
+    wanted += _runs_for_aliases(selection.after, config, effects)
+    return [*wanted, *_slower_speed(selection.after, config)]
 
 
 def _is_tested(conditions: Mapping[str, object], rows: Rows) -> bool:
