@@ -16,7 +16,7 @@ from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.joint import Fitted, effective_df
 from sealfit.fit.joint.model import Term, mean_derivatives
 from sealfit.fit.joint.prior import penalised, reml_smoothness, roughness_of
-from sealfit.fit.joint.rows import Rows
+from sealfit.fit.joint.rows import Cache, Rows
 
 PART = 32  # Grid points that are whitened at once.
 UNNAMED = (SMOOTH, SURFACE)
@@ -81,17 +81,18 @@ class Proposal:
 
 
 def linearised(
-    fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate
+    fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate, shapes: Cache
 ) -> list[Proposal]:
     """Return a term fitted to the residual in the tangent space of a model, at the best point of its grid.
 
-    The list is empty if none of the grid is identifiable. Amplitudes are fitted exactly.
+    The list is empty if none of the grid is identifiable. Amplitudes are fitted exactly. `shapes` keeps the
+    shapes of the last grid, which are the same for every target.
     """
     effect, rows = term.effect, fitted.rows
     points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
-    at = (effect.id, term.channels, points, term.fixed)  # the shapes are the same for every target
-    shapes = rows.cache.once(("shapes on a grid",), lambda: _shapes(term, points, rows), at=at)
-    point, most, shape = _best(fitted, term, points, shapes)
+    at = (effect.id, term.channels, points, term.fixed)
+    coarse = shapes.once("of a grid", lambda: _shapes(term, points, rows), at=at)
+    point, most, shape = _best(fitted, term, points, coarse)
     finer = _between(term, point, search, rows)
     if finer:
         point, most, shape = _best(fitted, term, finer, _shapes(term, finer, rows))

@@ -37,6 +37,7 @@ from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Model
+from sealfit.fit.joint.rows import Cache
 from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening
 from sealfit.tables import CALENDAR
@@ -65,7 +66,8 @@ def propose(
         for t, search in terms_of(c, channels, fitted, effects)
     ]
     forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # all quantities share a shape
-    found = [*also, *(p for form in forms for p in linearised(fitted, *form))]
+    shapes = Cache()
+    found = [*also, *(p for form in forms for p in linearised(fitted, *form, shapes))]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
     if not (
@@ -97,7 +99,8 @@ def propose_ripples(
 
     Changes of its amplitude that are not the best are no rivals: none of them was found.
     """
-    found = [p for form in periodic_terms(fitted, peak, samples, effects) for p in linearised(fitted, *form)]
+    forms, shapes = periodic_terms(fitted, peak, samples, effects), Cache()
+    found = [p for form in forms for p in linearised(fitted, *form, shapes)]
     refitted = _refitted(fitted, _best_few(found), found)
     best, *others = _ordered(fitted, [p for p in refitted if len(p.term.channels) == 1 or _changes(p)])
     return [best, *(p for p in others if len(p.term.channels) == 1)]
