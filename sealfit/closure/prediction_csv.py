@@ -42,13 +42,14 @@ def read_points(path: Path) -> pd.DataFrame:
             raise RequestError("a quotation mark is left open.", file=path, line=begins, fix=fix)
         begins = lines.line_num + 1
         if any(cell.strip() for cell in row):
+            if not rows:
+                names = [name.strip() for name in row]
+                _refuse_names(names, file=path, line=lines.line_num)
             rows.append(row)
             _refuse_width(row, rows[0], file=path, line=lines.line_num)
     if len(rows) < 2:
         what = "has no rows." if rows else "is empty."
         raise RequestError(what, file=path, fix="Give a line of column names, then one row per point.")
-    names = [name.strip() for name in rows[0]]
-    _refuse_names(names, file=path, line=1)
     return pd.DataFrame(rows[1:], columns=names, dtype=object)
 
 
