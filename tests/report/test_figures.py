@@ -29,6 +29,7 @@ from sealfit.report.figures.residual import (
     draw_levels,
     draw_shape,
     finding,
+    residual_channels,
     run_means,
 )
 from sealfit.report.figures.speed import curve_lines, draw_starts, force_speed, run_points
@@ -251,6 +252,12 @@ def test_channels_have_95_percent_bars(ax):
     npt.assert_allclose(ends, [1 - 0.97998, 1 + 0.97998], rtol=1e-4)  # 1.95996 of 0.5
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["a", "b"]
     assert ax.get_ylabel() == "residual (mN m)"
+
+
+def test_means_that_are_all_missing_have_a_scale(made):
+    channels = made.tables["channels"].assign(before_N=np.nan, after_N=np.nan)
+    plot = residual_channels({**made.tables, "channels": channels}, made.config)
+    assert np.isfinite(plot.panels[0].limits["ylim"]).all()
 
 
 def test_the_strongest_channel_comes_first(made):

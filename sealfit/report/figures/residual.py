@@ -329,8 +329,8 @@ def _channel_panel(
 
 def _span(channels: pd.DataFrame) -> tuple[float, float]:
     """Return the ends of a scale for all means and intervals; a wide interval does not flatten the rest."""
-    means = channels[["before_N", "after_N"]]
-    half = Z95 * channels[["before_se_N", "after_se_N"]].fillna(0).to_numpy()
+    means = channels[["before_N", "after_N"]].fillna(0.0)
+    half = Z95 * channels[["before_se_N", "after_se_N"]].fillna(0.0).to_numpy()
     largest = 2.5 * means.abs().max().max()
     low = max((means - half).min().min(), -largest)
     high = min((means + half).max().max(), largest)
