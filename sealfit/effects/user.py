@@ -1,8 +1,8 @@
 """Effects of users: Python files in a folder that the command line names (see `store.paths`).
 
-This is the only place where Python of a user is run. A file defines one or more `Effect` at its top level,
-like the modules of this package. Modules it imports must be installed. Files whose name starts with an
-underscore are not read.
+This is the only place where Python of a user is run. A file has one or more functions that `effect` describes
+at its top level, like the modules of this package. Modules it imports must be installed. Files whose name
+starts with an underscore are not read.
 """
 
 from __future__ import annotations
