@@ -11,7 +11,7 @@ from scipy.special import stdtr
 from sealfit.closure import criteria
 from sealfit.closure.channels import level_values, settings
 from sealfit.fit.joint import Fitted, fit, fit_declared, fitted_at
-from sealfit.fit.joint.declared import DAYS_FOR_LAW
+from sealfit.fit.joint.declared import has_law
 from sealfit.fit.joint.rows import LEVELS, POWER, SAME_SPEED, Rows, sliding_power
 from sealfit.fit.joint.search import search_nonlinear
 
@@ -237,18 +237,14 @@ def _without_lost_edges(out: np.ndarray, condition: np.ndarray, rows: Rows) -> n
 def _edge(rows: Rows, condition: int) -> bool:
     """Whether a condition cannot be predicted without its rows.
 
-    It has parameters of its own where its series has too few days for an aging law, or none, and the law does
-    not extrapolate: day 0 and the last day are edges, too.
+    It has parameters of its own without an aging law, and the law does not extrapolate: day 0 and the last
+    day are edges, too.
     """
-    if not rows.has_aging:
+    law = rows.cache.once(("aging law",), lambda: has_law(rows.conditions, rows.has_aging))
+    if not law[condition]:
         return True
-    own = rows.conditions.iloc[condition]
-    of_series = (rows.conditions["series"] == own["series"]).to_numpy()
-    unaged = ((rows.conditions["rubber"] == own["rubber"]) & (rows.conditions["aging_days"] == 0)).to_numpy()
-    days = rows.conditions["aging_days"]
-    if days[of_series | unaged].nunique() < DAYS_FOR_LAW:
-        return True
-    return bool(own["aging_days"] in (0.0, days[of_series].max()))
+    days, series = rows.conditions["aging_days"], rows.conditions["series"]
+    return bool(days.iloc[condition] in (0.0, days[series == series.iloc[condition]].max()))
 
 
 def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.ndarray:

@@ -80,11 +80,7 @@ def _declare(rows: Rows) -> Declared:
     series_of = series_of_curve(conditions, aging)
     stribeck = _speed_forms(rows, series_of)
     rubbers, days = (conditions[name].tolist() for name in ("rubber", "aging_days"))
-    unaged_rubbers = {rubber for rubber, day in zip(rubbers, days, strict=True) if day == 0}
-    days_of: dict[str, set[float]] = {}
-    for s, rubber, day in zip(series_of, rubbers, days, strict=True):
-        days_of.setdefault(s, set()).update({day, 0.0} if rubber in unaged_rubbers else {day})
-    law = {s: bool(aging and len(own) >= DAYS_FOR_LAW and max(own) > 0) for s, own in days_of.items()}
+    law = dict(zip(series_of, has_law(conditions, aging).tolist(), strict=True))
     law_rubbers = {rubber for s, rubber in zip(series_of, rubbers, strict=True) if law[s]}
     parameters: dict[JointParameter, int] = {}
     index = {quantity: np.full(len(names), -1) for quantity in QUANTITIES}
@@ -108,6 +104,20 @@ def _declare(rows: Rows) -> Declared:
             use(c, "sigma_2", series)
     drops = _drops(index["mu_0s"], index["mu_0c"], rows)
     return Declared(tuple(parameters), index, stribeck, law, drops)
+
+
+def has_law(conditions: pd.DataFrame, aging: bool) -> np.ndarray:
+    """Return whether Eq. 15 is fitted to the series of each condition, shape (conditions,).
+
+    Its days, with those of unaged rubber, must be enough. `conditions` as for `series_of_curve`.
+    """
+    series = series_of_curve(conditions, aging)
+    rubbers, days = (conditions[name].tolist() for name in ("rubber", "aging_days"))
+    unaged_rubbers = {rubber for rubber, day in zip(rubbers, days, strict=True) if day == 0}
+    days_of: dict[str, set[float]] = {}
+    for s, rubber, day in zip(series, rubbers, days, strict=True):
+        days_of.setdefault(s, set()).update({day, 0.0} if rubber in unaged_rubbers else {day})
+    return np.array([aging and len(days_of[s]) >= DAYS_FOR_LAW and max(days_of[s]) > 0 for s in series])
 
 
 def _drops(number_s: np.ndarray, number_c: np.ndarray, rows: Rows) -> dict[tuple[int, int], float]:
