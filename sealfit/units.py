@@ -189,8 +189,7 @@ def conversion(unit: str, to: str) -> Conversion:
 def other_unit(said: str, unit: str) -> str | None:
     """Return the unit that a header says, if it is not `unit`: "" for one of another dimension; else None.
 
-    A unit that is not known says nothing; kg stands for kgf, and lbs for lbf. Headers spell units in any
-    case: MM stands for mm.
+    A unit that is not known says nothing.
 
     Examples
     --------
@@ -199,19 +198,17 @@ def other_unit(said: str, unit: str) -> str | None:
     >>> other_unit("kg", "kgf"), other_unit("Sek", "s")
     (None, None)
     """
-    if said == unit or not said[:1].isalpha() or None in (_dimension(said), _dimension(unit)):
+    if said == unit or not said[:1].isalpha():
         return None
-    lower = said.lower()
-    spelled = (lower, said, f"{lower.removesuffix('s')}f")
-    known = [one for one in spelled if _dimension(one) == _dimension(unit)]
-    alike = _letters(unit) in map(_letters, spelled)
-    if alike or any(abs(conversion(one, unit).factor - 1.0) < 1e-9 for one in known):
+    own, ours = unit_of(said), _dimension(unit)
+    spelled = (said.lower(), said, said if own is None else own.name)  # MM stands for mm, and kg for kgf
+    found = [_dimension(one) for one in spelled]
+    if ours is None or all(one is None for one in found):
+        return None
+    known = [name for name, one in zip(spelled, found, strict=True) if one == ours]
+    if any(abs(conversion(name, unit).factor - 1.0) < 1e-9 for name in known):
         return None
     return known[0] if known else ""
-
-
-def _letters(unit: str) -> str:
-    return re.sub("[ *·]", "", unit).lower()
 
 
 @cache
@@ -245,3 +242,82 @@ def _nearest(unit: str, dimension: Hashable) -> str:
     close = get_close_matches(unit, own, n=1, cutoff=0.3)
     named = close or [one for one in own if one.lower() == unit.lower()]
     return f"Did you mean '{named[0]}'?" if named else f"Units: {', '.join(own)}." if own else ""
+
+
+# ---------------------------------------------------------------- spellings
+# What a unit of a header or a file's name measures, and how a config spells it.
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A unit: what it measures, and its name in a config, which is pint's where it can be converted."""
+
+    dimension: str
+    name: str
+
+    @property
+    def suffix(self) -> str:
+        """The unit as the end of a column's name, e.g. "mm_s"."""
+        return {"degC": "C", "%": "pct"}.get(self.name, re.sub("[/ ]", "_", self.name))
+
+
+_LENGTHS = {"mm": "mm", "m": "m", "cm": "cm", "um": "um", "µm": "um", "μm": "um", "in": "in", "inch": "in"}
+_TIMES = {"s": "s", "sec": "s", "min": "min", "h": "h"}
+_SPELLINGS = {
+    ("time", "s"): ("s", "sec", "secs", "second", "seconds", "sek", "sekunden"),
+    ("time", "ms"): ("ms", "msec", "millisec", "milliseconds"),
+    ("time", "us"): ("us", "µs", "μs"),
+    ("time", "min"): ("min", "minutes", "minuten"),
+    ("time", "h"): ("h", "hr", "hours", "std", "stunden"),
+    ("time", "d"): ("d", "days", "day", "tage", "tag"),
+    ("time", "week"): ("wk", "week", "weeks", "woche", "wochen", "semaines"),
+    ("length", "ft"): ("ft",),
+    ("force", "N"): ("N",),
+    ("force", "kN"): ("kN",),
+    ("force", "mN"): ("mN",),
+    ("force", "daN"): ("daN",),
+    ("force", "uN"): ("uN", "µN", "μN"),
+    ("force", "lbf"): ("lbf", "lb", "lbs"),
+    ("force", "kgf"): ("kgf", "kp", "kg"),
+    ("force", "gf"): ("gf", "g"),
+    ("rotation", "rpm"): ("rpm", "1/min", "U/min", "min-1"),
+    ("torque", "N m"): ("Nm", "N m", "N*m", "N·m"),
+    ("torque", "mN m"): ("mNm", "mN m", "mN*m", "mN·m"),
+    ("torque", "N cm"): ("Ncm", "N cm", "N*cm", "N·cm"),
+    ("torque", "N mm"): ("Nmm", "N mm", "N*mm", "N·mm"),
+    ("angle", "deg"): ("deg", "°", "degrees"),
+    ("angle", "rad"): ("rad",),
+    ("angle", "turn"): ("turn", "turns", "rev", "U"),
+    ("temperature", "degC"): ("°C", "C", "degC", "deg C", "Grad C", "ºC"),
+    ("temperature", "degF"): ("°F", "F", "degF", "deg F", "ºF"),
+    ("temperature", "K"): ("K", "kelvin"),
+    ("share", "%"): ("%", "pct", "percent", "prozent", "Prozent"),
+    ("pressure", "bar"): ("bar",),
+    ("pressure", "mbar"): ("mbar",),
+    ("pressure", "kPa"): ("kPa",),
+    ("stress", "MPa"): ("MPa",),
+    ("none", "1"): ("-", "1", "segments", "counts", "cycles"),
+}
+UNITS = {
+    **{spelled: Unit(*unit) for unit, spellings in _SPELLINGS.items() for spelled in spellings},
+    **{spelled: Unit("length", unit) for spelled, unit in _LENGTHS.items()},
+    **{
+        f"{length}/{time}": Unit("speed", f"{_LENGTHS[length]}/{_TIMES[time]}")
+        for length in _LENGTHS
+        for time in _TIMES
+    },
+    **{spelled: Unit("none", spelled) for spelled in ("V", "mV", "A", "Hz", "kHz", "mV/V", "mm/mm")},
+}
+_BY_LOWER = {spelled.lower(): unit for spelled, unit in reversed(UNITS.items())}
+
+
+def unit_of(text: str) -> Unit | None:
+    """Return the unit that a text is, brackets around it or not; None if it is none that is known.
+
+    Examples
+    --------
+    >>> unit_of("[kN]").name, unit_of("Sec").name, unit_of("(µm)").name, unit_of("Weg")
+    ('kN', 's', 'um', None)
+    """
+    bare = text.strip().strip("[]()<>{}").strip()
+    return UNITS.get(bare) or _BY_LOWER.get(bare.lower())

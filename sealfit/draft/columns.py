@@ -9,8 +9,9 @@ import numpy as np
 
 from sealfit.config import Strokes
 from sealfit.draft.dialect import Dialect
-from sealfit.draft.vocabulary import Unit, column_role, name_and_unit, unit_of
+from sealfit.draft.vocabulary import column_role, name_and_unit
 from sealfit.ingest.strokes import Stroke, find_strokes, turning_rows
+from sealfit.units import Unit, unit_of
 
 SMOOTHED = 7  # samples, as `strokes.smooth_samples`
 MOVING = 0.3  # of the highest smoothed speed: slower samples belong to rests, ramps and turns

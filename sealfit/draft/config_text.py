@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sealfit.draft.dialect import When
-from sealfit.draft.vocabulary import Unit
-from sealfit.units import Units
+from sealfit.units import Unit, Units
 
 WIDTH = 110  # characters of a comment's line
 

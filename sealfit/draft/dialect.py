@@ -14,9 +14,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from sealfit.draft.vocabulary import Unit, column_role, name_and_unit, plain, setting, unit_of
+from sealfit.draft.vocabulary import column_role, name_and_unit, plain, setting
 from sealfit.ingest.files import as_number, split_line
-from sealfit.units import conversion
+from sealfit.units import Unit, conversion, unit_of
 
 # Lines from the top that are looked at: longer than the headers we know of, by five times.
 SAMPLE_LINES = 200

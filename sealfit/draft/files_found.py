@@ -13,13 +13,14 @@ import numpy as np
 from sealfit.config import AGING_CONDITION, Config, TraceFormat
 from sealfit.draft.dialect import MIN_ROWS, SETTINGS, STRAYS, Dialect, sniff
 from sealfit.draft.file_names import shape_of, tokens
-from sealfit.draft.vocabulary import UNAGED, Unit, name_and_unit, setting
+from sealfit.draft.vocabulary import UNAGED, name_and_unit, setting
 from sealfit.errors import BadFile, CampaignError, RequestError
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
 from sealfit.ingest.listing import RUNS_CSV, natural, read_table
 from sealfit.ingest.runs import time_of
 from sealfit.ingest.workbooks import LONGEST, read_sheet
+from sealfit.units import Unit
 
 SNIFFED = 24  # files of one kind of name that are looked at, spread evenly: more would show the same
 MOST = 240  # files that are looked at, however many ways of naming them there are

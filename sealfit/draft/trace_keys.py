@@ -20,13 +20,13 @@ from sealfit.draft.columns import (
 from sealfit.draft.config_text import Notes, date_lines, file_column
 from sealfit.draft.dialect import RATE, STRAYS, rate_in, settings_in, started_in
 from sealfit.draft.files_found import Found
-from sealfit.draft.vocabulary import UNITS, Unit, name_and_unit, plain
+from sealfit.draft.vocabulary import name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
 from sealfit.ingest.formats import kind_of
 from sealfit.ingest.strokes import several_speeds
 from sealfit.ingest.workbooks import rows_of_sheets
-from sealfit.units import Units, conversion
+from sealfit.units import UNITS, Unit, Units, conversion
 
 # A trace without a time unit is not taken to last longer than an hour at a sample per second or slower.
 LONG_S = 3600.0

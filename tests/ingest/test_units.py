@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, faults, read, refused, trace
 
-from sealfit.draft.vocabulary import UNITS, unit_of
 from sealfit.errors import ConfigError
-from sealfit.units import conversion, other_unit
+from sealfit.units import UNITS, conversion, other_unit, unit_of
 
 BY_HAND = [  # (unit, ours, number, the number in our unit)
     ("kgf", "N", 5.0, 49.03325),  # standard gravity, 9.80665 m/s2
