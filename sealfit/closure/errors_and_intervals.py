@@ -248,9 +248,9 @@ class Sandwich(NamedTuple):
 def degrees_of_freedom(fitted: Fitted) -> float:
     """Return the degrees of freedom of the coarsest level that scatters.
 
-    This is the number of its units less what the model takes of one number per unit, to which effects within
-    strokes add nothing; for specimens it is less the number of levels and aging laws. It is 0 if the model
-    takes nearly all runs: their scatter is not estimable then.
+    This is the number of its units less the degrees of freedom that the model takes from their mean forces.
+    Effects within strokes take none. For specimens the levels and aging laws are counted. It is 0 if the
+    model takes those of nearly all runs: their scatter is not estimable then.
     """
     starts = fitted.rows.groups.starts
     if starts["run"].size - _taken(fitted, "run") < LEAST_SPARE_RUNS:

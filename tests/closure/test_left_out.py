@@ -91,7 +91,7 @@ def test_no_file_is_left_out_where_another_may_be_the_wrong_one():
 
 
 def test_no_file_is_left_out_where_the_rest_does_not_predict_it_without_another():
-    """Two days of four speeds: without the wrong file nothing determines v_s of its condition but another."""
+    """Two days of four speeds: without the wrong file, one other file determines v_s of the condition."""
     design = {"days": (1.0, 12.0), "temperatures": (40.0, 100.0), "speeds": (2.35, 9.4, 37.5, 150.0)}
     for number in (3, 7):
         bins, files = bins_with({number: 0.83}, gain=0.002, repeats=1, **design)
