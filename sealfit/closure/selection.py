@@ -11,7 +11,14 @@ import pandas as pd
 
 from sealfit.closure.channels import Channel, channels_of, searched
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
-from sealfit.closure.criteria import EQUAL_BIC, HALF_OF_CALENDAR, MOST_PROPOSALS, PAIRS_FROM_P, WEAK_P
+from sealfit.closure.criteria import (
+    BINS_PER_WAVE,
+    EQUAL_BIC,
+    HALF_OF_CALENDAR,
+    MOST_PROPOSALS,
+    PAIRS_FROM_P,
+    WEAK_P,
+)
 from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import propose, rivals
@@ -354,14 +361,14 @@ def _no_stronger(candidates: Sequence[Candidate], proposal: Proposal) -> set[tup
 def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
     """Return the fit without effects that a later one has made redundant by the BIC.
 
-    The weakest is removed first, and after a removal all are tested again. Ripples are kept: they were tested
-    on the raw samples.
+    The weakest is removed first, and after a removal all are tested again. Ripples that bins do not resolve
+    are kept: they were tested on the raw samples.
     """
     while True:
         without = {
             k: fitted.refitted(fitted.model.without_term(k))
-            for k, a in enumerate(added[:-1])
-            if not a.proposal.term.effect.periodic
+            for k in range(len(added) - 1)
+            if not _finer_than_bins(fitted, k)
         }
         worth = {
             k: other.deviance - fitted.deviance - added[k].proposal.bic_penalty
@@ -372,3 +379,12 @@ def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitt
             return fitted, added
         fitted = fit(without[k].model, fitted.rows, fitted.scatter, turns=1)
         added = [*added[:k], *added[k + 1 :]]
+
+
+def _finer_than_bins(fitted: Fitted, number: int) -> bool:
+    """Whether a term is periodic, with too few bins a wavelength to show the wave."""
+    effect, values = fitted.model.terms[number].effect, fitted.model.values[number]
+    if not effect.periodic:
+        return False
+    width = float(np.median(np.abs(fitted.rows.bin_width(fitted.model.terms[number].channels[0]))))
+    return values["lambda_"] < BINS_PER_WAVE * width

@@ -16,36 +16,49 @@ DEVIANCE = {"abc": 0.0, "bc": 20.0, "ac": 1.0, "c": 2.0}
 
 @dataclass
 class Model:
-    """Effects by their letters."""
+    """Effects by their letters; waves have a length in mm."""
 
-    terms: str
+    letters: str
+    waves: dict
+
+    @property
+    def terms(self):
+        periodic = [SimpleNamespace(periodic=letter in self.waves) for letter in self.letters]
+        return [SimpleNamespace(effect=own, channels=("displacement_mm",)) for own in periodic]
+
+    @property
+    def values(self):
+        return [{"lambda_": self.waves.get(letter)} for letter in self.letters]
 
     def without_term(self, number):
-        return Model(self.terms[:number] + self.terms[number + 1 :])
+        return Model(self.letters[:number] + self.letters[number + 1 :], self.waves)
 
 
 def fit(model, *given, **options):
-    return SimpleNamespace(model=model, deviance=DEVIANCE[model.terms], rows=None, scatter=None, refitted=fit)
+    rows = SimpleNamespace(bin_width=lambda channel: np.array([-0.5, -0.5, 0.5]))
+    return SimpleNamespace(
+        model=model, deviance=DEVIANCE[model.letters], rows=rows, scatter=None, refitted=fit
+    )
 
 
-def effect(letter, *, periodic=False):
-    form = SimpleNamespace(effect=SimpleNamespace(periodic=periodic))
-    return SimpleNamespace(name=letter, proposal=SimpleNamespace(term=form, bic_penalty=PENALTY))
-
-
-def left(monkeypatch, added):
+def left(monkeypatch, **waves):
     monkeypatch.setattr(selection, "fit", fit)
-    fitted, kept = selection._remove_redundant(fit(Model("abc")), added)
-    assert fitted.model.terms == "".join(a.name for a in kept)
-    return fitted.model.terms
+    added = [SimpleNamespace(name=a, proposal=SimpleNamespace(bic_penalty=PENALTY)) for a in "abc"]
+    fitted, kept = selection._remove_redundant(fit(Model("abc", waves)), added)
+    assert fitted.model.letters == "".join(a.name for a in kept)
+    return fitted.model.letters
 
 
 def test_an_effect_is_asked_again_when_a_later_one_has_gone(monkeypatch):
-    assert left(monkeypatch, [effect("a"), effect("b"), effect("c")]) == "c"
+    assert left(monkeypatch) == "c"
 
 
-def test_a_ripple_is_not_dropped(monkeypatch):
-    assert left(monkeypatch, [effect("a", periodic=True), effect("b"), effect("c")]) == "ac"
+def test_a_ripple_that_bins_do_not_resolve_is_not_dropped(monkeypatch):
+    assert left(monkeypatch, a=1.9) == "ac"
+
+
+def test_a_long_wave_is_dropped_where_a_later_effect_makes_it_needless(monkeypatch):
+    assert left(monkeypatch, a=2.1) == "c"
 
 
 def a_loop(monkeypatch, candidates, proposals):
