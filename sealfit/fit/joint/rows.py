@@ -20,6 +20,8 @@ class Groups:
 
     starts: dict[str, np.ndarray]
     codes: dict[str, np.ndarray]
+    # By level; making one takes ten times as long as a sum.
+    _summing: dict[str, csr_array] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     @classmethod
     def of(cls, codes: dict[str, np.ndarray]) -> Groups:
@@ -33,11 +35,14 @@ class Groups:
 
     def sums(self, values: np.ndarray, level: str) -> np.ndarray:
         """Return the sum of `values`, shape (n,) or (n, k), over each group of a level."""
-        start, n = self.starts[level], values.shape[0]
+        start = self.starts[level]
         if values.ndim == 1:
             return np.add.reduceat(values, start)
-        summing = csr_array((np.ones(n), np.arange(n), np.r_[start, n]), shape=(start.size, n))
-        return summing @ values  # ten times as fast as reduceat
+        if level not in self._summing:
+            n = values.shape[0]
+            entries = (np.ones(n), np.arange(n), np.r_[start, n])
+            self._summing[level] = csr_array(entries, shape=(start.size, n))
+        return self._summing[level] @ values  # ten times as fast as reduceat
 
     def means(self, values: np.ndarray, level: str) -> np.ndarray:
         """Return the mean of `values`, shape (n,) or (n, k), in each group of a level."""
