@@ -151,10 +151,14 @@ def _least_small_sample(
 ) -> np.ndarray:
     """Return the smallest log p-value of all small-sample tests of one level in each of many draws."""
     drawn, least = units.draws(draws, rng), np.zeros(draws)
+    # The largest F has the smallest p-value where its degrees of freedom are the same.
+    most = defaultdict(lambda: np.zeros(draws))
     for test in tests:
         d = test.error_df + test.basis.shape[1]
-        own = small_sample_test.log_p_of(drawn[test.target], test.basis, test.known, d)
-        least = np.minimum(least, own)
+        f, *df = small_sample_test.f_of(drawn[test.target], test.basis, test.known, d)
+        most[tuple(df)] = np.maximum(most[tuple(df)], f)
+    for df, f in most.items():
+        least = np.minimum(least, small_sample_test.log_p_of_f(f, *df))
     return least
 
 

@@ -411,8 +411,20 @@ def log_p_of(values: np.ndarray, basis: np.ndarray, known: float, d: int | None 
 
     Both may be padded with zeros to more than d.
     """
+    return log_p_of_f(*f_of(values, basis, known, d))
+
+
+def f_of(
+    values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None
+) -> tuple[np.ndarray, int, float]:
+    """Return F, shape (m,), and its two degrees of freedom; arguments as `log_p_of`."""
     d, k = d or basis.shape[0], basis.shape[1]
     explained = ((values @ basis) ** 2).sum(axis=1)
     left = np.maximum((values**2).sum(axis=1) - explained, 1e-300)
     df = known + d - k
-    return np.log(np.maximum(fdtrc(k, df, explained / k / ((known + left) / df)), 1e-300))
+    return explained / k / ((known + left) / df), k, df
+
+
+def log_p_of_f(f: np.ndarray, k: int, df: float) -> np.ndarray:
+    """Return log p-values of F, shape (m,), with k and df degrees of freedom."""
+    return np.log(np.maximum(fdtrc(k, df, f), 1e-300))

@@ -130,6 +130,18 @@ def test_tests_on_few_specimens_are_adjusted_by_draws_and_never_by_more_than_the
     npt.assert_allclose(adjust_small_sample(FourNumbers, surer, np.random.default_rng(0)), 2 * np.exp(-30.0))
 
 
+def test_of_tests_with_unlike_degrees_of_freedom_the_smallest_p_value_counts():
+    log_p = np.log(0.05)
+    tests = [along(log_p, k) for k in (0, 1)]
+    tests += [along(log_p, 2)._replace(basis=np.eye(4)[:, 2:], error_df=2)]
+    tests += [along(log_p, 3)._replace(known=8.0)]
+    drawn = FourNumbers.draws(FLIPS, np.random.default_rng(0))[TARGET]
+    least = np.min([small_sample_log_p(drawn, test.basis, test.known) for test in tests], axis=0)
+    results = [ScoreTestResult(1.0, 1, 4, NOWHERE, small_sample=test) for test in tests]
+    found = adjust_small_sample(FourNumbers, results, np.random.default_rng(0))
+    npt.assert_allclose(found, (1 + np.count_nonzero(least <= log_p)) / (FLIPS + 1))
+
+
 def test_a_level_without_tests_adjusts_nothing():
     results = [ScoreTestResult(1.0, 1, 4, NOWHERE, small_sample=along(-9.0, 0)._replace(level="run"))]
     assert adjust_small_sample(FourNumbers, results, np.random.default_rng(0)).tolist() == [1.0]
