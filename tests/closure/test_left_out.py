@@ -83,7 +83,7 @@ def test_few_files_that_scatter_are_no_outliers():
 def test_no_file_is_left_out_where_another_may_be_the_wrong_one():
     """Twelve files, three speeds both ways: without either of two files the others agree."""
     design = {"days": (4.0,), "temperatures": (60.0,), "speeds": (1.0, 10.0, 100.0), "directions": (1, -1)}
-    for number in range(12):
+    for number in (0, 3, 4, 7, 8, 11):  # each condition and speed, one way and the other in turn
         bins, files = bins_with({number: 1.2}, gain=0.001, repeats=1, **design)
         (one,) = outlier_files(make_rows(bins, has_aging=True))
         assert one.instead
