@@ -146,23 +146,6 @@ def test_a_channel_of_words_and_numbers_is_words():
     assert table["empty"].null_count == 2
 
 
-def test_words_by_their_codes_are_written_as_any_others(tmp_path):
-    frame = small("bins").assign(batch=["a", None])
-    words = {
-        name: parquet.as_dictionary(pa.array(frame[name], from_pandas=True), np.array([0, 1, 0]))
-        for name in ("file", "batch")
-    }
-    rows = {name: frame[name].to_numpy()[[0, 1, 0]] for name in frame if name not in words}
-    table = parquet.to_arrow(rows | words, BINS, Units())
-    assert pa.types.is_dictionary(table.schema.field("file").type)
-    parquet.write_arrow(table, tmp_path / "coded.parquet")
-    parquet.write(frame.iloc[[0, 1, 0]], BINS, Units(), tmp_path / "spelled.parquet")
-    coded, spelled = (pq.read_table(tmp_path / f"{name}.parquet") for name in ("coded", "spelled"))
-    assert coded.schema.equals(spelled.schema, check_metadata=True)
-    assert coded.equals(spelled)
-    assert coded["batch"].to_pylist() == ["a", None, "a"]
-
-
 def test_metadata_holds_true_units_and_meaning():
     units = parse_config(
         '[quantities]\nforce = {quantity = "torque", unit = "mN m"}\n[column_units]\nhumidity = "g/kg"', "rig"

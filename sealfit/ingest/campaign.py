@@ -38,7 +38,6 @@ from sealfit.ingest.stored_parts import (
 )
 from sealfit.progress import timed
 from sealfit.store.manifest import Fingerprint, Fingerprints, fingerprint
-from sealfit.store.parquet import spelled_out
 from sealfit.store.staged_writes import file_size
 from sealfit.tables import RUNS, STEADY
 
@@ -284,8 +283,7 @@ def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
 
 
 def _stacked(tables: Sequence[pa.Table]) -> pd.DataFrame:
-    spelled = [table.cast(spelled_out(table.schema)) for table in tables]
-    return pa.concat_tables(spelled).replace_schema_metadata().to_pandas()
+    return pa.concat_tables(tables).replace_schema_metadata().to_pandas()
 
 
 def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:

@@ -23,7 +23,7 @@ from sealfit.ingest.files import as_number
 from sealfit.ingest.strokes import several_speeds
 from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints
-from sealfit.store.parquet import as_dictionary, to_arrow
+from sealfit.store.parquet import to_arrow
 from sealfit.tables import BINS, BOOL, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
 
 # ---------------------------------------------------------------- shaped
@@ -137,9 +137,9 @@ class Part:
     the strokes; `marks` are the fingerprints of those that were read now. `strokes` has a row per stroke with
     everything that is known of it, the keys included, and `used` by what the file itself shows; it is None
     where they are left on the disk, and once they are let go. `tables` are those of `SAMPLED` that have rows,
-    without the strokes that are not used or were asked to be left out, their words as dictionaries; or they
-    are on the disk, in `stored`: files by their names below OUT, with their sizes in bytes. `columns` are
-    those that the samples gave, `unused` and `wanted` what was asked for (`Asked`).
+    without the strokes that are not used or were asked to be left out; or they are on the disk, in `stored`:
+    files by their names below OUT, with their sizes in bytes. `columns` are those that the samples gave,
+    `unused` and `wanted` what was asked for (`Asked`).
     """
 
     marks: Fingerprints
@@ -170,8 +170,7 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
         if samples["steady"].any():
             tables["bins"] = _bins(samples, strokes, config)
     columns = {
-        name: {column.name: str(column.type) for column in parquet.spelled_out(table.schema)}
-        for name, table in tables.items()
+        name: {column.name: str(column.type) for column in table.schema} for name, table in tables.items()
     }
     if asked.columns is not None:
         for name, table in tables.items():
@@ -283,7 +282,7 @@ def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:
 def _traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config: Config) -> pa.Table:
     """Return table `traces`."""
     measured = {name: values for name, values in samples.items() if name not in ("row", "sliding", ALONG)}
-    words = {name: as_dictionary(_array(strokes[name]), samples["row"]) for name in ("file", "condition")}
+    words = {name: _array(strokes[name]).take(pa.array(samples["row"])) for name in ("file", "condition")}
     return to_arrow({**measured, **words}, TRACES, config.units)
 
 
@@ -294,7 +293,7 @@ def _mean_traces(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list],
     made = mean_traces({name: samples[name][rows] for name in names}, strokes)
     row = made.pop("row")
     made["direction"] = np.array(strokes["direction"])[row]
-    words = {name: as_dictionary(_array(strokes[name]), row) for name in ("run_id", "condition")}
+    words = {name: _array(strokes[name]).take(pa.array(row)) for name in ("run_id", "condition")}
     return to_arrow(made | words, TRACES_MEAN, config.units)
 
 
@@ -318,9 +317,5 @@ def _bins(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config
         if kind == FLOAT:  # null where a word stands for a number
             values = [as_number(value) if isinstance(value, str) else value for value in values]
         columns[name] = _array(values).cast(kind)
-    spread = {  # words as dictionaries
-        name: as_dictionary(values, place) if values.type == TEXT else values.take(pa.array(place))
-        for name, values in columns.items()
-        if name not in made
-    }
+    spread = {name: values.take(pa.array(place)) for name, values in columns.items() if name not in made}
     return to_arrow(spread | made, BINS, config.units)

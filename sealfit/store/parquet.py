@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,7 +27,7 @@ def to_arrow(frame: pd.DataFrame | Columns, schema: Schema, units: Units) -> pa.
 
     The schema's columns are first, in its order and types; if it is open, all others follow. Each field's
     metadata holds `unit` (the true one) and `meaning`; the table's holds `sealfit` (version and table) and
-    `units` (true unit by column). NaN becomes null; words may come as dictionaries (`as_dictionary`).
+    `units` (true unit by column). NaN becomes null.
 
     ValueError if a column is missing, doubled, of the wrong type, or not in a closed schema: a fault of the
     step, not of the user's data.
@@ -70,9 +69,7 @@ def with_columns(table: pa.Table, columns: Mapping[str, str], units: Units) -> p
             fields.append(_field(Column(name, CHANNEL, None), wanted, units))
             continue
         values = table.column(at)
-        if wanted == TEXT and pa.types.is_dictionary(values.type):
-            wanted = values.type
-        elif wanted == TEXT and values.type != TEXT:
+        if wanted == TEXT and values.type != TEXT:
             values = _as_words(values.to_pandas())
         arrays.append(values.cast(wanted))
         fields.append(table.schema.field(at).with_type(wanted))
@@ -89,36 +86,19 @@ def write(frame: pd.DataFrame, schema: Schema, units: Units, path: Path) -> None
     write_arrow(to_arrow(frame, schema, units), path)
 
 
-def as_dictionary(words: pa.Array, row: np.ndarray) -> pa.Array:
-    """Return every row's word, of those in `words`, as a dictionary: no word is spelled out for every row."""
-    codes = words.cast(TEXT).dictionary_encode()
-    return pa.DictionaryArray.from_arrays(codes.indices.take(pa.array(row)), codes.dictionary)
-
-
-def spelled_out(schema: pa.Schema) -> pa.Schema:
-    """Return the schema of the same table without dictionaries, as it is read from the disk."""
-    fields = [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in schema]
-    return pa.schema(fields, schema.metadata)
-
-
 def write_arrow(table: pa.Table, path: Path) -> None:
     """Write a table without checks; the caller syncs it to the disk. Raises OSError if the disk refuses."""
-    schema = spelled_out(table.schema)
-    measured = [field.name for field in schema if pa.types.is_floating(field.type)]  # have no dictionary
+    measured = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     settings = {
         "compression": "zstd",
-        "use_dictionary": [field.name for field in schema if field.name not in measured] or False,
+        "use_dictionary": [name for name in table.column_names if name not in measured] or False,
         # First bytes with first bytes, and so on: nothing to lose, and half the time to compress.
         "use_byte_stream_split": measured or False,
-        # Whoever reads it is told of words, as they are in a table without dictionaries.
-        "store_schema": False,
         "write_page_checksum": True,
     }
-    about = {**(schema.metadata or {}), b"ARROW:schema": base64.b64encode(schema.serialize())}
     # A file of Python's, so that a full disk is an OSError with its number.
-    with path.open("wb") as file, pq.ParquetWriter(file, table.schema, **settings) as writer:
-        writer.write_table(table)
-        writer.add_key_value_metadata(about)
+    with path.open("wb") as file:
+        pq.write_table(table, file, **settings)
 
 
 def write_ipc(table: pa.Table, path: Path) -> None:
@@ -168,7 +148,8 @@ def _check_schema(found: pa.Schema) -> None:
     schema = SCHEMAS[json.loads((found.metadata or {})[b"sealfit"])["table"]]
     numbers = [Column(name, CHANNEL) for name in AGING_CONDITION if name in found.names]
     for column in (*schema.columns, *numbers):
-        dtype = spelled_out(found).field(column.name).type
+        dtype = found.field(column.name).type
+        dtype = dtype.value_type if pa.types.is_dictionary(dtype) else dtype  # of a column that is `coded`
         if column.dtype not in (None, dtype):
             raise ValueError(f"column {column.name} has the type {dtype}")
 
