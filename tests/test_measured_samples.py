@@ -69,7 +69,7 @@ def test_screw_drives_lack_an_offset_between_directions_and_ripple_once_a_turn(t
 
 def test_hand_edited_cells_of_the_worm_drive_are_named(tutorial):
     quality = pd.read_parquet(tutorial[1] / "quality.parquet")
-    remarks = quality[quality["reason"].str.contains("remark")]
+    remarks = quality[quality["check"] == "not_a_number"]
     assert {Path(file).name for file in remarks["file"]} == {"1.csv", "2.csv", "n1.csv"}
     assert {str(value).split(",")[0] for value in remarks["value"]} == {"-1200", "-800", "-400"}
 

@@ -123,7 +123,6 @@ OVERLOAD = 1e24  # no rig measures this; instruments write 9.9e37 for overload a
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
 _CLOCK = re.compile(r"(?:.*[\sT])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:\s*([ap])\.?m\.?)?Z?", re.IGNORECASE)
 _DAY_S = 86400.0
-_NUMBER = re.compile(r"\s*[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?(?=[\s,;])")
 
 
 def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str) -> list[Fault]:
@@ -327,30 +326,19 @@ def cell_faults(
             return Fault("too_few_cells", reason, line=int(line[i]), fix=fix, **place)
         cell = "" if pd.isna(cell) else str(cell)  # as text: JSON has no inf
         value = cell.strip()
-        check, reason, fix = "not_a_number", "is not a number.", ""
+        check, reason = "not_a_number", "is not a number."
+        fix = decimal_fix(cell, decimal) or "Put a number there or delete the line."
         if not value:
             check, reason = "empty_cell", "holds no value: empty, n/a or the like."
             fix = "Fill it or delete the line."
         elif as_number(value, decimal) is not None:
             check, reason, fix = "not_finite", "is not a measured number.", "Delete the line."
-        elif remark := _remark(cell):
-            check, reason = "remark", f"a remark stands beside the number: {remark!r}."
-            fix = "Put the right number alone in the cell."
         elif i == 0 and not wrong.all() and not any(char.isdigit() for char in value):
             fix = "If this is a row of units, set units_row = true in the rig config; "
             fix += "otherwise delete the line."
-        else:
-            fix = decimal_fix(cell, decimal) or "Put a number there or delete the line."
         return Fault(check, reason, line=int(line[i]), value=value, fix=fix, **place)
 
     return listed(np.flatnonzero(wrong), make, "not_a_number", "cells of this column that are not numbers.")
-
-
-def _remark(cell: str) -> str:
-    """Return the words beside the number in a cell; "" if there is no number, or there are no words."""
-    number = _NUMBER.match(cell)
-    words = cell[number.end() :].strip(" \t,;") if number else ""
-    return words if any(char.isalpha() for char in words) else ""
 
 
 def decimal_fix(cell: str, decimal: str) -> str:
@@ -367,13 +355,10 @@ def decimal_fix(cell: str, decimal: str) -> str:
 def _beyond_faults(at, rows, line, width) -> list[Fault]:
     def make(i: int) -> Fault:
         value = " ".join(cell.strip() for cell in rows[i][width:] if cell.strip())
+        reason = f"the line has {len(rows[i])} cells where {width} are named."
         fix = "Move it to a column with a name of its own, or delete the line."
-        if as_number(value) is None:
-            check, reason = "remark", f"a remark stands beside the numbers: {value!r}."
-        else:
-            check, reason = "too_many_cells", f"the line has {len(rows[i])} cells where {width} are named."
-            if len(rows[i]) == 2 * width:
-                fix = "Decimal commas between commas? Export with another separator, or with decimal points."
-        return Fault(check, reason, line=int(line[i]), value=value, fix=fix, action="row left out")
+        if len(rows[i]) == 2 * width:
+            fix = "Decimal commas between commas? Export with another separator, or with decimal points."
+        return Fault("too_many_cells", reason, line=int(line[i]), value=value, fix=fix, action="row left out")
 
     return listed(at, make, "too_many_cells", "lines with cells beyond the last named column.")

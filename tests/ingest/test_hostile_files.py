@@ -76,7 +76,7 @@ def test_a_cell_of_thousands_of_separators_is_read_in_no_time(tmp_path):
 
 def test_a_remark_beside_a_number_is_quoted(tmp_path):
     found = read(tmp_path, csv_of([*ROWS, '10.0,50.0,"2.5, seal slipped"']))
-    assert [fault.reason for fault in found.faults] == ["a remark stands beside the number: 'seal slipped'."]
+    assert [(fault.check, fault.value) for fault in found.faults] == [("not_a_number", "2.5, seal slipped")]
 
 
 def test_long_cells_and_control_characters_are_shortened_and_escaped_in_messages():
