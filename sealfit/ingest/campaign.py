@@ -38,6 +38,7 @@ from sealfit.ingest.stored_parts import (
 )
 from sealfit.progress import timed
 from sealfit.store.manifest import Fingerprint, Fingerprints, fingerprint
+from sealfit.store.parquet import as_words
 from sealfit.store.staged_writes import file_size
 from sealfit.tables import RUNS, STEADY
 
@@ -258,17 +259,14 @@ def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
     """Return the strokes of all parts in one table; a column with words in one part has words in all."""
     whole = [part for part in parts if part.num_rows] or parts[:1]
     words = {column.name for part in whole for column in part.schema if column.type == pa.string()}
-    worded = [_worded(part, words) for part in whole]
+    worded = []
+    for part in whole:
+        for i, column in enumerate(part.schema):
+            if column.name in words and column.type != pa.string():
+                part = part.set_column(i, column.name, as_words(part.column(i).to_pandas()))
+        worded.append(part)
     table = pa.concat_tables(worded, promote_options="permissive").to_pandas()
     return table.assign(by_itself=table["used"])
-
-
-def _worded(part: pa.Table, words: set[str]) -> pa.Table:
-    for i, column in enumerate(part.schema):
-        if column.name in words and column.type != pa.string():
-            texts = part.column(i).to_pandas().map(str, na_action="ignore").astype(object)
-            part = part.set_column(i, column.name, pa.array(texts, pa.string(), from_pandas=True))
-    return part
 
 
 def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:

@@ -23,7 +23,7 @@ from sealfit.ingest.files import as_number
 from sealfit.ingest.strokes import several_speeds
 from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints
-from sealfit.store.parquet import to_arrow
+from sealfit.store.parquet import as_words, to_arrow
 from sealfit.tables import BINS, BOOL, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
 
 # ---------------------------------------------------------------- shaped
@@ -250,7 +250,7 @@ def _array(values: Sequence[object]) -> pa.Array:
     try:
         return pa.array(values, from_pandas=True)
     except (pa.ArrowInvalid, pa.ArrowTypeError):
-        return pa.array([value if value is None else str(value) for value in values], TEXT)
+        return as_words(pd.Series(values, dtype=object))
 
 
 def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) -> dict[str, np.ndarray]:

@@ -70,7 +70,7 @@ def with_columns(table: pa.Table, columns: Mapping[str, str], units: Units) -> p
             continue
         values = table.column(at)
         if wanted == TEXT and values.type != TEXT:
-            values = _as_words(values.to_pandas())
+            values = as_words(values.to_pandas())
         arrays.append(values.cast(wanted))
         fields.append(table.schema.field(at).with_type(wanted))
     return _table(arrays, fields, table.schema.metadata[b"sealfit"])
@@ -172,12 +172,13 @@ def _of_column(values: pd.Series | np.ndarray, column: Column) -> pa.Array | pa.
     if column.dtype == TEXT and isinstance(values.dtype, pd.StringDtype):
         return pa.array(values, from_pandas=True)
     if column.dtype == TEXT or (column.dtype is None and _mixed(values)):
-        return _as_words(pd.Series(values))
+        return as_words(pd.Series(values))
     missing = values.dtype != float or np.isnan(values).any()  # that none is, is seen faster here
     return pa.array(values, type=column.dtype, from_pandas=missing)
 
 
-def _as_words(values: pd.Series) -> pa.Array:
+def as_words(values: pd.Series) -> pa.Array:
+    """Return values of any kind as words, null where one is missing."""
     return pa.array(values.map(str, na_action="ignore").astype(object), type=TEXT, from_pandas=True)
 
 
