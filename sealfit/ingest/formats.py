@@ -45,7 +45,6 @@ CALLED = {
     "mat": "a MAT-file",
     "parquet": "a Parquet file",
 }
-_LIBRARIES = {"xlsx": "openpyxl", "tdms": "nptdms"}  # that every file of the kind needs
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]+")
 
 
@@ -70,12 +69,6 @@ def library(name: str, kind: str) -> ModuleType:
         reason = f"{CALLED[kind]} is read by {name}, which is not installed."
         fix = "Install it: pip install 'sealfit[formats]'"
         raise CampaignError([Fault("missing_library", reason, fix=fix)]) from None
-
-
-def require_libraries(files: Sequence[str], settings: TraceFormat) -> None:
-    """Raise `CampaignError` if a library that some of the files need is not installed."""
-    for kind in {kind_of(file, settings) for file in files} & _LIBRARIES.keys():
-        library(_LIBRARIES[kind], kind)
 
 
 @contextmanager

@@ -56,7 +56,7 @@ from sealfit.ingest.derived_columns import (
 from sealfit.ingest.expression import parse, read_by
 from sealfit.ingest.file_names import Listing, channels_of, fits_up_to, name_parts, unmatched
 from sealfit.ingest.files import as_number, bad_file, cut_files, placed, read_bytes
-from sealfit.ingest.formats import kind_of, require_libraries
+from sealfit.ingest.formats import kind_of
 from sealfit.ingest.listing import Entry, list_entries, misspelt
 from sealfit.ingest.reader import read_header, read_trace
 from sealfit.ingest.strokes import several_speeds
@@ -204,7 +204,6 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
         _stop_at_errors(faults)  # nothing can be said of files that are not there, and none outside is opened
     if not entries:
         raise CampaignError([*faults, NOTHING_LEFT])
-    require_libraries([entry.file for entry in entries], config.trace)
     kept, named, found = _named(entries, config)
     faults += found
     entries, cells = _kept(kept, entries, cells)
