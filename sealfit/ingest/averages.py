@@ -390,7 +390,7 @@ def _stroke_rows(
             "several": several,
             "several_speeds": stroke.several_speeds,
         }
-        found = stroke_faults(stroke, time_s, force, trace.line, config.quality, trace.number)
+        found = stroke_faults(stroke, time_s, force, trace.line, trace.number, config.quality)
         used = not any(fault.action == "stroke left out" for fault in found)
         if used:
             found += rising_faults(row["left"], row["force_N"], unit)

@@ -58,8 +58,8 @@ def stroke_faults(
     time_s: np.ndarray,
     force_N: np.ndarray,
     line: np.ndarray,
+    number: np.ndarray,
     settings: Quality,
-    number: np.ndarray | None = None,
 ) -> list[Fault]:
     """Return what is wrong with one stroke by itself: too short, gappy, saturated, stuck.
 
@@ -81,7 +81,6 @@ def stroke_faults(
         speed = float(stroke.speed_mm_s)
         found = [Fault("no_plateau", reason, column="speed_mm_s", value=speed, fix=fix, **KEPT)]
     whole, steady = slice(stroke.start, stroke.stop), stroke.rows
-    number = np.arange(len(line)) if number is None else number
     found += _gaps(time_s[whole], line[whole], number[whole], settings)
     force_N, line = force_N[steady], line[steady]
     return found + (_saturated(force_N, line, settings) or _stuck(force_N, line, settings))

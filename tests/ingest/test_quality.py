@@ -35,7 +35,8 @@ def trace(n=1000, noise=0.1, step=0.0, seed=0, ripple=0.0):
 def checks(time, x, force, **quality):
     config = Config(quality=Quality(**quality))
     (stroke,) = find_strokes(time, x, force, config.strokes)
-    return stroke_faults(stroke, time, force, 2 + np.arange(len(time)), config.quality)
+    number = np.arange(len(time))
+    return stroke_faults(stroke, time, force, 2 + number, number, config.quality)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -78,7 +79,8 @@ def blamed(force):
     none = np.zeros(len(force))
     stroke = Stroke(1, 0, len(force), 0, 1, 5.0, every, every, none, none + 5.0)
     time = np.linspace(0.0, 8.0, len(force))
-    return [f.check for f in stroke_faults(stroke, time, force, 2 + np.arange(len(force)), Quality())]
+    number = np.arange(len(force))
+    return [f.check for f in stroke_faults(stroke, time, force, 2 + number, number, Quality())]
 
 
 def test_a_few_samples_of_a_short_stroke_may_share_its_extreme():
@@ -139,7 +141,7 @@ def test_the_longest_gap_is_told_as_long_as_it_is_over_rows_filtered_out():
     kept = np.r_[0:400, 600:1000]
     number = np.r_[0:400, 410:810]  # 190 rows are lost, and 10 are filtered out
     (stroke,) = find_strokes(time[kept], x[kept], force[kept], Strokes())
-    (fault,) = stroke_faults(stroke, time[kept], force[kept], 2 + kept, Quality(), number)
+    (fault,) = stroke_faults(stroke, time[kept], force[kept], 2 + kept, number, Quality())
     assert "after this line, is 1.61 where 0.00801 is usual" in fault.reason
 
 
@@ -148,7 +150,7 @@ def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
     x = -10.0 * np.cos(0.5 * np.pi * time)
     force = 20.0 + 0.1 * np.gradient(x, time)
     (stroke,) = find_strokes(time, x, force, Strokes(min_steady_share=0.6))
-    (fault,) = stroke_faults(stroke, time, force, np.arange(200), Quality())
+    (fault,) = stroke_faults(stroke, time, force, np.arange(200), np.arange(200), Quality())
     assert (fault.check, fault.fix) == ("too_short", "Drive at a constant speed.")
     assert fault.reason.startswith("the speed never settles: the steady window is ")
 
@@ -156,7 +158,7 @@ def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
 def test_a_stroke_too_short_says_what_is_needed():
     time, x, force = trace(n=18)
     (stroke,) = find_strokes(time, x, force, Strokes())
-    (fault,) = stroke_faults(stroke, time, force, np.arange(18), Quality())
+    (fault,) = stroke_faults(stroke, time, force, np.arange(18), np.arange(18), Quality())
     assert (fault.check, fault.action) == ("too_short", "stroke left out")
     assert "at least 20 are needed" in fault.reason
     assert "strokes.min_samples" in fault.fix
