@@ -114,18 +114,6 @@ _MEANING = {
 # ---------------------------------------------------------------- conversion
 # Units of files to ours, by pint.
 
-_COMMON = {  # units that rigs write, by what they measure: for messages
-    "force": ("N", "kN", "mN", "uN", "kgf", "gf", "lbf", "ozf"),
-    "length": ("mm", "um", "nm", "cm", "m", "in", "mil", "ft"),
-    "time": ("s", "ms", "us", "min", "h", "d", "week"),
-    "speed": ("mm/s", "um/s", "cm/s", "m/s", "mm/min", "m/min", "in/s", "in/min", "km/h"),
-    "temperature": ("degC", "degF", "K"),
-    "torque": ("N*m", "mN*m", "N*mm", "N*cm", "lbf*in", "ozf*in"),
-    "rotational speed": ("rpm", "turn/s", "rad/s", "deg/s"),
-    "angle or ratio": ("%", "turn", "deg", "rad", "1"),
-    "pressure": ("bar", "mbar", "MPa", "kPa", "Pa", "psi"),
-    "mass": ("kg", "g", "lb", "oz"),
-}
 _FAR = 1000.0  # a scale with an offset is read here and at 0: its factor then keeps all digits
 
 
@@ -174,8 +162,8 @@ def conversion(unit: str, to: str) -> Conversion:
     if theirs != ours:
         found = f"{unit!r} is no known unit"
         if theirs is not None:
-            found = f"the unit {unit!r} is one of {_name(theirs)}"
-        raise ConfigError(f"{found}; {_name(ours)} ({to}) is expected.", fix=_nearest(unit, ours))
+            found = f"the unit {unit!r} is one of {_measured(unit)}"
+        raise ConfigError(f"{found}; {_measured(to)} ({to}) is expected.", fix=_nearest(unit, ours))
 
     def converted(value: float) -> float:
         return float(registry.Quantity(value, registry.Unit(unit)).m_as(registry.Unit(to)))
@@ -231,14 +219,17 @@ def _dimension(unit: str) -> Hashable | None:
         return None
 
 
-def _name(dimension: Hashable) -> str:
-    known = (name for name, units in _COMMON.items() if _dimension(units[0]) == dimension)
-    return next(known, re.sub(r"[\[\]]", "", str(dimension)))
+def _measured(unit: str) -> str:
+    """Return what a unit that pint knows measures."""
+    dimension, known = _dimension(unit), UNITS.get(unit)
+    if known is None or known.dimension == "none" or _dimension(known.name) != dimension:  # as kg, for kgf
+        return re.sub(r"[\[\]]", "", str(dimension))
+    return known.dimension
 
 
 def _nearest(unit: str, dimension: Hashable) -> str:
     """Return a fix: the unit of that dimension that is written most like `unit`."""
-    own = [one for units in _COMMON.values() for one in units if _dimension(one) == dimension]
+    own = [name for name in {known.name: None for known in UNITS.values()} if _dimension(name) == dimension]
     close = get_close_matches(unit, own, n=1, cutoff=0.3)
     named = close or [one for one in own if one.lower() == unit.lower()]
     return f"Did you mean '{named[0]}'?" if named else f"Units: {', '.join(own)}." if own else ""
