@@ -59,14 +59,10 @@ def _regular(pattern: str) -> str:
 
 
 def _expression(text: str, *, condition: bool = False) -> str:
-    """Raise ValueError for a text that is no expression."""
+    """Raise ConfigError for a text that is no expression."""
     from sealfit.ingest.expression import parse  # here, so that commands that read no config start quickly
 
-    try:
-        parse(text, condition=condition)
-    except ConfigError as error:
-        raise ValueError(str(error)) from None
-    return text
+    return parse(text, condition=condition).text
 
 
 def _encoding(name: str) -> str:
@@ -286,10 +282,7 @@ class Files(Strict):
         if self.name_pattern is None and (self.columns or self.compute):
             from sealfit.ingest.file_names import name_parts
 
-            try:
-                name_parts("", self, {})
-            except ConfigError as error:
-                raise ValueError(str(error)) from None
+            name_parts("", self, {})
         return self
 
     @property

@@ -274,7 +274,7 @@ class BadFile(SealfitError):
         return self.faults[-1]
 
 
-class ConfigError(SealfitError):
+class ConfigError(SealfitError, ValueError):  # as which pydantic names the key whose value is refused
     """A config file that cannot be used: unknown key, wrong type, unsafe expression."""
 
 
