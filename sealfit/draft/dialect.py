@@ -62,9 +62,9 @@ class Dialect:
     `header` are the lines above the data; `names` and `units` have one entry per column, or none;
     `names_back` and `units_back` count their lines back from the header's end, 1 the last; `names_are_cells`
     is False where the reader cuts the line of names in another way, as names hold the separator. `numbers`
-    are the positions (from 0) that hold numbers, `first` is the first line of data, `odd_lines` counts lines
-    between the data without any of these numbers, `footer` are the lines below. `decimal` is "" where no
-    number has one. `grouped` is a cell with marks between thousands, "" where there is none.
+    are the positions (from 0) that hold numbers, `first` is the first line of data, `footer` are the lines
+    below. `decimal` is "" where no number has one. `grouped` is a cell with marks between thousands, "" where
+    there is none.
     """
 
     delimiter: str
@@ -79,7 +79,6 @@ class Dialect:
     trailing: bool
     first: str
     names_are_cells: bool = True
-    odd_lines: int = 0
     footer: tuple[str, ...] = ()
     grouped: str = ""
 
@@ -166,7 +165,6 @@ def _dialect(lines: list[str], block: _Block) -> Dialect:
     numeric = [_numeric(line, delimiter, block.decimal) for line in lines[start:]]
     is_data = [found is not None and core <= found for found in numeric]
     last = max(i for i, good in enumerate(is_data) if good)
-    odd = sum(found is not None and core.isdisjoint(found) for found in numeric[:last])
     below = [line for line in lines[start + last + 1 :] if line.strip()]
     data = [line for line, good in zip(lines[start : start + SAMPLE_LINES], is_data, strict=False) if good]
     marks = ("\t" if delimiter == "tab" else delimiter, ",", ";")
@@ -191,7 +189,6 @@ def _dialect(lines: list[str], block: _Block) -> Dialect:
         trailing=delimiter != "whitespace" and ending > 0.5 * len(data),
         first=data[0],
         names_are_cells=names_at is None or rows[names_at] == _cells_of(header[names_at], delimiter),
-        odd_lines=odd,
         footer=tuple(below),
         grouped=next(in_groups, ""),
     )

@@ -96,11 +96,6 @@ def dialect_keys(found: Found, notes: Notes) -> None:
     if grouped := next((other.grouped for other in sniffed if other.grouped), ""):
         reason = f"some numbers have marks between thousands, such as '{grouped}'. They cannot be read."
         notes.doubt("trace.columns", reason, "Export the files again without these marks.")
-    odd = [other.odd_lines for other in sniffed if other.odd_lines]
-    if odd:
-        reason = f"in {len(odd)} of {len(sniffed)} files up to {max(odd)} lines between the data are none."
-        fix = "If a file holds several recordings, export one file each."
-        notes.doubt("trace", reason, f"They are left out, and `check` lists them. {fix}")
 
 
 def _header_keys(found: Found, of: str, notes: Notes) -> None:

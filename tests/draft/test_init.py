@@ -275,14 +275,6 @@ def test_documents_and_other_formats_do_not_disturb(tmp_path):
     assert doubt.reason.startswith("a.tdms holds no column of data")
 
 
-def test_rows_with_an_empty_cell_are_not_taken_for_several_recordings(tmp_path):
-    for one in exports.records(days=(4,), repeats=(1,)):
-        lines = plain(one).split("\n")
-        lines[9] = lines[9].rpartition(",")[0] + ","
-        exports.write(tmp_path, f"d4_v{one.speed:g}.csv", "\n".join(lines))
-    assert not any("several recordings" in doubt.fix for doubt in draft(tmp_path).doubts)
-
-
 def test_a_draft_of_many_files_looks_at_some_and_says_so(tmp_path):
     exports.german_daq(tmp_path)
     made = draft(tmp_path)
