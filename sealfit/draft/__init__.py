@@ -17,7 +17,6 @@ from sealfit.errors import RequestError
 # Guesses that the summary repeats: the others are in the draft.
 SHOWN = (
     "trace.columns.", "trace.rate_Hz", "condition", "files.glob", "files.name_pattern", "files.runs_columns",
-    "strokes.",
 )  # fmt: skip
 
 
@@ -44,7 +43,7 @@ def draft(folder: Path) -> Draft:
         fix = "Give the folder that holds traces: time, displacement and force in columns."
         raise RequestError(f"{tables}, but no time and no force.", file=folder, fix=f"{fix} {VALUES}")
     units = trace_keys.settled_units(roles, notes)
-    speeds = trace_keys.motion_keys(roles, units, list(tables), notes)
+    speeds = trace_keys.measured_speeds(roles, units, list(tables))
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)
     names = run_keys.suited_to(read_names(found.traces), roles)
     names = run_keys.improved(names, speeds, found, notes)

@@ -381,47 +381,24 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
     return [one.ours for one in settings]
 
 
-def motion_keys(
-    roles: Roles, units: Mapping[str, Unit | None], files: Sequence[str], notes: Notes
-) -> dict[str, float]:
-    """Say whether strokes go both ways and how many speeds a file has; return each file's measured speed.
-
-    It is negative where all strokes of the file go backward.
-    """
+def measured_speeds(roles: Roles, units: Mapping[str, Unit | None], files: Sequence[str]) -> dict[str, float]:
+    """Return the speed in mm/s of each file with strokes of one speed, negative where all go backward."""
     if roles.time is None or (roles.displacement is None and roles.speed is None):
+        return {}
+    if roles.dimension("displacement") == "angle":
         return {}
     given = {role: unit.name for role, unit in units.items() if unit is not None}
     in_s, in_mm = conversion(given.get("time", "s"), "s"), conversion(given.get("displacement", "mm"), "mm")
-    speeds: dict[str, list[float]] = {}
-    in_steps = set()
+    speeds: dict[str, float] = {}
     for i, file in enumerate(files):
         if roles.displacement is None:
-            speeds[file] = [mean_speed(roles.speed.values[i])]
+            speeds[file] = mean_speed(roles.speed.values[i])
             continue
         found = moving_strokes(in_s(roles.time.values[i]), in_mm(roles.displacement.values[i]))
-        speeds[file] = [stroke.speed_mm_s for stroke in found]
-        if any(stroke.several_speeds for stroke in found):
-            in_steps.add(file)
-    several = {file: found for file, all_ in speeds.items() if (found := several_speeds(all_))}
-    steps = {file: found for file, found in several.items() if file in in_steps}
-    if steps:
-        evidence = f"several steady speeds in a stroke, {_shown_speeds(steps, files)}: each is a stroke"
-        notes.guess("strokes.speed_tolerance", 0.1, evidence)
-    if others := {file: found for file, found in several.items() if file not in steps}:
-        reason = f"strokes in one direction have several speeds, {_shown_speeds(others, files)}."
-        fix = "Those of each speed are a run, unless names or a table give the file a speed: take that out."
-        notes.doubt("strokes", reason, fix)
-    if roles.dimension("displacement") == "angle":  # these speeds are not in mm/s
-        return {}
-    one_speed = {file: found for file, found in speeds.items() if found and file not in several}
-    signs = {file: -1 if max(found) < 0 else 1 for file, found in one_speed.items()}
-    return {file: float(np.median(np.abs(found)) * signs[file]) for file, found in one_speed.items()}
-
-
-def _shown_speeds(several: Mapping[str, Sequence[float]], files: Sequence[str]) -> str:
-    file, found = next(iter(several.items()))
-    shown = ", ".join(f"{speed:.3g}" for speed in found[:6])
-    return f"in {len(several)} of {len(files)} files read: {shown} mm/s in {file}"
+        own = [stroke.speed_mm_s for stroke in found]
+        if own and not several_speeds(own):
+            speeds[file] = float(np.median(np.abs(own)) * (-1 if max(own) < 0 else 1))
+    return speeds
 
 
 def motion_words(roles: Roles) -> str:

@@ -131,31 +131,6 @@ def test_a_number_in_names_that_is_the_measured_speed_is_the_speed(tmp_path):
     assert "(?P<speed_mm_s>" in config.files.name_pattern
 
 
-def test_a_file_with_steps_of_speed_is_told(tmp_path):
-    time = 0.05 * np.arange(400)
-    for number, first in enumerate((1.0, 2.0), start=1):
-        speed = np.where(time < 10, first, 4 * first)
-        way = np.cumsum(speed) * 0.05
-        body = exports.table([time, way, 40 + 0.1 * speed], ",", 4)
-        exports.write(tmp_path, f"d4_r{number}.csv", "time_s,position_mm,force_N\n" + body)
-    made = draft(tmp_path)
-    (guess,) = [guess for guess in made.guesses if guess.key == "strokes.speed_tolerance"]
-    assert "2 of 2 files read: 1, 4 mm/s" in guess.evidence
-    assert not [doubt for doubt in made.doubts if doubt.key == "strokes"]
-
-
-def test_strokes_of_a_file_at_different_speeds_are_a_doubt(tmp_path):
-    time = 0.05 * np.arange(800)
-    for number, first in enumerate((1.0, 2.0), start=1):
-        speed = np.where(time < 20, first, 4 * first) * np.where(time % 20 < 10, 1, -1)
-        way = np.cumsum(speed) * 0.05
-        body = exports.table([time, way, 40 + 0.1 * speed], ",", 4)
-        exports.write(tmp_path, f"d4_r{number}.csv", "time_s,position_mm,force_N\n" + body)
-    (doubt,) = [doubt for doubt in draft(tmp_path).doubts if doubt.key == "strokes"]
-    assert "1, 4 mm/s" in doubt.reason
-    assert doubt.fix.startswith("Those of each speed are a run, ")
-
-
 @pytest.mark.parametrize("strokes", [1, 2, 4, 7])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_strokes_are_counted(strokes, sign):
