@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
 import shlex
 import sys
 import traceback
@@ -69,19 +68,7 @@ def end(command: str, made: dict, lines: Callable[[dict], list[str]], as_json: b
     if as_json:
         print_json({"ok": True, "command": command, **made})
     else:
-        typer.echo("\n".join(_coloured(printable(text)) for text in lines(made)))
-
-
-VERDICT_COLOURS = {"closed": "green", "nothing_missing": "green", "cannot_tell": "yellow"}
-
-
-def _coloured(text: str) -> str:
-    """Return a line of a summary, its verdict in colour; `typer.echo` removes colour off a terminal."""
-    found = re.match(r"verdict +(\w+)", text)
-    if found is None or os.environ.get("NO_COLOR"):
-        return text
-    verdict = typer.style(found[1], fg=VERDICT_COLOURS.get(found[1], "red"), bold=True)
-    return text[: found.start(1)] + verdict + text[found.end(1) :]
+        typer.echo("\n".join(map(printable, lines(made))))
 
 
 def print_json(document: dict) -> None:

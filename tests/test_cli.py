@@ -93,15 +93,6 @@ def test_help_has_an_example_and_plain_arguments(sealfit, command):
     assert "{" not in ended.stdout
 
 
-@pytest.mark.parametrize(("colour", "expected"), [(None, "\x1b["), ("1", "verdict     closed: it is")])
-def test_a_verdict_is_in_colour_unless_it_is_not_wanted(monkeypatch, colour, expected):
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    if colour:
-        monkeypatch.setenv("NO_COLOR", colour)
-    assert expected in cli._coloured("verdict     closed: it is")
-    assert cli._coloured("files       3 used") == "files       3 used"
-
-
 def test_the_summary_names_the_settings_of_the_next_runs(sealfit, parts, campaign, out):
     ended = sealfit("run", campaign, "--out", out)
     assert "next runs   a second load would separate them: load_N 98\n" in ended.stdout
