@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,8 +19,8 @@ from sealfit.draft.vocabulary import DIRECTIONS, RUBBERS, UNAGED, after_number, 
 SUFFIX = re.compile(r"\.(?=[^./]*[^\W\d])[^./]*$")
 _TOKEN = re.compile(
     r"(?P<date>(?<!\d)20\d\d(?P<_d>[-_.]?)(?:0[1-9]|1[0-2])(?P=_d)(?:0[1-9]|[12]\d|3[01])(?!\d)"
-    r"(?:[T_\- ](?:[01]\d|2[0-3])(?P<_t>[-:.h]?)[0-5]\d(?:(?P=_t)[0-5]\d)?(?!\d))?)"
-    r"|(?P<dmy>(?<!\d)(?:0[1-9]|[12]\d|3[01])(?P<_g>[-.])(?:0[1-9]|1[0-2])(?P=_g)20\d\d(?!\d))"
+    r"(?:[T_\- ](?:[01]\d|2[0-3])(?P<_t>[-:.h]?)[0-5]\d(?:(?P=_t)[0-5]\d)?(?!\d))?"
+    r"|(?<!\d)(?:0[1-9]|[12]\d|3[01])(?P<_g>[-.])(?:0[1-9]|1[0-2])(?P=_g)20\d\d(?!\d))"
     r"|(?P<word>(?<![^\W\d_])(?:[mµuc]?m|in)[-_ /]?(?:per|p)?(?:s|min)(?![^\W\d_])|[^\W\d_]+|[%°]+[^\W\d_]*)"
     r"|(?P<number>(?:(?:(?<=[/_\s=(])|^)-)?\d+(?:[.,]\d+|p\d+)?)"
     r"|(?P<sep>[^\w%°]+|_+)"
@@ -39,7 +39,7 @@ COUNTED = 6
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A piece of a name: `kind` is date, dmy, word, number or sep."""
+    """A piece of a name: `kind` is date, word, number or sep."""
 
     kind: str
     text: str
@@ -147,7 +147,7 @@ def pattern_of(names: Names) -> str:
         if part is None:
             pieces.append(re.escape(token.text) if token.kind != "number" else r"\d+(?:[.,p]\d+)?")
         elif part.ours == "started_at":
-            pieces.append(_date_pattern(token.text, token.kind))
+            pieces.append(_date_pattern(token.text))
         else:
             pieces.append(f"(?P<{part.group}>{part.pattern})" if part.ours else f"(?:{part.pattern})")
         if optional is not None and optional.at == at:
@@ -161,11 +161,11 @@ def pattern_of(names: Names) -> str:
     return pattern + ("".join(endings) if len(endings) < 2 else f"(?:{'|'.join(endings)})")
 
 
-def _date_pattern(text: str, kind: str) -> str:
+def _date_pattern(text: str) -> str:
     """Return the pattern of a date, with its numbers named in their order."""
     names = iter(("_year", "_month", "_day", "_hour", "_minute", "_second"))
     numbers = r"^\d{4}|\d\d"
-    if kind == "dmy":
+    if not text[:4].isdecimal():
         names, numbers = iter(("_day", "_month", "_year")), r"\d{4}$|\d\d"
     return re.sub(numbers, lambda found: rf"(?P<{next(names)}>\d{{{len(found[0])}}})", re.escape(text))
 
@@ -231,7 +231,8 @@ def read_names(files: Sequence[str]) -> Names:
             break
     rows = [cut[file] for file in main]
     if sign is not None:
-        signed = [pieces for pieces in cut.values() if _has_word(pieces, sign, rows[0])]
+        added = (sign[0], *sign)
+        signed = [pieces for pieces in cut.values() if added in _words_instead(pieces, rows[0])]
         rows += [pieces[: sign[0]] + pieces[sign[0] + 1 :] for pieces in signed]
     parts = _parts(rows)
     middle, words = _unaged(rows[0], parts, [cut[f] for f in files if f not in set(main)])
@@ -248,8 +249,8 @@ def _parts(rows: Sequence[Sequence[Token]]) -> list[Part]:
     found: list[Part] = []
     for at, token in enumerate(rows[0]):
         texts = tuple(dict.fromkeys(row[at].text for row in rows))
-        if token.kind in ("date", "dmy"):
-            doubt = "the day is taken to stand before the month" if token.kind == "dmy" else ""
+        if token.kind == "date":
+            doubt = "" if token.text[:4].isdecimal() else "the day is taken to stand before the month"
             found.append(Part(at, "started_at", "", texts, "a date", doubt=doubt))
         elif token.kind == "word" and (part := _word(at, texts)):
             found.append(part)
@@ -390,25 +391,26 @@ def _without_doubles(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> 
     return made
 
 
+def _words_instead(pieces: Sequence[Token], main: Sequence[Token]) -> Iterator[tuple[int, int, str]]:
+    """Yield the words of a name that stand in place of a range of the main ones, which may be empty."""
+    for at, token in enumerate(pieces):
+        last = len(main) - (len(pieces) - at - 1)
+        around = (shape_of(pieces[:at]), shape_of(pieces[at + 1 :]))
+        if token.kind == "word" and at <= last and around == (shape_of(main[:at]), shape_of(main[last:])):
+            yield at, last, token.text
+
+
 def _unaged(
     main: Sequence[Token], parts: Sequence[Part], others: Sequence[Sequence[Token]]
 ) -> tuple[tuple[int, int] | None, list[str]]:
     """Return the range of pieces that a word such as `unaged` replaces, and these words."""
     days = [part.at for part in parts if part.ours == "aging_days"]
-    ranges: Counter = Counter()
-    words: list[str] = []
-    for pieces in others:
-        for at, token in enumerate(pieces):
-            if token.kind == "word" and token.text.lower() in UNAGED:
-                left, right = at, len(pieces) - at - 1
-                head, tail = shape_of(main)[:left], shape_of(main)[len(main) - right :]
-                if (head, tail) == (shape_of(pieces)[:left], shape_of(pieces)[at + 1 :]):
-                    ranges[left, len(main) - right] += 1
-                    words.append(token.text)
+    instead = [one for pieces in others for one in _words_instead(pieces, main) if one[2].lower() in UNAGED]
+    ranges = Counter((first, last) for first, last, _ in instead)
     first, last = ranges.most_common(1)[0][0] if ranges else (0, 0)
     if not days or not first <= days[0] < last:
         return None, []
-    return (first, last), sorted(set(words))
+    return (first, last), sorted({word for _, _, word in instead})
 
 
 def _optional_word(
@@ -420,19 +422,11 @@ def _optional_word(
     """
     row = cut[main[0]]
     for members in groups.values():
-        pieces = cut[members[0]]
-        if len(pieces) != len(row) + 1 or len(members) < ALIKE * len(main):
-            continue
-        for at, token in enumerate(row):
-            word = (at, pieces[at].text)
-            if token.kind == "number" and pieces[at].kind == "word" and _has_word(pieces, word, row):
-                return word
+        if len(members) >= ALIKE * len(main):
+            for first, last, word in _words_instead(cut[members[0]], row):
+                if first == last < len(row) and row[first].kind == "number":
+                    return first, word
     return None
-
-
-def _has_word(pieces: list[Token], word: tuple[int, str], row: Sequence[Token]) -> bool:
-    at, text = word
-    return shape_of(pieces[:at] + pieces[at + 1 :]) == shape_of(row) and pieces[at].text == text
 
 
 def _with_sign(parts: Sequence[Part], sign: tuple[int, str]) -> list[Part]:
