@@ -15,6 +15,7 @@ from pydantic import Field, ValidationError, model_validator
 from sealfit.config import Strict, explain, parse_toml, read_toml
 from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
+from sealfit.ingest.columns import RESERVED, SLOTS
 from sealfit.ingest.expression import parse
 from sealfit.simulation.model import CONDITIONS, EffectEntry, Physics, resolve_effects
 from sealfit.simulation.noise import Channel, Noise
@@ -193,12 +194,7 @@ def _dated(files: pd.DataFrame, design: Design, random: np.random.Generator) -> 
 # ---------------------------------------------------------------- spec
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-TAKEN = {  # of traces, of runs.csv, derived from them, and of formulas
-    "time_s", "displacement_mm", "force_N",
-    "file", "run_id", "repeat", "specimen_id", *CONDITIONS, "load_N", "speed_mm_s", "started_at",
-    "distance_mm", "stroke", "direction", "run_order", "elapsed_h", "speed_set_mm_s", "condition", "series",
-    "rubber", "pi",
-}  # fmt: skip
+TAKEN = {*SLOTS, *RESERVED, *CONDITIONS, "pi"}  # of traces, of tables, and of formulas
 
 
 class Spec(Strict):
