@@ -207,13 +207,11 @@ def source_keys(
 def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:
     if not others:
         return
-    dialect = next(iter(others.values()))
-    delimiter = f"separator '{dialect.delimiter}'"
-    decimal = f", decimal '{dialect.decimal}'" if dialect.decimal else ""
-    names = f", columns {', '.join(dialect.names[:4])}" if dialect.names else ""
-    form, shown = f"({delimiter}{decimal}{names})", ", ".join(list(others)[:3])
+    one, shown = next(iter(others.values())), ", ".join(list(others)[:3])
+    columns = ", ".join(one.names[:4]) or "without names"
+    form = f"separator '{one.delimiter}', decimal '{one.decimal or '.'}', columns {columns}"
     fix = "Move them to a folder of their own and draft a config for them, too."
-    reason = f"{len(others)} files are written otherwise {form}: {shown}."
+    reason = f"{len(others)} files are written otherwise ({form}): {shown}."
     notes.doubt("files", reason, f"One config reads files of one form. {fix}")
 
 
@@ -282,23 +280,13 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
             notes.doubt("files.name_pattern", reason, "Check what it stands for.")
     for table, evidence in OF_NAMES.items():
         for name, value in getattr(settings, table).items():
-            specimens = (table, name) == ("columns", "specimen_id")
-            notes.guess(f"files.{table}.{name}", value, _specimens(names, notes) if specimens else evidence)
-
-
-def _specimens(names: Names, notes: Notes) -> str:
-    """Add the doubt about what names say of specimens; return the evidence."""
-    if any(part.ours == "specimen_id" for part in names.parts):
-        evidence = "the number of the piece of rubber, within its condition"
-        reason = "files of a condition are taken as different pieces."
-        fix = "If they are repeats with one piece, call the part `repeat` in name_pattern "
-        fix += "and delete this line."
-    else:
-        evidence = "unaged rubber was tested with several series, in files that are alike otherwise"
-        reason = "each series is taken to have a piece of unaged rubber of its own."
-        fix = "If it was the same piece, number its repeats through and delete this line."
-    notes.doubt("files.columns.specimen_id", reason, fix)
-    return evidence
+            notes.guess(f"files.{table}.{name}", value, evidence)
+    if template := settings.columns.get("specimen_id"):
+        reason = (
+            f"files with another '{template}' are taken to be of other pieces of rubber, unaged ones, too."
+        )
+        fix = "If one piece was tested, delete this line, and number its repeats through."
+        notes.doubt("files.columns.specimen_id", reason, fix)
 
 
 def _example(part: Part) -> str:
@@ -381,8 +369,7 @@ def condition_keys(names: Names, table: RunsTable | None, header: Collection[str
     if "rubber" in given and (table is not None or "rubber" in varied):
         notes.guess("rubber", ["rubber"], "a column of its own for each rubber")
     if aging:
-        found = [f"{name} from {_origin(name, names, table)}" for name in aging]
-        notes.guess("condition", aging, ", ".join(found))
+        notes.guess("condition", aging, f"{', '.join(aging)}: what is known of the aging")
         missing = [name for name in AGING_CONDITION if name not in given]
         if missing:
             reason = f"nothing says {' or '.join(missing)}: the same is assumed for all files."
@@ -402,9 +389,3 @@ def condition_keys(names: Names, table: RunsTable | None, header: Collection[str
     notes.guess("files.columns.state", "one", "the same for all files")
     notes.doubt("condition", "nothing says what differs between the files: all are taken as one condition.",
                 f"{write} temperature_C, compression_ratio_pct and aging_days.")  # fmt: skip
-
-
-def _origin(name: str, names: Names, table: RunsTable | None) -> str:
-    if table is not None and name in table.given:
-        return table.file
-    return "the names of files" if name in names.given else "the header"

@@ -289,7 +289,7 @@ def test_unaged_rubber_of_several_series_is_a_piece_in_each(tmp_path):
     made = draft(tmp_path)
     config = parse_config(made.text, "rig.toml")
     assert config.files.columns["specimen_id"] == "{temperature_C} {aging_days}"
-    assert any("a piece of unaged rubber of its own" in doubt.reason for doubt in made.doubts)
+    assert any("other pieces of rubber, unaged ones, too" in doubt.reason for doubt in made.doubts)
     runs = ingest_campaign(tmp_path, config).tables["runs"]
     assert sorted(runs.loc[runs["aging_days"] == 0, "specimen_id"].unique()) == ["60 0", "80 0"]
 
