@@ -180,12 +180,11 @@ def _write(spec: Spec, folder: Path) -> dict:
         channels = _channels(record, motion, along)
         friction, added = _forces(spec, law, motion, channels, speed)
         clean = scatter.gain[number] * friction + added + scatter.offset_N[number]
-        force = clean + noise.sample_noise_N(spec.noise, clean, motion.time_s, speed, number, seed)
-        wobble = noise.displacement_noise_mm(spec.noise, len(force), number, seed)
+        force, displacement = noise.logged(spec.noise, clean, motion, speed, number, seed)
         columns = {
             "time_s": motion.time_s,
-            "displacement_mm": np.round(motion.displacement_mm + wobble, DISPLACEMENT_DECIMALS),
-            "force_N": np.round(noise.quantised(spec.noise, force), spec.force_decimals),
+            "displacement_mm": np.round(displacement, DISPLACEMENT_DECIMALS),
+            "force_N": np.round(force, spec.force_decimals),
             **along,
         }
         if number in defects:

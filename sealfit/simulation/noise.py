@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 from zlib import crc32
 
 import numpy as np
@@ -16,6 +16,9 @@ from scipy.signal import lfilter
 from sealfit.config import Expression, Strict
 from sealfit.errors import ConfigError
 from sealfit.ingest.expression import evaluate, parse
+
+if TYPE_CHECKING:
+    from sealfit.simulation.motion import Motion
 
 # ---------------------------------------------------------------- draws
 # Random numbers depend only on the seed and their purpose. Adding a kind of noise or a channel to a SPEC
@@ -167,44 +170,34 @@ def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> Scat
     return Scatter(gain, offset, speed, outlier)
 
 
-def sample_noise_N(
-    noise: Sequence[Noise], force_N: np.ndarray, time_s: np.ndarray, speed_mm_s: float, file: int, seed: int
-) -> np.ndarray:
-    """Return the noise of one trace's samples in N, shape (n,): white, autocorrelated and proportional.
+def logged(
+    noise: Sequence[Noise], force_N: np.ndarray, motion: Motion, speed_mm_s: float, file: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return force in N and displacement in mm as the sensors of one trace give them, shape (n,) each.
 
-    `force_N`, without noise, and `time_s`, at equal steps, have the shape (n,). The magnitude of the speed
-    turns a correlation length in mm into one in s. Every `file`, by its number, has its own noise.
+    `force_N` is without noise, shape (n,), at equal time steps. The magnitude of the speed turns a length of
+    correlation in mm into one in s. Every `file`, by its number, has its own noise. The force is rounded to
+    the sensor's resolution.
     """
     n = len(force_N)
-    total = np.zeros(n)
+    of_force, of_displacement = np.zeros(n), np.zeros(n)
     for kind, random in _streams(noise, seed, file):
         match kind:
             case White():
-                total += kind.sd_N * random.standard_normal(n)
+                of_force += kind.sd_N * random.standard_normal(n)
             case Proportional():
-                total += kind.sd_rel * np.abs(force_N) * random.standard_normal(n)
+                of_force += kind.sd_rel * np.abs(force_N) * random.standard_normal(n)
             case Autocorrelated():
-                second = time_s[1] - time_s[0]
+                second = motion.time_s[1] - motion.time_s[0]
                 step = {"samples": 1.0, "s": second, "mm": second * speed_mm_s}[kind.unit]
-                total += kind.sd_N * remembering(random.standard_normal(n), np.exp(-step / kind.length))
-    return total
-
-
-def displacement_noise_mm(noise: Sequence[Noise], n: int, file: int, seed: int) -> np.ndarray:
-    """Return the noise of one trace's displacement in mm, shape (n,)."""
-    total = np.zeros(n)
-    for kind, random in _streams(noise, seed, file):
-        if isinstance(kind, DisplacementNoise):
-            total += kind.sd_mm * random.standard_normal(n)
-    return total
-
-
-def quantised(noise: Sequence[Noise], force_N: np.ndarray) -> np.ndarray:
-    """Return the force rounded to the sensor's resolution."""
+                of_force += kind.sd_N * remembering(random.standard_normal(n), np.exp(-step / kind.length))
+            case DisplacementNoise():
+                of_displacement += kind.sd_mm * random.standard_normal(n)
+    force = force_N + of_force
     for kind in noise:
         if isinstance(kind, Quantised):
-            force_N = kind.resolution_N * np.round(force_N / kind.resolution_N)
-    return force_N
+            force = kind.resolution_N * np.round(force / kind.resolution_N)
+    return force, motion.displacement_mm + of_displacement
 
 
 def _streams(noise: Sequence[Noise], seed: int, *file: int) -> Iterator[tuple[Noise, np.random.Generator]]:
