@@ -34,8 +34,6 @@ def name_and_unit(text: str) -> tuple[str, Unit | None]:
     for pattern in _NAME_AND_UNIT:
         if match := pattern.match(text.strip()):
             unit = unit_of(match["unit"]) or unit_of(match["unit"].replace("_", "/"))
-            if unit is None and match["name"].endswith("_mm") and match["unit"] in ("s", "min"):
-                unit = unit_of(f"mm/{match['unit']}")
             name = match["name"].strip(" _,:")
             bare = match["unit"] in ("F", "K") and setting(name) != "temperature_C"  # Kraft F, Karte K
             if unit is not None and not bare:
