@@ -64,11 +64,6 @@ class Found:
         usual = list(self.dialects.values())
         return next((one for one in usual if one.decimal), usual[0])
 
-    @property
-    def of_arrays(self) -> bool:
-        """Whether the traces are no text, so that nothing is to be said of their lines."""
-        return kind_of(self.traces[0]) in OF_ARRAYS
-
 
 def look(folder: Path) -> Found:
     """Return what lies in a folder.

@@ -23,7 +23,7 @@ from sealfit.draft.files_found import Found
 from sealfit.draft.vocabulary import name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
-from sealfit.ingest.formats import kind_of
+from sealfit.ingest.formats import OF_ARRAYS, kind_of
 from sealfit.ingest.strokes import several_speeds
 from sealfit.ingest.workbooks import rows_of_sheets
 from sealfit.units import UNITS, Unit, Units, conversion
@@ -69,8 +69,8 @@ def _sheet_key(found: Found, notes: Notes) -> None:
 
 def dialect_keys(found: Found, notes: Notes) -> None:
     """Add the keys of how the files are written."""
-    if found.of_arrays:
-        return
+    if kind_of(found.traces[0]) in OF_ARRAYS:
+        return  # no text: nothing is to be said of lines
     _sheet_key(found, notes)
     one, sniffed = found.dialect, found.sniffed
     of = f"{len(sniffed)} of {len(sniffed)} files"
