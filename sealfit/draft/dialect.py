@@ -261,7 +261,7 @@ class Setting:
 class When:
     """A date in a header line of every file, and the keys of a config that read it.
 
-    The time of day is a field of its own. There is a format where the date is not ISO 8601.
+    The time of day is a field of its own, and there is a format, where the date is not ISO 8601.
     """
 
     keys: dict[str, str | dict[str, str]]
@@ -338,7 +338,10 @@ def _date_in(headers: Sequence[Sequence[str]], number: int, line: str) -> When |
     for below, start in ((line, match.end()), (following, 0)):
         if clock := CLOCK.search(below, start):
             # No format has a fraction of a second.
-            time = _pattern(below, clock.start(), clock.end() if clock["half"] else clock.end("clock"))
+            end = clock.end() if clock["half"] else clock.end("clock")
+            both, time = _pattern(line, match.start(), end), _pattern(below, clock.start(), end)
+            if below is line and all(map(time_of, _found(both, headers))):
+                return When({"trace.header_fields.started_at": both}, number, line.strip())
             texts = [" ".join(both) for both in zip(texts, _found(time, headers), strict=True)]
             keys = {"trace.header_fields.started_day": day, "trace.header_fields.started_clock": time}
             keys["files.started_at"] = {"date": "started_day", "time": "started_clock"}
