@@ -233,14 +233,13 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
 
 def _fitted(tables: Mapping[str, pd.DataFrame], config: Config) -> list[parameter_tables.ParameterTable]:
     """Return the tables of fitted parameters; those of the goodness of fit come last."""
-    dynamic = tables["dynamic_fit"]
-    fits = {"steady_fit": tables["steady_fit"], "aging_fit": tables["aging_fit"]}
-    fits["dynamic_fit"] = dynamic[dynamic["quantity"] == "dynamic"]
     found = []
-    for name, fit in fits.items():
-        key = "series" if name == "aging_fit" else "condition"
-        found += parameter_tables.parameter_tables(fit, key, config, tables.get(f"{name}_before"))
-    return sorted(found, key=lambda table: table.single)
+    for name in parameter_tables.TITLES:
+        fit = tables[name]
+        if name == "dynamic_fit":
+            fit = fit[fit["quantity"] == "dynamic"]
+        found += parameter_tables.parameter_tables(fit, name, config, tables.get(f"{name}_before"))
+    return sorted(found, key=lambda table: table.statistics)
 
 
 def fit_badge(closure: Mapping) -> tuple[str, str]:

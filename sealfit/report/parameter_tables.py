@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import pandas as pd
-from markupsafe import Markup
 
 from sealfit.config import Config
 from sealfit.report.notation import (
@@ -72,31 +70,29 @@ STATISTICS = {
     "df": "df", "n_runs": "runs", "n_files": "files", "n_speeds": "speeds", "n_days": "days tested",
     "last_day": "last day",
 }  # fmt: skip
+TITLES = {
+    "steady_fit": "Steady friction, per condition",
+    "aging_fit": "Aging law per series",
+    "dynamic_fit": "Pre-sliding stiffness and damping, per condition",
+}
 ENDS = ("value", "lo95", "hi95")
 MOST_BREAK_AWAYS = 600
-
-SHARED = 3  # rows with one note, from which it is said once
-_NUMBERS = re.compile(r"(?<![\w<;&#.])\d+(?:\.\d+)?(?![\w.]*[<;])")  # not those in symbols or in markup
-Fitted = Mapping | None
-Rows = dict[tuple[str, str], Mapping]  # of one condition or series, by parameter and unit
 
 
 @dataclass(frozen=True)
 class ParameterTable:
-    """A table for the page: heads of the key columns, (symbol, unit) of each parameter, rows, notes.
+    """A table of the page with a row per condition or series and parameter; `key` says which of the two.
 
-    A row has keys, cells and a note: why a parameter is not identified, or a remark. A cell is the row of a
-    parameter in the table of fits, and that without the loop's effects; None where there is none.
+    A row has name, quantity, parameter, value, before, interval, u_sys, unit and note: why a parameter is not
+    identified, or a remark. Statistics have neither an interval nor u_sys.
     """
 
     title: str
-    heads: tuple[str, ...]
-    groups: tuple[tuple[Markup, str], ...]
-    rows: tuple[tuple[tuple[str | Markup, ...], tuple[tuple[Fitted, Fitted], ...], Markup], ...]
-    single: bool = False  # values only: statistics have neither interval nor u_sys
-    note: str = ""  # the number of rows shown, where there are too many
-    compared: bool = False  # whether cells have the value before
-    remarks: tuple[Markup, ...] = ()  # notes that several rows share, below the table
+    key: str
+    rows: list[dict]
+    statistics: bool
+    compared: bool  # whether rows have the value before
+    excerpt: str = ""  # the number of conditions or series shown, where there are too many
 
 
 def break_aways(dynamic_fit: pd.DataFrame) -> tuple[list[dict], int]:
@@ -113,165 +109,67 @@ def break_aways(dynamic_fit: pd.DataFrame) -> tuple[list[dict], int]:
 
 
 def parameter_tables(
-    fit: pd.DataFrame, key: str, config: Config, before: pd.DataFrame | None = None
+    fit: pd.DataFrame, name: str, config: Config, before: pd.DataFrame | None = None
 ) -> list[ParameterTable]:
-    """Return the tables of `steady_fit` (key "condition") or `aging_fit` (key "series").
+    """Return the parameters in `fit`, one of the tables in `TITLES`, and its statistics as another table.
 
-    Quantities with the same parameters share a table; units stand in the head, and where a parameter has
-    another unit than in the head's row it has a column of its own. `before` is the same table without the
-    loop's effects, for its values beside those of `fit`.
+    `before` is the same table without the loop's effects, for its values beside those of `fit`. A table
+    without rows is not there.
     """
-    if fit.empty:
-        return []
-    of_quantity = {
-        quantity: tuple(dict.fromkeys(zip(rows["parameter"], rows["unit"].fillna(""), strict=True)))
-        for quantity, rows in fit.groupby("quantity", sort=False)
-    }
-    fit, note = _readable(fit, key, ConditionNames.of(config))
-    tables = []
-    for parameters in dict.fromkeys(of_quantity.values()):
-        quantities = [quantity for quantity, own in of_quantity.items() if own == parameters]
-        rows = fit[fit["quantity"].isin(quantities)]
-        if quantities == ["statistics"]:
-            tables.append(_statistics(rows, key, config))
-        else:
-            tables.append(_parameters(rows, key, parameters, config, before))
-    return [replace(table, note=note) for table in tables]
-
-
-def _readable(fit: pd.DataFrame, key: str, names: ConditionNames) -> tuple[pd.DataFrame, str]:
-    """Return the rows of at most `MOST_ROWS` conditions or series, and a note on the selection."""
+    key, names = "series" if name == "aging_fit" else "condition", ConditionNames.of(config)
     every = sorted(fit[key].unique(), key=names.place)
-    if len(every) <= MOST_ROWS:
-        return fit, ""
-    stored = "dynamic_fit" if "dynamic" in set(fit["quantity"]) else "steady_fit"
-    if key == "series":
-        stored = "aging_fit"
-    note = f"{MOST_ROWS} of {count(len(every), key, key if key == 'series' else None)}, selected evenly; "
-    return fit[fit[key].isin(spread(every, MOST_ROWS))], f"{note}{stored}.parquet has all."
+    excerpt = ""
+    if len(every) > MOST_ROWS:
+        plural = key if key == "series" else None
+        excerpt = f"{MOST_ROWS} of {count(len(every), key, plural)}, selected evenly; {name}.parquet has all."
+    shown = {one: number for number, one in enumerate(spread(every, MOST_ROWS))}
+    fit = fit[fit[key].isin(shown)].sort_values(key, key=lambda own: own.map(shown), kind="stable")
+    earlier = {}
+    if before is not None:
+        identified = before[before["identified"].astype(bool)]
+        earlier = identified.set_index([key, "quantity", "parameter"])["value"].to_dict()
+    of_statistics = fit["quantity"] == "statistics"
+    told = of_statistics & fit["parameter"].str.split(":").str[-1].isin(STATISTICS)
+    tables = []
+    for own, title, statistics in (
+        (fit[~of_statistics], TITLES[name], False),
+        (fit[told], f"Goodness of fit, per {key}", True),
+    ):
+        rows = [_row(row, key, earlier, config) for row in own.to_dict("records")]
+        if rows:
+            tables.append(ParameterTable(title, key, rows, statistics, before is not None, excerpt))
+    return tables
 
 
-def _parameters(
-    fit: pd.DataFrame,
-    key: str,
-    parameters: Sequence[tuple[str, str]],
-    config: Config,
-    before: pd.DataFrame | None,
-) -> ParameterTable:
-    names, quantities = ConditionNames.of(config), list(dict.fromkeys(fit["quantity"]))
-    compared = before is not None
-    records = _records(before, key) if compared else ()
-    earlier = {(row[key], row["quantity"], row["parameter"]): row for row in records}
-    several = len(quantities) > 1 or key == "series"
-    found = []
-    for name, quantity, by in _rows_of(fit, key, names):
-        cells = tuple((by.get(p), earlier.get((name, quantity, p[0]))) for p in parameters)
-        found.append((_heads(names(name), symbol_html(quantity), several), cells, _note(by, config)))
-    groups = tuple((symbol_html(p), u) for p, u in parameters)
-    title = _title(key, quantities, after=compared)
-    rows, remarks = _said_once(found)
-    heads = _heads(key, "quantity", several)
-    return ParameterTable(title, heads, groups, rows, compared=compared, remarks=remarks)
-
-
-def _heads(first: str, second: str | Markup, several: bool) -> tuple[str | Markup, ...]:
-    return (first, second) if several else (first,)
-
-
-def _said_once(rows: Sequence[tuple]) -> tuple[tuple[tuple, ...], tuple[Markup, ...]]:
-    """Return the rows without the notes that several share but for a number, and these notes, each once."""
-    alike: dict[str, list[Markup]] = {}
-    for *_, note in rows:
-        if note:
-            alike.setdefault(_NUMBERS.sub("\0", note), []).append(note)
-    shared = {form: notes for form, notes in alike.items() if len(notes) >= SHARED}
-    kept = tuple((*row, Markup("") if _NUMBERS.sub("\0", note) in shared else note) for *row, note in rows)
-    remarks = []
-    for form, notes in shared.items():
-        of = "all rows" if len(notes) == len(rows) else f"{len(notes)} of {len(rows)} rows"
-        numbers = iter(map(_range, zip(*map(_NUMBERS.findall, notes), strict=True)))
-        text = re.sub("\0", lambda _, own=numbers: next(own), form)
-        remarks.append(Markup(f"{text} ({of})"))
-    return kept, tuple(remarks)
-
-
-def _range(numbers: Sequence[str]) -> str:
-    """Return equal numbers as one, others as the smallest to the largest."""
-    low, high = min(numbers, key=float), max(numbers, key=float)
-    return low if low == high else f"{low} to {high}"
-
-
-def _statistics(fit: pd.DataFrame, key: str, config: Config) -> ParameterTable:
-    names, parts = ConditionNames.of(config), fit["parameter"].str.rpartition(":")
-    fit = fit.assign(quantity=parts[0], parameter=parts[2])  # "mu_s:lack_of_fit_p" is about mu_s alone
-    several = fit["quantity"].ne("").any()
-    present = sorted(set(zip(fit["parameter"], fit["unit"].fillna(""), strict=True)))
-    shown = [p for name in STATISTICS for p in present if p[0] == name] or present
-    found = []
-    for name, quantity, by in _rows_of(fit, key, names):
-        cells = tuple((by.get(p), None) for p in shown)
-        lack = {p: row for p, row in by.items() if p[0] == "lack_of_fit_p"}
-        keys = _heads(names(name), symbol_html(quantity), several)
-        found.append((keys, cells, _note(lack, config, named=False)))
-    groups = tuple((STATISTICS.get(p, p.removesuffix("_N").replace("_", " ")), u) for p, u in shown)
-    title = f"Goodness of fit{' of the aging law' if key == 'series' else ''}, per {key}"
-    return ParameterTable(title, _heads(key, "quantity", several), groups, tuple(found), single=True)
-
-
-def _rows_of(fit: pd.DataFrame, key: str, names: ConditionNames) -> list[tuple[str, str, Rows]]:
-    """Return (name, quantity, rows by parameter and unit): unaged first, then by temperature, ..., days."""
-    found: dict[tuple[str, str], Rows] = {}
-    for row in _records(fit, key):
-        found.setdefault((row[key], row["quantity"]), {})[row["parameter"], row["unit"] or ""] = row
-    return sorted(((*keys, by) for keys, by in found.items()), key=lambda entry: names.place(entry[0]))
-
-
-def _records(rows: pd.DataFrame, key: str) -> list[dict]:
-    """Return rows as dictionaries, with None for missing values."""
-    columns = [key, "quantity", "parameter", "unit", *ENDS, "u_sys", "identified", "reason"]
-    plain = rows[columns].astype(object)
-    return plain.where(plain.notna(), None).to_dict("records")
-
-
-def statistic(row: Fitted) -> str:
-    """Return a count without decimals, another statistic to three digits."""
-    if row is None:
-        return NOTHING
-    whole = known(row["value"]) and float(row["value"]).is_integer() and abs(row["value"]) >= 1
-    return given(row["value"], 9) if whole else number(row["value"])
-
-
-def estimate(row: Fitted) -> tuple[str, str, str]:
-    """Return the value of a parameter or that it is not identified, its interval, and its u_sys."""
-    if row is None:
-        return NOTHING, NOTHING, NOTHING
+def _row(row: Mapping, key: str, earlier: Mapping, config: Config) -> dict:
+    """Return a row of the page of a row of a table of fits."""
+    # The statistic "mu_s:lack_of_fit_p" is about mu_s alone.
+    of, _, parameter = row["parameter"].rpartition(":")
+    before = earlier.get((row[key], row["quantity"], row["parameter"]))
+    value, interval = measured(*(row[name] for name in ENDS))
+    if row["quantity"] == "statistics":
+        quantity, symbol = symbol_html(of), STATISTICS[parameter]
+        value, before = statistic(row["value"]), statistic(before)
+    else:
+        quantity, symbol, before = symbol_html(row["quantity"]), symbol_html(parameter), number(before)
+    note = row["reason"]
     if not row["identified"]:
-        return "not identified", NOTHING, NOTHING
-    return *measured(*(row[name] for name in ENDS)), number(row["u_sys"], 2)
+        value, interval = "not identified", NOTHING
+        note = note or "these data do not determine it"
+    return {
+        "name": ConditionNames.of(config)(row[key]),
+        "quantity": quantity,
+        "parameter": symbol,
+        "value": value,
+        "before": before,
+        "interval": interval,
+        "u_sys": number(row["u_sys"], 2) if row["identified"] else NOTHING,
+        "unit": row["unit"] if isinstance(row["unit"], str) else "",
+        "note": with_symbols(true_units(note, config.units)) if isinstance(note, str) else "",
+    }
 
 
-def _note(rows: Mapping[tuple[str, str], Mapping], config: Config, *, named: bool = True) -> Markup:
-    """Return the reasons and remarks of a row, each once, with its parameters."""
-    about: dict[tuple[bool, str], list[Markup]] = {}
-    for (parameter, _), row in rows.items():
-        why = row["reason"] or ("" if row["identified"] else "these data do not determine it")
-        if why:
-            about.setdefault((bool(row["identified"]), why), []).append(symbol_html(parameter))
-    said = []
-    for (identified, why), symbols in about.items():
-        lead = Markup(", ").join(symbols if named else [])
-        lead += "" if identified else " not identified"
-        said.append(
-            Markup("{}{}{}").format(lead, ": " if lead else "", with_symbols(true_units(why, config.units)))
-        )
-    return Markup("<br>").join(said)
-
-
-def _title(key: str, quantities: Sequence[str], *, after: bool) -> str:
-    if quantities == ["dynamic"]:
-        return "Pre-sliding stiffness and damping, per condition"
-    if key == "condition":
-        return "Steady friction, per condition"
-    if set(quantities) <= {"mu_s", "mu_c", "F_s", "F_c"}:
-        return "Aging law per series, from the joint fit" if after else "Aging law per series"
-    return f"Aging law per series: {', '.join(quantities)}"
+def statistic(value: float | None) -> str:
+    """Return a count without decimals, another statistic to three digits."""
+    whole = known(value) and float(value).is_integer() and abs(value) >= 1
+    return given(value, 9) if whole else number(value)

@@ -234,21 +234,14 @@ function quoted(cell) {
   return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
 
-// The lines of a cell that has several values, each a column of the saved table, or the cell.
-function parts(cell) {
-  const lines = cell.querySelectorAll(".part");
-  return lines.length ? [...lines] : [cell];
-}
-
 function csv(table) {
-  const rows = [...table.rows].map(row => [...row.cells].flatMap(cell =>
-    [...parts(cell).map(one => quoted(plain(one.textContent))), ...Array(cell.colSpan - 1).fill("")]).join(","));
+  const rows = [...table.rows].map(row => [...row.cells].map(cell => quoted(plain(cell.textContent))).join(","));
   return rows.join("\r\n") + "\r\n";
 }
 
 function sorted(table, column, falling) {
   const body = table.tBodies[0], rows = [...body.rows], sign = falling ? -1 : 1;
-  const key = row => plain(row.cells[column] ? parts(row.cells[column])[0].textContent : "");
+  const key = row => plain(row.cells[column].textContent);
   const number = text => (/^[-+.\d]/.test(text) ? parseFloat(text) : NaN);
   rows.sort((one, other) => {
     const [a, b] = [key(one), key(other)], [x, y] = [number(a), number(b)];
@@ -272,15 +265,13 @@ for (const box of document.querySelectorAll(".box")) {
     button("CSV", `Save as CSV: ${name}`, () => save("\ufeff" + csv(table), "text/csv", `${name}.csv`)),
   );
   box.before(tools);
-  const heads = table.tHead?.rows;
-  const even = [...(table.tBodies[0]?.rows ?? [])].every(row => row.cells.length === heads?.[0].cells.length);
-  if (heads?.length !== 1 || !even) continue; // rows of notes belong to the row above
-  [...heads[0].cells].forEach((head, column) => {
+  const heads = [...table.tHead.rows[0].cells];
+  heads.forEach((head, column) => {
     head.tabIndex = 0;
     head.classList.add("sorts");
     const turn = () => {
       const falling = head.getAttribute("aria-sort") === "ascending";
-      for (const other of heads[0].cells) other.removeAttribute("aria-sort");
+      for (const other of heads) other.removeAttribute("aria-sort");
       head.setAttribute("aria-sort", falling ? "descending" : "ascending");
       sorted(table, column, falling);
     };

@@ -311,7 +311,18 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
         label, unit = label.format(held=closure["heldout_unit"]), config.units.of(key)
         found.append({"label": label, "unit": unit, "before": texts[0], "after": texts[1], "change": change})
     p = {stage: _p(closure[stage]["lack_of_fit_p"]) for stage in stages}
-    return [*found, {"label": "lack of fit, p", "unit": "", **p, "change": ""}]
+    floor_text = number(floor, 2) if known(floor) else "unknown"
+    return [
+        *found,
+        {"label": "lack of fit, p", "unit": "", **p, "change": ""},
+        {
+            "label": "noise floor: error of a perfect model",
+            "unit": config.units.unit("force"),
+            "before": floor_text,
+            "after": floor_text,
+            "change": "",
+        },
+    ]
 
 
 def _p(value: float | None) -> str:

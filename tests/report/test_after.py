@@ -7,8 +7,9 @@ import pytest
 from report.made_campaigns import HIGHER, after_campaign, aging_campaign
 from report.test_page import Page
 
+from sealfit.report.notation import number
 from sealfit.report.page import build_report, with_after_fits
-from sealfit.report.parameter_tables import error_text, estimate, law_rows, parameter_tables
+from sealfit.report.parameter_tables import error_text, law_rows, parameter_tables
 
 
 @pytest.fixture(scope="module")
@@ -18,16 +19,12 @@ def made():
 
 def test_values_before_stand_beside_those_after(made):
     fit = made.tables["steady_fit"]
-    (table, _) = parameter_tables(made.tables["steady_fit_after"], "condition", made.config, fit)
-    assert table.compared
-    _, cells, _ = table.rows[1]
+    found = parameter_tables(made.tables["steady_fit_after"], "steady_fit", made.config, fit)[0]
+    assert found.compared
     row = fit.query("aging_days == 1 and compression_ratio_pct == 80 and parameter == 'mu_s'").iloc[0]
-    shown = [estimate(one)[0] for one in cells[0]]
-    assert shown == [f"{HIGHER * row['value']:.3f}", f"{row['value']:.3f}"]
-    law = parameter_tables(made.tables["aging_fit_after"], "series", made.config, made.tables["aging_fit"])[0]
-    assert law.title == "Aging law per series, from the joint fit"
-    (plain, _) = parameter_tables(fit, "condition", made.config)
-    assert plain.compared is False
+    shown = [found.rows[4][name] for name in ("value", "before")]
+    assert shown == [f"{HIGHER * row['value']:.3f}", number(row["value"])]
+    assert parameter_tables(fit, "steady_fit", made.config)[0].compared is False
 
 
 def test_the_likeliest_law_before_follows_that_after(made):
@@ -40,7 +37,7 @@ def test_the_likeliest_law_before_follows_that_after(made):
 def test_the_page_is_of_the_after_model_and_says_its_reference(made, unsaved):
     page = Page(build_report(*made.arguments).html)
     assert "at the reference state: cold contact (time 0)" in page.text
-    assert re.search(r"μ s before 95 % u sys", page.text)
+    assert re.search(r"parameter value 95 % u sys before unit", page.text)
     assert "before, without the effects" in page.text
 
 

@@ -168,9 +168,10 @@ def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_p
     assert found["copy"].splitlines() == lines
     assert found["copied"] == ["Copied", "Refused by the browser"]
     parameters = list(csv.reader(found["parameters"].removeprefix("\ufeff").splitlines()))
-    assert parameters[0][:6] == ["condition", "μs", "before", "95 %", "usys", "μc"]
-    assert len(parameters[0]) == len(parameters[1]) == 1 + 4 * 4
-    assert float(parameters[1][1]) == pytest.approx(HIGHER * float(parameters[1][2]), abs=2e-3)
+    assert parameters[0] == ["condition", "parameter", "value", "95 %", "usys", "before", "unit", "note"]
+    assert len(parameters[1]) == len(parameters[0])
+    assert parameters[1][1] == "μs"
+    assert float(parameters[1][2]) == pytest.approx(HIGHER * float(parameters[1][5]), abs=2e-3)
     assert found["single"]
 
 

@@ -92,25 +92,13 @@ def fits(n, quantity="steady"):
 
 
 def test_long_parameter_tables_are_cut_and_say_where_the_rest_is():
-    (found,) = parameter_tables(fits(301), "condition", Config())
+    (found,) = parameter_tables(fits(301), "steady_fit", Config())
     assert len(found.rows) == 200
-    assert found.rows[0][0] == ("20 °C · 80 % · 1 d",)
-    assert found.rows[-1][0] == ("320 °C · 80 % · 1 d",)
-    assert found.note.startswith("200 of 301 conditions")
-    assert "steady_fit.parquet" in found.note
-    assert parameter_tables(fits(200), "condition", Config())[0].note == ""
-
-
-def test_a_note_that_rows_share_but_for_a_number_is_said_once_with_its_range():
-    many = fits(4)
-    many["reason"] = [f"at most {bound} N s/mm." for bound in (0.83, 1.2, 1.0, 0.9)]
-    (found,) = parameter_tables(many, "condition", Config())
-    assert [row[-1] for row in found.rows] == ["", "", "", ""]
-    (remark,) = found.remarks
-    assert remark.endswith("at most 0.83 to 1.2 N s/mm. (all rows)")
-    (found,) = parameter_tables(many.assign(reason=["", "", *many["reason"][2:]]), "condition", Config())
-    assert [bool(row[-1]) for row in found.rows] == [False, False, True, True]  # two are no repetition
-    assert found.remarks == ()
+    assert found.rows[0]["name"] == "20 °C · 80 % · 1 d"
+    assert found.rows[-1]["name"] == "320 °C · 80 % · 1 d"
+    assert found.excerpt.startswith("200 of 301 conditions")
+    assert "steady_fit.parquet" in found.excerpt
+    assert parameter_tables(fits(200), "steady_fit", Config())[0].excerpt == ""
 
 
 def test_break_aways_are_cut_and_counted():
