@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sealfit.report import drawing
 from sealfit.report.drawing import Drawn
-from sealfit.report.style import Plot
+from sealfit.report.style import Panel, Plot, compose
 
 UNDRAWN = """
 import drawing_helpers
@@ -20,12 +20,17 @@ SAVED = drawing.saved
 
 def undrawn(plot: Plot) -> Drawn:
     """Stand for `draw` in reports that nobody looks at."""
-    return Drawn("<svg/>", b"", b"", ("<svg/>",) * len(plot.panels))
+    return Drawn("<svg/>", b"", b"")
 
 
 def only_svg(figure, form, metadata, **options) -> bytes:
     """Stand for `saved` in tests of what the page holds: the files for print are empty."""
     return SAVED(figure, form, metadata, **options) if form == "svg" else b""
+
+
+def panel_figure(panel: Panel):
+    """Return a figure of one panel."""
+    return compose(Plot("one", "", (panel,)))
 
 
 def command(*words: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Plots as SVG, PNG and PDF files; for the page each panel as SVG, texts of points and traces of runs."""
+"""Plots as SVG, PNG and PDF; for the page texts of points, and traces of runs."""
 
 from __future__ import annotations
 
@@ -8,44 +8,54 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from xml.sax.saxutils import escape
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sealfit.config import Config
 from sealfit.report.notation import ConditionNames, given, plain
-from sealfit.report.style import Plot, compose, look, panel_figure
+from sealfit.report.style import Plot, compose, look
 
 PRINT = 300  # pixels of a PNG file in an inch
+NEAR = 12.0  # points: size of the place around a marker at which its text is shown
 MOST_BINS = 30_000  # of all runs that a page has, about 1 MB; of more, every second, third ... is left
 LARGEST_STEP = 5  # traces of which fewer than every fifth bin would be left are not in the page
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A plot as SVG, as PNG and as PDF, and its panels as SVG."""
+    """A plot as SVG, as PNG and as PDF."""
 
     svg: str
     png: bytes
     pdf: bytes
-    panels: tuple[str, ...]
 
 
 def draw(plot: Plot) -> Drawn:
     """Return a plot, drawn; equal plots give equal bytes."""
-    whole = compose(plot)
-    panels = tuple(_svg(panel_figure(panel)) for panel in plot.panels)
-    png = saved(whole, "png", {"Software": None}, dpi=PRINT)
-    pdf = saved(whole, "pdf", {"CreationDate": None, "Creator": None, "Producer": None})
-    return Drawn(_svg(whole), png, pdf, panels)
+    figure = compose(plot)
+    png = saved(figure, "png", {"Software": None}, dpi=PRINT)
+    pdf = saved(figure, "pdf", {"CreationDate": None, "Creator": None, "Producer": None})
+    return Drawn(_svg(figure), png, pdf)
 
 
 def explain(points: Line2D, texts: Sequence[str]) -> None:
-    """Give each point of a line of markers, all finite, a text, which the page shows under the pointer."""
-    points.explained = tuple(texts)  # an attribute that `_svg` looks for
+    """Give each point of a line of markers, all finite, a text, which a browser shows under the pointer."""
+    x, y = points.get_data()
+    (over,) = points.axes.plot(x, y, "o", markersize=NEAR, alpha=0.0, zorder=9)
+    over.explained = tuple(texts)  # an attribute that `_svg` looks for
+
+
+def inline(svg: str, name: str, alt: str) -> Markup:
+    """Return a drawing as an element of the page, its ids preceded by a name, with a text alternative."""
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # it would hold for the whole page
+    svg = re.sub(r'( id="|xlink:href="#|url\(#)', rf"\1{name}-", svg)
+    return Markup(svg.replace("<svg", f'<svg role="img" aria-label={quoteattr(alt)}', 1))
 
 
 def run_traces(tables: Mapping[str, pd.DataFrame], config: Config) -> dict:
@@ -83,7 +93,7 @@ def _svg(figure: Figure) -> str:
     explained = [line for ax in figure.axes for line in ax.lines if hasattr(line, "explained")]
     for number, artist in enumerate(explained):
         artist.set_gid(f"points{number}")
-    svg = saved(figure, "svg", {"Date": None, "Creator": None}).decode()
+    svg = saved(figure, "svg", {"Date": None, "Creator": None, "Format": None, "Type": None}).decode()
     for artist in explained:
         svg = _with_titles(svg, artist.get_gid(), artist.explained)
     return svg

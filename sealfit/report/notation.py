@@ -172,19 +172,8 @@ def _power(value: float) -> int:
     return math.floor(math.log10(size)) if size and not SMALL <= size < LARGE else 0
 
 
-def power_of_ten(power: int) -> str:
-    """Return an exponent in superscript.
-
-    Examples
-    --------
-    >>> power_of_ten(-12)
-    '⁻¹²'
-    """
-    return str(power).translate(_UP)
-
-
 def _times_ten(power: int) -> str:
-    return f"{THIN}×{THIN}10{power_of_ten(power)}" if power else ""
+    return f"{THIN}×{THIN}10{str(power).translate(_UP)}" if power else ""
 
 
 def _fixed(value: float, places: int) -> str:

@@ -18,7 +18,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
 from sealfit.report import notation, parameter_tables, words
-from sealfit.report.drawing import Drawn, draw, run_traces
+from sealfit.report.drawing import Drawn, draw, inline, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
 from sealfit.report.notation import (
@@ -29,7 +29,6 @@ from sealfit.report.notation import (
     given,
     true_units,
 )
-from sealfit.report.style import WIDTH
 from sealfit.report.summary import of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
 from sealfit.tables import FITTED, SCHEMAS
@@ -37,7 +36,6 @@ from sealfit.tables import FITTED, SCHEMAS
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
 MOST_INPUTS = 2000  # listed with their hashes; inputs.parquet has all
 RANK = {"error": 0, "warning": 1, "info": 2}  # of a severity, in the order of the page
-CSS = 96  # pixels of a page in an inch
 TEMPLATES = Environment(autoescape=True, undefined=StrictUndefined, loader=PackageLoader("sealfit", "report"))
 
 
@@ -132,24 +130,23 @@ def build_report(
     """Return the report of one campaign.
 
     `tables` are those of OUT by name, which may be missing or empty; `closure` and `provenance` are its JSON
-    files, `closure` None of properties. The page loads nothing. Figures are drawn once; the page shows their
-    panels.
+    files, `closure` None of properties. The page loads nothing.
     """
     tables, closure = answered(tables, closure)
     opening = _of_properties(tables) if closure is None else _of_loop(tables, closure, config)
     plots = draw_all(tables, closure, config)
     with timed("plots", rows=len(plots), of="plots"):
         figures = {name: draw(plot) for name, plot in plots.items()}
-    images = {
-        name: list(zip(plot.panels, map(_source, figures[name].panels), strict=True))
-        for name, plot in plots.items()
-    }
+    images = {}
+    for name, plot in plots.items():
+        alt = f"{plot.title}: {' '.join(panel.alt for panel in plot.panels)}"
+        images[name] = inline(figures[name].svg, name, alt)
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
     html = TEMPLATES.get_template("template.html").render(
         style=Markup(_text("style.css")), script=Markup(_text("report.js")), runs=Markup(runs),
         script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(),
-        plots=plots, images_of=images, css=CSS, width=WIDTH, most_channels=MOST_CHANNELS,
+        plots=plots, images=images, most_channels=MOST_CHANNELS,
         tables=tables, closure=closure, config=config, units=config.units,
         unit=config.units.unit("force"), force=config.units.quantity("force"),
         names=ConditionNames.of(config), name=name_of(provenance, config), provenance=provenance,
@@ -157,11 +154,6 @@ def build_report(
         fitted=_fitted(tables, config), **opening,
     )  # fmt: skip
     return Report(html, figures)
-
-
-def _source(svg: str) -> str:
-    """Return a drawing as the source of an image."""
-    return "data:image/svg+xml;base64," + b64encode(svg.encode()).decode()
 
 
 def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:

@@ -1,12 +1,6 @@
 "use strict";
-// The page is whole without this script. With it, points say their values under the pointer, a click on the mean of
-// a run opens its trace, figures are enlarged and zoomed, tables are sorted by a click on their heads, and tables and
-// figures can be saved.
-
-const tip = document.body.appendChild(document.createElement("div"));
-tip.className = "tip";
-tip.setAttribute("role", "status");
-const NEAR = 18; // Pixels from a point at which its text is shown.
+// The page is whole without this script. With it, a click on the mean of a run opens its trace, figures are enlarged
+// and zoomed, tables are sorted by a click on their heads, and tables and figures can be saved.
 
 function button(text, label, action) {
   const made = document.createElement("button");
@@ -28,47 +22,26 @@ function save(content, type, name) {
 // ---------------------------------------------------------------- dialog
 
 const dialog = document.body.appendChild(document.createElement("dialog"));
-dialog.addEventListener("close", () => document.body.append(tip));
 
-function open(title, note, ...content) {
-  const head = document.createElement("h2"), words = document.createElement("p");
+// The wheel zooms a drawing about the pointer; its scroll bars move it.
+function open(title, note, svg) {
+  const head = document.createElement("h2"), words = document.createElement("p"), frame = document.createElement("div");
   head.textContent = title;
   words.textContent = note;
   words.className = "quiet";
-  dialog.replaceChildren(button("Close", "Close", () => dialog.close()), head, ...content, words, tip);
-  if (!dialog.open) dialog.showModal();
-}
-
-// The wheel zooms about the pointer, a drag moves the drawing, a double click shows the whole.
-function zoomable(svg) {
-  const whole = svg.getAttribute("viewBox").split(" ").map(Number);
-  let view = [...whole], from = null;
-  const set = (x, y, width) => {
-    const height = width * whole[3] / whole[2];
-    const inside = (at, size, k) => Math.max(whole[k], Math.min(at, whole[k] + whole[k + 2] - size));
-    view = [inside(x, width, 0), inside(y, height, 1), width, height];
-    svg.setAttribute("viewBox", view.join(" "));
-  };
-  const at = event => {
-    const shown = svg.getBoundingClientRect();
-    return [(event.clientX - shown.x) / shown.width, (event.clientY - shown.y) / shown.height];
-  };
-  svg.addEventListener("wheel", event => {
+  frame.append(svg);
+  let size = 1;
+  frame.addEventListener("wheel", event => {
     event.preventDefault();
-    const [u, v] = at(event), wanted = view[2] * 1.0015 ** event.deltaY;
-    const width = Math.min(whole[2], Math.max(whole[2] / 40, wanted));
-    const shrunk = 1 - width / view[2];
-    set(view[0] + u * view[2] * shrunk, view[1] + v * view[3] * shrunk, width);
+    const wanted = Math.min(40, Math.max(1, size * 0.9985 ** event.deltaY)), grown = wanted / size;
+    const shown = svg.getBoundingClientRect();
+    size = wanted;
+    svg.style.width = `${100 * size}%`;
+    frame.scrollLeft += (event.clientX - shown.x) * (grown - 1);
+    frame.scrollTop += (event.clientY - shown.y) * (grown - 1);
   }, { passive: false });
-  svg.addEventListener("pointerdown", event => { from = [at(event), view]; });
-  svg.addEventListener("pointermove", event => {
-    if (from === null || !event.buttons) return;
-    const [u, v] = at(event), [[a, b], start] = from;
-    set(start[0] + (a - u) * start[2], start[1] + (b - v) * start[3], start[2]);
-  });
-  svg.addEventListener("pointerup", () => { from = null; });
-  svg.addEventListener("dblclick", () => set(whole[0], whole[1], whole[2]));
-  return svg;
+  dialog.replaceChildren(button("Close", "Close", () => dialog.close()), head, frame, words);
+  if (!dialog.open) dialog.showModal();
 }
 
 // ---------------------------------------------------------------- trace of a run
@@ -76,7 +49,7 @@ function zoomable(svg) {
 const traces = JSON.parse(document.getElementById("runs").textContent);
 const [WIDE, HIGH, LEFT, RIGHT, TOP, BOTTOM] = [760, 420, 66, 12, 12, 46]; // The drawing and its margins.
 
-const SVG = new DOMParser().parseFromString("<svg></svg>", "text/html").querySelector("svg").namespaceURI;
+const SVG = document.querySelector("figure svg")?.namespaceURI;
 
 function drawn(name, attributes, text) {
   const made = document.createElementNS(SVG, name);
@@ -111,112 +84,47 @@ function trace(run) {
       drawn("text", { x: LEFT - 8, y: y(tick) + 4, "text-anchor": "end" }, tick.toFixed(up.digits)));
   svg.append(drawn("text", { x: (LEFT + WIDE) / 2, y: HIGH - 8, "text-anchor": "middle" }, traces.x),
     drawn("text", { transform: `translate(14 ${HIGH / 2}) rotate(-90)`, "text-anchor": "middle" }, traces.y));
-  const points = [];
   for (const one of run.strokes) {
-    const places = one.x.map((at, i) => i).filter(i => one.x[i] !== null && one.force[i] !== null);
-    const line = values =>
-      "M" + places.filter(i => values[i] !== null).map(i => `${x(one.x[i])} ${y(values[i])}`).join("L");
-    svg.append(drawn("path", { d: line(one.force), class: "measured" }));
-    for (const i of places) {
-      const point = drawn("circle", { cx: x(one.x[i]), cy: y(one.force[i]), r: 2.2, class: "measured" });
-      const left = one.model[i] === null ? "" : `\nresidual: ${(one.force[i] - one.model[i]).toPrecision(3)}`;
-      point.dataset.text = `${traces.y}: ${one.force[i]}${left}\n${traces.x}: ${one.x[i]}\n${one.file}`;
-      points.push(point);
-    }
-    svg.append(drawn("path", { d: line(one.model), class: "model" }));
+    const line = values => "M" + one.x.map((at, i) => [at, values[i]]).filter(point => point.every(finite))
+      .map(([at, value]) => `${x(at)} ${y(value)}`).join("L");
+    svg.append(drawn("path", { d: line(one.force), class: "measured" }),
+      drawn("path", { d: line(one.model), class: "model" }));
   }
-  svg.append(...points);
-  return explained(svg, points);
+  return svg;
 }
 
 function openRun(id) {
   const run = traces.runs[id], files = [...new Set(run.strokes.map(one => one.file))];
   const each = traces.every === 1 ? "each bin" : `one of ${traces.every} bins`;
-  const words = `Measured in blue, a point for ${each} of the steady window; model in orange. ${files.join(", ")}`;
-  open(run.label, words, zoomable(trace(run)));
+  const words = `Measured in blue, ${each} of the steady window; model in orange. ${files.join(", ")}`;
+  open(run.label, words, trace(run));
 }
 
 // ---------------------------------------------------------------- figures
 
-function drawingOf(image) {
-  const bytes = Uint8Array.from(atob(image.src.split(",")[1]), c => c.charCodeAt(0));
-  return new TextDecoder().decode(bytes);
-}
-
-// A figure as an element whose ids are single in the page, and its points.
-function parsed(text, label, number) {
-  const svg = new DOMParser().parseFromString(text, "image/svg+xml").documentElement;
-  const points = [...svg.querySelectorAll("use > title")].map(title => {
-    const use = title.parentElement;
-    use.dataset.text = title.textContent;
-    title.remove();
-    return use;
-  });
-  svg.querySelectorAll("style").forEach(style => style.remove());
-  for (const element of svg.querySelectorAll("*")) {
-    for (const attribute of [...element.attributes]) {
-      if (attribute.name === "id") element.id = `f${number}-${attribute.value}`;
-      else if (attribute.localName === "href") attribute.value = attribute.value.replace(/^#/, `#f${number}-`);
-      else if (attribute.value.includes("url(#"))
-        attribute.value = attribute.value.replaceAll("url(#", `url(#f${number}-`);
-    }
-  }
-  svg.style.strokeLinejoin = "round";
-  svg.setAttribute("role", "img");
-  svg.setAttribute("aria-label", label);
-  return { svg: explained(svg, points), points };
-}
-
-// A drawing whose points say their texts under the pointer, and open the run that a line of the text names.
-function explained(svg, points) {
-  const run = point => point?.dataset.text.split("\n").find(line => Object.hasOwn(traces.runs, line));
-  svg.addEventListener("pointermove", event => {
-    const nearest = near(event, points);
-    show(event, nearest);
-    svg.style.cursor = run(nearest) === undefined ? "" : "pointer";
-  });
-  svg.addEventListener("pointerleave", () => tip.classList.remove("shown"));
-  svg.addEventListener("click", event => {
-    const id = run(near(event, points));
-    if (id !== undefined) openRun(id);
-  });
-  return svg;
-}
-
-function near(event, points) {
-  let nearest = null, least = NEAR;
-  for (const point of points) {
-    const box = point.getBoundingClientRect();
-    const away = Math.hypot(box.x + box.width / 2 - event.clientX, box.y + box.height / 2 - event.clientY);
-    if (away < least) [nearest, least] = [point, away];
-  }
-  return nearest;
-}
-
-function show(event, nearest) {
-  tip.classList.toggle("shown", nearest !== null);
-  if (nearest === null) return;
-  tip.textContent = nearest.dataset.text;
-  const room = document.documentElement.clientWidth - tip.offsetWidth - 8;
-  tip.style.left = `${Math.max(8, Math.min(event.clientX + 14, room))}px`;
-  tip.style.top = `${Math.max(8, event.clientY - tip.offsetHeight - 12)}px`;
-}
-
-[...document.querySelectorAll(".panels img")].forEach((image, number) => {
-  const text = drawingOf(image), panel = document.createElement("div");
-  panel.className = "panel";
-  image.replaceWith(panel);
-  const name = `${image.alt.split(/[:;.]/)[0].replace(/[^\p{L}\p{N}]+/gu, "_").slice(0, 60)}.svg`;
-  const tools = document.createElement("div");
-  tools.append(
-    button("Enlarge", `Enlarge: ${image.alt}`, () =>
-      open(image.alt, "The wheel zooms, a drag moves, a double click shows the whole figure.",
-        zoomable(parsed(text, image.alt, "large").svg))),
-    button("SVG", `Save as SVG: ${image.alt}`, () => save(text, "image/svg+xml", name)),
-  );
-  const { svg, points } = parsed(text, image.alt, number);
-  panel.append(points.length ? svg : image, tools);
+// A point that names a run, in a line of its text, opens it.
+document.addEventListener("click", event => {
+  const text = event.target.closest("use")?.querySelector("title")?.textContent ?? "";
+  const id = text.split("\n").find(line => Object.hasOwn(traces.runs, line));
+  if (id !== undefined) openRun(id);
 });
+
+function tools(...buttons) {
+  const made = document.createElement("p");
+  made.className = "tools";
+  made.append(...buttons);
+  return made;
+}
+
+for (const figure of document.querySelectorAll("figure")) {
+  const svg = figure.querySelector("svg"), label = svg.getAttribute("aria-label"), title = label.split(":")[0];
+  const name = `${title.replace(/[^\p{L}\p{N}]+/gu, "_")}.svg`;
+  figure.prepend(tools(
+    button("Enlarge", `Enlarge: ${title}`, () => open(title, "The wheel zooms.", svg.cloneNode(true))),
+    button("SVG", `Save as SVG: ${title}`, () =>
+      save(new XMLSerializer().serializeToString(svg), "image/svg+xml", name)),
+  ));
+}
 
 // ---------------------------------------------------------------- tables
 
@@ -254,17 +162,14 @@ function sorted(table, column, falling) {
 for (const box of document.querySelectorAll(".box")) {
   const table = box.querySelector("table");
   const name = (box.getAttribute("aria-label") || "table").replace(/[^\p{L}\p{N}]+/gu, "_");
-  const tools = document.createElement("p");
-  tools.className = "tools";
-  tools.append(
+  box.before(tools(
     button("Copy", `Copy: ${name}`, event => {
       const { target } = event; // a page that came by http has no clipboard
       const done = navigator.clipboard?.writeText(csv(table).replaceAll("\r\n", "\n")) ?? Promise.reject();
       done.then(() => "Copied", () => "Refused by the browser").then(text => (target.textContent = text));
     }),
     button("CSV", `Save as CSV: ${name}`, () => save("\ufeff" + csv(table), "text/csv", `${name}.csv`)),
-  );
-  box.before(tools);
+  ));
   const heads = [...table.tHead.rows[0].cells];
   heads.forEach((head, column) => {
     head.tabIndex = 0;

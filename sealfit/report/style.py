@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -13,7 +12,6 @@ import matplotlib as mpl
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -21,13 +19,14 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import ArrayLike
 
-from sealfit.report.notation import count, plain, power_of_ten, short, symbol_math
+from sealfit.report.notation import count, plain, short, symbol_math
 
 # ---------------------------------------------------------------- excerpts
 # Selection of the panels, rows and legend keys that are shown for a large campaign.
 
 MOST_PANELS = 12  # of a figure
 MOST_KEYS = 16  # of a legend
+LONGEST_KEY, LONGEST_TITLE = 60, 40  # letters of an entry of a legend, and of the title of a panel
 MOST_MARKS = 300  # of a panel, until they are drawn as pixels: more makes an SVG large and shows nothing
 MOST_ROWS = 200  # conditions or series of a table
 
@@ -134,10 +133,9 @@ BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK = (
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 BEFORE, AFTER, FLOOR, QUIET = VERMILION, BLUE, "#5f6670", "#8a9099"
 
-WIDTH = 3.55  # inches of one panel: 340 px of a page, so its text is as large as the page's small print
-HEIGHT = 2.55
+WIDTH, HEIGHT = 3.5, 2.6  # inches of a panel: three side by side are as wide as the page
+ROW = 3  # panels side by side
 DPI = 150  # of a figure on a screen
-_EDGE, _BOTTOM, _TOP = 0.14, 0.5, 0.32  # inches around the axes
 
 Mark = Literal["line", "dotted", "dashed", "band", "point", "open", "left", "bar"]
 
@@ -159,9 +157,6 @@ class Panel:
     title: str
     alt: str
     draw: Callable[[Axes], None]
-    height: float = HEIGHT  # inches
-    left: float = 0.68  # inches left of the axes, for their tick labels
-    effect: int | None = None  # row in the closure's effects that it belongs to
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -174,6 +169,7 @@ class Plot:
     panels: tuple[Panel, ...]
     legend: tuple[Key, ...] = ()
     note: str = ""
+    height: float = HEIGHT  # inches of a panel
 
 
 def look() -> AbstractContextManager:
@@ -188,88 +184,46 @@ def shades(n: int) -> list[str]:
 
 
 def compose(plot: Plot, kind: type[Figure] = Figure) -> Figure:
-    """Return all panels of a plot in one figure of a `kind`, up to four a row, below its title and legend."""
-    columns = min(len(plot.panels), 4 if len(plot.panels) > 6 else 3)
-    rows = [plot.panels[k : k + columns] for k in range(0, len(plot.panels), columns)]
-    heights = [max(panel.height for panel in row) for row in rows]
-    width = columns * WIDTH
-    lines = _legend_lines(plot.legend, width)
-    total = sum(heights) + 0.36 + 0.19 * lines
+    """Return the panels of a plot in one figure of a `kind`, below its title and legend."""
+    columns = min(len(plot.panels), ROW)
+    rows = math.ceil(len(plot.panels) / columns)
+    # inches; columns of a legend are as wide as their widest entry
+    widest = max((min(len(key.label), LONGEST_KEY) for key in plot.legend), default=0) * 0.062 + 0.5
+    entries = max(1, int(columns * WIDTH // widest))
+    head = 0.25 + 0.19 * math.ceil(len(plot.legend) / entries)
     with look():
-        figure = kind(figsize=(width, total), dpi=DPI)
-        figure.text(_EDGE / width, 1 - 0.1 / total, plot.title, va="top", weight="bold", size=10)
-        if plot.legend:
-            figure.legend(
-                handles=[_handle(key) for key in plot.legend],
-                loc="upper left",
-                bbox_to_anchor=(_EDGE / width, 1 - 0.32 / total),
-                ncols=math.ceil(len(plot.legend) / lines),
-                handlelength=1.8,
-                columnspacing=1.4,
-                labelspacing=0.35,
-                borderaxespad=0,
-                borderpad=0,
-                fontsize=8,
-            )
-        for r, row in enumerate(rows):
-            for c, panel in enumerate(row):
-                _place(figure, panel, c * WIDTH, sum(heights[r:]) + 0.04 - panel.height)
+        size = (columns * WIDTH, rows * plot.height + head)
+        figure = kind(figsize=size, dpi=DPI, layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False).flat
+        for panel in plot.panels:
+            _draw(panel, next(axes))
+        for ax in axes:
+            ax.remove()
+        legend = figure.legend(
+            handles=[_handle(key) for key in plot.legend],
+            loc="outside upper left",
+            title=plain(plot.title),
+            title_fontproperties={"weight": "bold", "size": 10},
+            ncols=entries,
+            handlelength=1.8,
+            columnspacing=1.4,
+            labelspacing=0.35,
+            fontsize=8,
+        )
+        legend.set_alignment("left")
         return figure
 
 
-def panel_figure(panel: Panel) -> Figure:
-    """Return a figure of one panel, without title and legend."""
-    with look():
-        figure = Figure(figsize=(WIDTH, panel.height), dpi=DPI)
-        _place(figure, panel, 0.0, 0.0)
-        return figure
-
-
-def _place(figure: Figure, panel: Panel, left: float, bottom: float) -> None:
-    width, height = figure.get_figwidth(), figure.get_figheight()
-    box = (
-        (left + panel.left) / width,
-        (bottom + _BOTTOM) / height,
-        (WIDTH - panel.left - _EDGE) / width,
-        (panel.height - _BOTTOM - _TOP) / height,
-    )
-    ax = figure.add_axes(box)
+def _draw(panel: Panel, ax: Axes) -> None:
     ax.set(**panel.limits)
     panel.draw(ax)
     if ax.get_xscale() == "linear" and isinstance(ax.xaxis.get_major_locator(), AutoLocator):
         ax.xaxis.set_major_locator(round_ticks())
-    for axis in (ax.xaxis, ax.yaxis):
-        _put_power_behind_title(axis)
-    if panel.title:
-        ax.set_title(plain(panel.title), x=-(panel.left - _EDGE) / (WIDTH - panel.left - _EDGE), y=1.0)
-
-
-def _put_power_behind_title(axis: Axis) -> None:
-    """Move the power of ten of an axis to its title."""
-    formatter = axis.get_major_formatter()
-    formatter.set_locs(axis.get_majorticklocs())
-    if power := re.sub(r"([\d.]+)e([-−]?\d+)", _as_written, formatter.get_offset()):
-        axis.offsetText.set_visible(False)
-        axis.set_label_text("   ".join(text for text in (axis.get_label_text(), power) if text))
-
-
-def _as_written(found: re.Match) -> str:
-    power = f"10{power_of_ten(int(found[2].replace('−', '-')))}"
-    if found.start() == 0:  # a multiple, always of 1
-        return f"×{power}"
-    return power if found[1] == "1" else f"{found[1]}×{power}"
-
-
-def _legend_lines(legend: Sequence[Key], width: float) -> int:
-    if not legend:
-        return 0
-    # inches; columns are as wide as their widest entry
-    widest = max(len(key.label) for key in legend) * 0.062 + 0.5
-    return math.ceil(len(legend) / max(1, int((width - 0.1) // widest)))
+    ax.set_title(plain(short(panel.title, LONGEST_TITLE)))
 
 
 def _handle(key: Key) -> Line2D | Patch:
-    label = symbol_math(key.label) if key.symbol else plain(key.label)
+    label = symbol_math(key.label) if key.symbol else plain(short(key.label, LONGEST_KEY))
     if not key.symbol and key.label[:1] == "_":  # matplotlib leaves out labels that begin with an underscore
         label = label.replace("_", " ", 1)
     if key.mark in ("band", "bar"):

@@ -7,6 +7,7 @@ import pytest
 from report.made_campaigns import HIGHER, after_campaign, aging_campaign
 from report.test_page import Page
 
+from sealfit.report.figures.aging import aging
 from sealfit.report.notation import number
 from sealfit.report.page import build_report, with_after_fits
 from sealfit.report.parameter_tables import error_text, law_rows, parameter_tables
@@ -38,7 +39,8 @@ def test_the_page_is_of_the_after_model_and_says_its_reference(made, unsaved):
     page = Page(build_report(*made.arguments).html)
     assert "at the reference state: cold contact (time 0)" in page.text
     assert re.search(r"parameter value 95 % u sys before unit", page.text)
-    assert "before, without the effects" in page.text
+    legend = aging(with_after_fits(made.tables), made.config).legend
+    assert legend[-1].label == "before, without the effects"
 
 
 def test_without_effects_nothing_is_doubled(unsaved):

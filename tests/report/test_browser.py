@@ -26,13 +26,13 @@ for (const width of widths) {
   frame.style.height = "2000px";
   frame.style.border = "0";
   frame.onload = () => {
-    const page = frame.contentDocument, images = [...page.images], root = page.documentElement;
-    const inside = e => (e.closest(".box") && !e.closest(".explained")) || e.closest("pre");
+    const page = frame.contentDocument, root = page.documentElement;
+    const inside = e => (e.closest(".box") && !e.closest(".explained")) || e.closest("pre")
+      || e.parentElement.closest("svg");
     const boxes = [...page.querySelectorAll("body *")].filter(e => !inside(e));
     const right = Math.ceil(Math.max(...boxes.map(e => e.getBoundingClientRect().right)));
-    const drawings = [...page.querySelectorAll(".panels svg")], all = images.length + drawings.length;
-    const shown = images.filter(i => i.complete && i.naturalWidth > 0).length
-      + drawings.filter(d => d.getBoundingClientRect().width > 100).length;
+    const drawings = [...page.querySelectorAll("figure svg")], all = drawings.length;
+    const shown = drawings.filter(d => d.getBoundingClientRect().width > 100).length;
     const tables = [...page.querySelectorAll(".params")];
     const cut = tables.filter(t => t.offsetWidth > t.parentElement.clientWidth);
     found[width] = [root.clientWidth, root.scrollWidth, right, shown, all, cut.length];
@@ -48,7 +48,7 @@ COLOURS = """<!doctype html><title>not measured</title><body><script>
 const frame = document.createElement("iframe");
 frame.onload = () => {
   const page = frame.contentDocument, style = e => frame.contentWindow.getComputedStyle(e);
-  const body = style(page.body), plot = style(page.querySelector(".panels svg"));
+  const body = style(page.body), plot = style(page.querySelector("figure svg"));
   document.title = "measured " + JSON.stringify([body.backgroundColor, body.color, plot.filter]);
 };
 frame.srcdoc = PAGE;
@@ -62,38 +62,30 @@ frame.style.width = "1200px";
 frame.style.height = "2000px";
 frame.onload = async () => {
   const page = frame.contentDocument, found = {};
-  const tip = page.querySelector(".tip"), point = page.querySelector("svg use[data-text]");
-  const box = point.getBoundingClientRect();
-  const at = { clientX: box.x + box.width / 2, clientY: box.y + box.height / 2, bubbles: true };
-  found.hidden = frame.contentWindow.getComputedStyle(tip).visibility;
-  point.closest("svg").dispatchEvent(new frame.contentWindow.PointerEvent("pointermove", at));
-  found.shown = frame.contentWindow.getComputedStyle(tip).visibility;
-  found.tip = tip.textContent;
-  const mean = [...page.querySelectorAll("#force-speed use[data-text]")][3];
-  const place = mean.getBoundingClientRect();
-  const mouse = name => new frame.contentWindow.PointerEvent(name, {
-    clientX: place.x + place.width / 2, clientY: place.y + place.height / 2, bubbles: true });
-  const dialog = page.querySelector("dialog");
-  found.mean = mean.dataset.text;
-  mean.closest("svg").dispatchEvent(mouse("click"));
+  const text = point => point.querySelector("title").textContent;
+  const click = point => {
+    point.dispatchEvent(new frame.contentWindow.MouseEvent("click", { bubbles: true }));
+  };
+  const dialog = page.querySelector("dialog"), titled = id => page.querySelectorAll(id + " use:has(title)");
+  const mean = titled("#force-speed")[3];
+  found.mean = text(mean);
+  found.wide = mean.getBoundingClientRect().width;
+  click(mean);
   found.run = dialog.querySelector("h2").textContent;
-  found.points = dialog.querySelectorAll("circle").length;
+  const lines = [...dialog.querySelectorAll("path.measured")];
+  found.points = lines.map(line => line.getAttribute("d").split("L").length);
   dialog.close();
-  const residual = page.querySelector("#residual use[data-text]"), spot = residual.getBoundingClientRect();
-  found.residual = residual.dataset.text;
-  residual.closest("svg").dispatchEvent(new frame.contentWindow.PointerEvent("click", {
-    clientX: spot.x + spot.width / 2, clientY: spot.y + spot.height / 2, bubbles: true }));
+  const residual = titled("#residual")[0];
+  found.residual = text(residual);
+  click(residual);
   found.farthest = dialog.querySelector("h2").textContent;
   dialog.close();
-  page.querySelector("#force-speed .panel button").click();
-  const large = dialog.querySelector("svg");
-  const view = () => large.getAttribute("viewBox").split(" ").map(Number), whole = view();
-  const middle = large.getBoundingClientRect();
-  const wheel = { deltaY: -500, clientX: middle.x + middle.width / 2, clientY: middle.y + middle.height / 2 };
-  large.dispatchEvent(new frame.contentWindow.WheelEvent("wheel", wheel));
-  found.zoom = view()[2] / whole[2];
-  large.dispatchEvent(new frame.contentWindow.MouseEvent("dblclick"));
-  found.whole = view().join() === whole.join();
+  page.querySelector("#force-speed .tools button").click();
+  const large = dialog.querySelector("svg"), whole = large.getBoundingClientRect();
+  const wheel = { deltaY: -500, clientX: whole.x + whole.width / 2, clientY: whole.y + 20, bubbles: true };
+  large.dispatchEvent(new frame.contentWindow.WheelEvent("wheel", { ...wheel, cancelable: true }));
+  found.zoom = large.getBoundingClientRect().width / whole.width;
+  found.scrolled = large.parentElement.scrollLeft;
   dialog.close();
   const head = page.querySelector("th.n.sorts"), table = head.closest("table");
   const column = () => [...table.tBodies[0].rows].map(row => row.cells[head.cellIndex].textContent.trim());
@@ -127,7 +119,7 @@ document.body.append(frame);
 
 pytestmark = [
     pytest.mark.skipif(BROWSER is None, reason="no chromium on PATH"),
-    pytest.mark.usefixtures("only_panels"),
+    pytest.mark.usefixtures("only_drawings"),
 ]
 
 
@@ -150,13 +142,13 @@ def html_of(make):
 def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_path):
     shown = loaded(DRIVE, html_of(after_campaign), tmp_path)
     found = json.loads(html.unescape(re.search(r"<title>driven (.*?)</title>", shown, re.S)[1]))
-    assert (found["hidden"], found["shown"]) == ("hidden", "visible")
-    assert re.match(r"(before|after): .* N\n", found["tip"])
     assert found["mean"].splitlines()[2] in found["run"]
-    assert found["points"] == 3 * 20  # repeats and bins of made_campaigns
+    assert found["wide"] > 10  # pixels at which the text is shown
+    assert found["points"] == 3 * [20]  # repeats and bins of made_campaigns
+    assert re.match(r"(before|after): .* N\n", found["residual"])
     assert found["residual"].splitlines()[3] in found["farthest"]
-    assert 0.3 < found["zoom"] < 0.7
-    assert found["whole"]
+    assert 1.5 < found["zoom"] < 3
+    assert found["scrolled"] > 0
     rising = [float(text.replace("\u2212", "-")) for text in found["rising"]]
     assert len(rising) > 1
     assert rising == sorted(rising)
@@ -179,7 +171,7 @@ def test_without_scripts_the_page_is_whole(tmp_path):
     inert = html_of(aging_campaign).replace("<script>", '<script type="text/plain">')
     ((client, scroll, _, shown, images, _),) = measured(inert, [1200], tmp_path).values()
     assert client == scroll == 1200
-    assert shown == images == html_of(aging_campaign).count("<img")
+    assert shown == images == html_of(aging_campaign).count("<figure")
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -202,20 +194,13 @@ def test_the_page_prints_on_a4(tmp_path):
 
 
 def test_a_table_of_one_row_stays_on_its_sheet(tmp_path):
-    """Nor does the legend leave its figure, which needs a sheet of its own."""
+    """Nor is a figure cut, which needs a sheet of its own."""
     sections = """<div style="height: 200mm"></div>
     <section><h3>Table</h3><div class="box">
     <table><thead><tr><th>a</th></tr></thead><tbody><tr><td>1</td></tr></tbody></table></div></section>
-    <section><h2>Figure</h2><figure><ul class="legend"><li>b</li></ul>
-    <div class="panels"><div class="panel" style="height: 228mm"></div></div></figure></section>"""
-    assert sheets(sections, tmp_path) == 2
-
-
-def test_a_figure_whose_caption_does_not_fit_begins_on_the_sheet_all_the_same(tmp_path):
-    panel = '<div class="panel" style="height: 40mm"></div>'
-    sections = f"""<div style="height: 70mm"></div>
-    <section><h3>Figure</h3><figure><ul class="legend"><li>b</li></ul><div class="panels">{7 * panel}</div>
-    <figcaption>What it shows.</figcaption></figure></section><div style="height: 200mm"></div>"""
+    <section><h2>Figure</h2><figure>
+    <svg width="500" height="1000" viewBox="0 0 500 1000"><rect width="500" height="1000"/></svg>
+    </figure></section>"""
     assert sheets(sections, tmp_path) == 2
 
 

@@ -24,7 +24,6 @@ from sealfit.report.notation import (
     natural,
     number,
     plain,
-    short,
     symbol_math,
     symbol_plain,
 )
@@ -113,7 +112,7 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         symbols = [symbol_plain(quantity) for quantity in quantities]
         alt = f"Aging, {names(name)}: {joined(symbols)} over {number(right)} d; "
         alt += f"{symbols[0]} starts at {number(first)}."
-        panels.append(Panel(short(names(name)), alt, draw, limits=limits))
+        panels.append(Panel(names(name), alt, draw, limits=limits))
     legend = [Key(q, style.CYCLE[k % len(style.CYCLE)], symbol=True) for k, q in enumerate(quantities)]
     of_point = "mean of a condition, 95 %" if of_property else "fit per condition, 95 %"
     legend += [Key(of_point, style.FLOOR, "point"), Key("aging law, 95 % band", style.FLOOR, "band")]
@@ -213,7 +212,7 @@ def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         alt += f"{number(trace['force_N'].min())} to {number(trace['force_N'].max())} {units.unit('force')}."
         own = single[single["run_id"] == run.run_id] if len(single) else single
         draw = partial(draw_trace, trace=trace, units=units, repeats=own)
-        panels.append(Panel(short(title, 40), alt, draw, limits={"ylim": span}))
+        panels.append(Panel(title, alt, draw, limits={"ylim": span}))
     legend = [Key("mean of all repeats", style.AFTER)]
     if (traces["n"] < traces.groupby("run_id")["n"].transform("max")).any():
         legend.append(Key("mean of fewer repeats", style.SKY))
@@ -310,7 +309,7 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
         words = QUANTITIES.get(quantity, symbol_plain(quantity))
         title = f"{rubber}, {words}" if several else words
         alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
-        panels.append(Panel(short(capital(title), 40), alt, draw, limits=limits))
+        panels.append(Panel(capital(title), alt, draw, limits=limits))
     legend = [
         Key(f"{given(t)} °C", colour, "point")
         for t, colour in style.spread(list(colours.items()), style.MOST_KEYS)

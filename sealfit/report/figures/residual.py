@@ -106,7 +106,7 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: C
         alt += f"{label} {before} before, {after} {unit} after; "
     alt += f"noise floor {f'{number(floor)} {unit}' if known(floor) else 'unknown'}."
     draw = partial(draw_errors, closure=closure, units=config.units)
-    panels = [Panel("Errors and noise floor", alt, draw, left=0.86)]
+    panels = [Panel("Errors and noise floor", alt, draw)]
     before, after = tables["residuals_before"], tables["residuals_after"]
     if len(before) and len(after):
         held = before["heldout_residual_N"].notna().any() and after["heldout_residual_N"].notna().any()
@@ -126,7 +126,7 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: C
 
 # ---------------------------------------------------------------- finding
 def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
-    """Return the evidence for the verdict: the residual along one variable, and the errors.
+    """Return the evidence for the verdict: the residual along one variable, and the panels of the errors.
 
     The variable is that of the effect that reduces the held-out error most, or, without an effect, the one
     along which the residual is largest relative to its error. Of the direction it is the signed speed, over
@@ -141,7 +141,7 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config
     panel = _own_panel(next((name for name in own if name in order), order[0]), tables, config)
     floor = (key for key in errors.legend if key.mark == "dashed")
     title = "Residual and errors before and after"
-    return Plot("finding", title, (panel, errors.panels[0]), (*STAGES, *floor))
+    return Plot("finding", title, (panel, *errors.panels), (*STAGES, *floor))
 
 
 def _own_panel(name: str, tables: Mapping[str, pd.DataFrame], config: Config) -> Panel:
@@ -222,8 +222,8 @@ def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot 
     alt = f"Standard deviation of the residual by level: {', '.join(parts)}."
     height = max(0.82 + 0.42 * whole["level"].nunique(), 1.6)
     draw = partial(draw_levels, levels=levels, units=config.units)
-    panel = Panel(f"Variance by level (labels: sd in {unit})", alt, draw, height, left=0.86)
-    return Plot("variance_levels", "Residual variance by level", (panel,), BARS)
+    panel = Panel(f"Variance by level (labels: sd in {unit})", alt, draw)
+    return Plot("variance_levels", "Residual variance by level", (panel,), BARS, height=height)
 
 
 # ---------------------------------------------------------------- residual by channel
@@ -324,7 +324,7 @@ def _channel_panel(
     tested = tables["levels"].dropna(subset=["channel", "p_value"])
     p = tested.loc[(tested["stage"] == "before") & (tested["channel"] == name), "p_value"]
     alt += f"; p {p_value(p.min())} before." if len(p) else "."
-    return Panel(short(capital(words), 38), alt, draw, limits={"ylim": span or _span(rows)})
+    return Panel(capital(words), alt, draw, limits={"ylim": span or _span(rows)})
 
 
 def _span(channels: pd.DataFrame) -> tuple[float, float]:
@@ -414,7 +414,7 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: 
         alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
         alt += f"{shape_label(rows, effect, config.units)} from {number(scale * rows['value'].min())} to "
         alt += f"{number(scale * rows['value'].max())}."
-        panels.append(Panel(short(capital(words), 40), alt, draw, effect=int(index)))
+        panels.append(Panel(capital(words), alt, draw))
     legend = [Key("effect, 95 % band", style.AFTER)]
     if shapes["free"].notna().any():
         legend.append(Key("free shape", style.FLOOR, "dashed"))

@@ -147,8 +147,7 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
             for c in [*shared, *group]
         ]
         draw = partial(draw_force_speed, lines=lines, units=config.units, log=log)
-        height = style.HEIGHT if len(groups) > 2 else TALL
-        panels.append(Panel(short(title), _force_alt(title, lines, config), draw, height, limits=limits))
+        panels.append(Panel(title, _force_alt(title, lines, config), draw, limits=limits))
     legend = [Key(short(names(c)), style.BLACK) for c in style.spread(unaged, style.MOST_KEYS)]
     for level in style.spread(levels, style.MOST_KEYS):
         legend.append(Key(short(names(f"{last}={level}")), colour[level]))
@@ -167,7 +166,8 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
         legend.append(Key("declared model", style.FLOOR, "dotted"))
     quantity = config.units.quantity("force")
     title = f"{capital(quantity)} against {config.units.quantity('speed')}"
-    return Plot("force_speed", title, tuple(panels), tuple(legend), note)
+    height = style.HEIGHT if len(groups) > 2 else TALL
+    return Plot("force_speed", title, tuple(panels), tuple(legend), note, height)
 
 
 def _force_alt(title: str, lines: Sequence[Line], config: Config) -> str:
@@ -304,7 +304,7 @@ def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         alt += f"from {number(own['force_N'].min())} to {number(own['force_N'].max())} {units.unit('force')} "
         alt += f"over {number(_reach(own))} {units.unit('displacement')}."
         draw = partial(draw_starts, curves=own, colours=colours, units=units)
-        panels.append(Panel(short(names(condition)), alt, draw, limits={"ylim": span}))
+        panels.append(Panel(names(condition), alt, draw, limits={"ylim": span}))
     legend = [Key(f"{given(speed)} {units.unit('speed')}", colour) for speed, colour in colours.items()]
     legend.append(Key("mean of the strokes", style.FLOOR, "point"))
     if (shown["direction"] < 0).any():
