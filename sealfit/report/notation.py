@@ -76,10 +76,8 @@ def decimals(size: float, digits: int = 2) -> int:
     return digits - 1 - math.floor(math.log10(rounded) + 1e-12)
 
 
-def measured(value: float | None, lo: float | None, hi: float | None, digits: int = 2) -> tuple[str, str]:
-    """Return a value and its interval, rounded to `digits` significant digits of the interval's half-width.
-
-    With `digits` 1, a half-width that begins with 1 keeps two: one would round it by up to a third.
+def measured(value: float | None, lo: float | None, hi: float | None) -> tuple[str, str]:
+    """Return a value and its interval, rounded to two significant digits of the interval's half-width.
 
     Examples
     --------
@@ -87,8 +85,6 @@ def measured(value: float | None, lo: float | None, hi: float | None, digits: in
     ('0.835', '[0.821, 0.849]')
     >>> measured(6.123, 5.513, 6.7012)
     ('6.12', '[5.51, 6.70]')
-    >>> measured(4.02, 3.61, 4.48, digits=1), measured(4.02, 3.9, 4.14, digits=1)
-    (('4.0', '[3.6, 4.5]'), ('4.02', '[3.90, 4.14]'))
     >>> measured(4.0, None, None), measured(4.0, None, 5.5)
     (('4.00', '–'), ('4.00', 'up to 5.50'))
     """
@@ -101,10 +97,7 @@ def measured(value: float | None, lo: float | None, hi: float | None, digits: in
         return number(value), f"[{number(lo)}, {number(hi)}]"
     power = _power(max(abs(value), abs(lo), abs(hi)))
     value, lo, hi = (x / 10.0**power for x in (value, lo, hi))
-    half = (hi - lo) / 2
-    if digits == 1 and f"{half:.1e}".startswith("1"):
-        digits = 2
-    places = min(decimals(half, digits), 9)
+    places = min(decimals((hi - lo) / 2), 9)
     tail = _times_ten(power)
     return _fixed(value, places) + tail, f"[{_fixed(lo, places)}, {_fixed(hi, places)}]" + tail
 
@@ -305,24 +298,6 @@ def channel_words(name: str, units: Units) -> str:
         return special[name]
     unit, label = units.of(name), units.label(name)
     return label.removesuffix(f" ({unit})") if unit else label
-
-
-def split_channels(text: str | None, known: Collection[str]) -> list[str]:
-    """Return the channel names that `text` joins by spaces.
-
-    A column name may contain spaces, so the text is cut at the names in `known`.
-
-    Examples
-    --------
-    >>> split_channels("direction oil temp", {"direction", "oil temp"})
-    ['direction', 'oil temp']
-    """
-    names, words = [], text.split(" ") if text else []
-    while words:
-        n = next((n for n in range(len(words), 0, -1) if " ".join(words[:n]) in known), 1)
-        names.append(" ".join(words[:n]))
-        words = words[n:]
-    return names
 
 
 def effect_label(effect: Mapping, units: Units) -> str:

@@ -167,7 +167,6 @@ def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
         "tone": "" if not known else "within_scatter" if fits else "above_scatter",
         "fit": ("", ""),
         "verdict": Markup(" ").join(map(_of_property, properties)),
-        "undecided": "",
         "facts": [f"{one['quantity']}: {values_clause(one)}" for one in properties],
         "references": [],
     }
@@ -186,10 +185,8 @@ def answered(
 ) -> tuple[dict[str, pd.DataFrame], Mapping | None]:
     """Return tables and closure.json as the page uses them; see `with_after_fits`."""
     tables = with_after_fits(tables)
-    if closure is not None:
-        closure = words.with_left_channels(closure, set(tables["channels"]["channel"].dropna()))
-        if len(tables["steady"]) and tables["steady"]["load_N"].isna().all():
-            closure = words.without_load(closure)
+    if closure is not None and len(tables["steady"]) and tables["steady"]["load_N"].isna().all():
+        closure = words.without_load(closure)
     return tables, closure
 
 
@@ -216,8 +213,7 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
         "badge": capital(closure["verdict"].replace("_", " ")),
         "tone": closure["verdict"],
         "fit": fit_badge(closure),
-        "verdict": words.verdict(closure, tables["shapes"], config),
-        "undecided": words.undecided(closure, config),
+        "verdict": words.verdict(closure, config),
         "facts": campaign_facts(tables, config),
         "references": added if "steady_fit_before" in tables else [],
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -197,31 +197,59 @@ def by_gain(effects: Sequence[Mapping]) -> list[Mapping]:
 
 def verdict_sentence(closure: Mapping, units: Units) -> str:
     """Return the verdict in one sentence."""
-    return "; ".join(filter(None, [_verdict_clause(closure, units), outlier_clause(closure)]))
-
-
-def _verdict_clause(closure: Mapping, units: Units) -> str:
     count = sum(not effect["candidate"] for effect in closure["effects"])
     added = {0: "no effect was added", 1: "one effect was added"}.get(count, f"{count} effects were added")
-    quality, untold = quality_clause(closure), untold_clause(closure, units)
-    if closure["verdict"] == "nothing_missing":
-        power = power_clause(closure, units)
-        return "; ".join(filter(None, ["no effect beyond the declared model is significant", quality, power]))
-    if closure["verdict"] == "cannot_tell":
-        return f"{quality}; these files do not decide whether an effect is missing: {untold}"
-    if closure["verdict"] == "closed":
-        beside = f"; not decided by these files: {untold}" if untold else ""
+    lead = [added] if closure["verdict"] in ("closed", "unexplained") else []
+    said = [*lead, *verdict_clauses(closure, units), outlier_clause(closure)]
+    return "; ".join(filter(None, said))
+
+
+def verdict_clauses(closure: Mapping, units: Units) -> list[str]:
+    """Return what the verdict says beside the effects that were added, in clauses; some may be empty."""
+    kind, quality = closure["verdict"], quality_clause(closure)
+    if kind == "nothing_missing":
+        said = ["no effect beyond the declared model is significant", quality, power_clause(closure, units)]
+    elif kind == "cannot_tell":
+        untold = untold_clause(closure, units)
+        said = [quality, f"these files do not decide whether an effect is missing: {untold}"]
+    elif kind == "closed":
         remains = "no significant residual remains"
         if closure["left"]["significant"]:
-            remains = f"what remains{_where(closure['left'], units)} is less than repeats scatter by"
-        return f"{added}; {remains}; {quality}{beside}"
-    return f"{added}; a significant residual remains{_where(closure['left'], units)}; {quality}"
+            remains = f"what remains{residual_clause(closure, units)} is less than repeats scatter by"
+        untold = untold_clause(closure, units)
+        said = [remains, quality, f"not decided by these files: {untold}" if untold else ""]
+    else:
+        said = [f"a significant residual remains{residual_clause(closure, units)}", quality]
+    return said
 
 
-def _where(left: Mapping, units: Units) -> str:
+def residual_clause(closure: Mapping, units: Units) -> str:
+    """Return along which variable and at which level the residual remains, and its p-value."""
+    left = closure["left"]
+    known = {entry["variable"] for entry in closure["sensitivity"]} | {"direction"}
+    known |= {name for effect in closure["effects"] for name in effect["channels"]}
+    names = [units.label(name) for name in split_channels(left["channel"], known)]
     where = f" {level_words(left['level'])}" if left["level"] else ""
-    along = f" along {units.label(left['channel'])}" if left["channel"] else ""
+    along = f" along {' and '.join(names)}" if names else ""
     return along + where + (f" (p = {left['p_value']:.2g})" if left["p_value"] is not None else "")
+
+
+def split_channels(text: str | None, known: Collection[str]) -> list[str]:
+    """Return the channel names that `text` joins by spaces.
+
+    A column name may contain spaces, so the text is cut at the names in `known`.
+
+    Examples
+    --------
+    >>> split_channels("direction oil temp", {"direction", "oil temp"})
+    ['direction', 'oil temp']
+    """
+    names, words = [], text.split(" ") if text else []
+    while words:
+        n = next((n for n in range(len(words), 0, -1) if " ".join(words[:n]) in known), 1)
+        names.append(" ".join(words[:n]))
+        words = words[n:]
+    return names
 
 
 def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:

@@ -8,13 +8,11 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 
-import numpy as np
 import pandas as pd
 from markupsafe import Markup, escape
 
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
-from sealfit.effects.contract import Parameter
 from sealfit.report.figures.residual import LEVELS, shape_label, shape_scale
 from sealfit.report.notation import (
     GREEK,
@@ -30,7 +28,6 @@ from sealfit.report.notation import (
     number,
     of_unit,
     p_value,
-    split_channels,
     symbol_html,
     together,
     true_units,
@@ -41,17 +38,11 @@ from sealfit.report.summary import (
     by_gain,
     level_words,
     outlier_clause,
-    power_clause,
-    quality_clause,
-    untold_clause,
+    residual_clause,
+    split_channels,
+    verdict_clauses,
 )
 
-# A shape that crosses zero by at most this share of its span counts as one of constant sign. 0.02 is about
-# the resolution of a plot.
-FLAT = 0.02
-COUNTED = dict(enumerate(["two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"], start=2))
-# The verdict gives the sizes of at most this many effects; the sizes of more are in their cards.
-DETAILED = 2
 MOST_TESTS = 40
 CURVE_PLACES = 7  # of a free shape that a card lists
 FREE = {
@@ -62,40 +53,18 @@ FREE = {
 }
 
 
-def verdict(closure: Mapping, shapes: pd.DataFrame, config: Config) -> Markup:
-    """Return the verdict in a few sentences; table `shapes` gives the sizes of the effects."""
-    errors = [error_clause(closure, config)]
-    if known(closure["noise_floor_N"]):
-        errors.append(quality_clause(closure))
-    errors.append(outlier_clause(closure))
-    if closure["verdict"] == "nothing_missing":
-        power = power_clause(closure, config.units)
-        return _sentences("no effect beyond the declared model is significant", *errors, power)
-    if closure["verdict"] == "cannot_tell":
-        lead = Markup("these files do not decide whether an effect is missing: {}")
-        return _sentences(
-            lead.format(in_words(untold_clause(closure, config.units), closure, config)), *errors
-        )
-    effects = closure["effects"]
-    added = [(effects.index(e), e) for e in by_gain(effects) if not e["candidate"]]
-    lacked = left = better = ""
-    if added:
-        many = f"{COUNTED.get(len(added), len(added))} effects: " if len(added) > 1 else ""
-        missed = Markup(joined(_missed_effects(added, shapes, config)))
-        lacked = Markup("the declared model lacks {}{}").format(many, missed)
-        better = Markup("with {}, {}").format("them" if len(added) > 1 else "it", errors.pop(0))
-    if closure["verdict"] != "closed":
-        left = f"a significant residual remains that no effect explains: {_where(closure['left'], config)}"
-    elif closure["left"]["significant"]:
-        left = f"{_where(closure['left'], config)}, by less than repeats scatter"
-    return _sentences(lacked, better, left, *errors)
-
-
-def undecided(closure: Mapping, config: Config) -> Markup:
-    """Return what the files do not decide beside the effects that were found, in a sentence; may be empty."""
-    untold = untold_clause(closure, config.units) if closure["verdict"] == "closed" else ""
-    lead = Markup("not decided by these files: {}")
-    return _sentences(lead.format(in_words(untold, closure, config)) if untold else "")
+def verdict(closure: Mapping, config: Config) -> Markup:
+    """Return the verdict in a few sentences."""
+    added = [effect for effect in by_gain(closure["effects"]) if not effect["candidate"]]
+    error = error_clause(closure, config)
+    said = [in_words(clause, closure, config) for clause in verdict_clauses(closure, config.units)]
+    said.append(outlier_clause(closure))
+    if not added:
+        return _sentences(*said, error)
+    times = Counter(effect_label(effect, config.units) for effect in added)
+    labels = [label if n == 1 else f"{label} ({n} of them)" for label, n in times.items()]
+    them = "them" if len(added) > 1 else "it"
+    return _sentences(f"the declared model lacks {joined(labels)}", f"with {them}, {error}", *said)
 
 
 def in_words(text: str, closure: Mapping, config: Config) -> Markup:
@@ -105,25 +74,7 @@ def in_words(text: str, closure: Mapping, config: Config) -> Markup:
     return with_symbols(true_units(re.sub(r"\bforce\b", force, text), config.units, names))
 
 
-def _missed_effects(
-    added: Sequence[tuple[int, Mapping]], shapes: pd.DataFrame, config: Config
-) -> list[Markup]:
-    """Return each effect with its size; of more than `DETAILED` effects only the names, each once."""
-    if len(added) <= DETAILED:
-        return [_missed(effect_label(e, config.units), does(k, e, shapes, config)) for k, e in added]
-    times = Counter(effect_label(effect, config.units) for _, effect in added)
-    return [escape(label if n == 1 else f"{label} ({n} of them)") for label, n in times.items()]
-
-
-def _missed(label: str, does: Markup) -> Markup:
-    if not does:
-        return escape(label)
-    if label.endswith(")"):  # a second pair of parentheses would follow
-        return Markup("{}; {})").format(label.removesuffix(")"), does)
-    return Markup("{} ({})").format(label, does)
-
-
-def error_clause(closure: Mapping, config: Config) -> Markup:
+def error_clause(closure: Mapping, config: Config) -> str:
     """Return the held-out error before and after, and the noise floor, in a clause."""
     unit = config.units.unit("force")
     held = f"rms error on held-out {closure['heldout_unit']}s"
@@ -141,63 +92,7 @@ def error_clause(closure: Mapping, config: Config) -> Markup:
         way = "falls" if after < before else "rises"
         change = f"the {what} {way} from {of_unit(texts[0], unit)} to {of_unit(texts[1], unit)}"
     end = f": {of_unit(texts[2], unit)}" if known(floor) else " unknown: there are no repeats"
-    return Markup("{} (noise floor{})").format(change, end)
-
-
-def does(index: int, effect: Mapping, shapes: pd.DataFrame, config: Config) -> Markup:
-    """Return the largest change of the target by an effect, and its other parameters, in a clause.
-
-    The values of a free shape at its knots are not among them.
-    """
-    change = _change(effect, shapes[shapes["effect"] == index] if len(shapes) else shapes, config)
-    rest = [p for p in effect["parameters"] if effect["named"] and p["unit"] != "rad"]
-    if change:  # which says how large the amplitudes are
-        found = [_catalogued(effect["id"], p["name"]) for p in rest]
-        rest = [p for p, own in zip(rest, found, strict=True) if own is None or not own.linear]
-    return Markup(", ").join(filter(None, [change, *(parameter(p, effect) for p in rest[:2])]))
-
-
-def parameter(p: Mapping, effect: Mapping) -> Markup:
-    """Return "time constant τ = 4.0 s [3.6, 4.5]", in words for an effect of the catalogue."""
-    words = meaning(effect["id"], p["name"])
-    value = _measured(p["value"], p["ci95"], p["unit"])
-    text = Markup("{} = {}").format(symbol_html(p["name"]), value)
-    return Markup("{} {}").format(words, text) if words and len(words) <= 40 else text
-
-
-def _measured(value: float | None, ends: Sequence[float | None], unit: str | None) -> str:
-    text, interval = measured(value, *ends, digits=1)
-    tail = f" {interval}".replace(", ", ",\u00a0") if interval != NOTHING else ""
-    return of_unit(text, unit or "") + tail
-
-
-def _change(effect: Mapping, shape: pd.DataFrame, config: Config) -> Markup:
-    """Return the target's largest change along the first variable, and where it occurs; empty for none."""
-    shape = shape[shape["x"].notna() & shape["value"].notna()]
-    if len(shape) < 2:
-        return Markup("")
-    channel = shape["channel"].iloc[0]
-    shape = shape[shape["channel"] == channel].sort_values("x")
-    value, lo, hi = (shape[name].to_numpy(float) for name in ("value", "lo95", "hi95"))
-    span = value.max() - value.min()
-    if not span > 0:
-        return Markup("")
-    scale, unit = 1.0, next((u for u in shape["unit"] if isinstance(u, str) and u), "")
-    if effect["operation"] == "multiply":
-        scale, unit = 100.0, "%"
-    size, words = of_unit(number(scale * span, 2), unit), channel_words(channel, config.units)
-    if channel == "direction":
-        change = f"differs by {size} between directions"
-    elif -value.min() > FLAT * span and value.max() > FLAT * span:
-        change = f"varies by {size} along {words}"
-    else:  # constant sign: the largest change against the model without the effect
-        k = int(np.argmax(np.abs(value)))
-        sign = 1.0 if value[k] > 0 else -1.0
-        ends = sorted((scale * sign * lo[k], scale * sign * hi[k]))
-        size = _measured(scale * abs(value[k]), ends, unit)
-        place = of_unit(given(float(shape["x"].iloc[k])), config.units.of(channel))
-        change = f"{'rises' if sign > 0 else 'falls'} by up to {size} at {words} {place}"
-    return Markup("{} {}").format(target_html(effect["acts_on"], config), change)
+    return f"{change} (noise floor{end})"
 
 
 def target_html(target: str, config: Config) -> Markup:
@@ -232,13 +127,8 @@ def acts(effect: Mapping, config: Config) -> Markup:
 
 def meaning(effect_id: str, name: str) -> str:
     """Return the meaning of a parameter, or "" for an effect that is not in the catalogue."""
-    found = _catalogued(effect_id, name)
-    return found.meaning if found else ""
-
-
-def _catalogued(effect_id: str, name: str) -> Parameter | None:
     parameters = EFFECTS[effect_id].parameters if effect_id in EFFECTS else ()
-    return next((p for p in parameters if p.symbol == name.rstrip("_")), None)
+    return next((p.meaning for p in parameters if p.symbol == name.rstrip("_")), "")
 
 
 def left_over(closure: Mapping, config: Config) -> Markup:
@@ -255,40 +145,22 @@ def left_over(closure: Mapping, config: Config) -> Markup:
             said.append(
                 f"the excess over the noise floor is {excess} (root of the difference of the squares)"
             )
+    where = in_words(residual_clause(closure, config.units), closure, config)
     if left["significant"]:
-        said.append(f"a significant residual remains: {_where(left, config)}")
-    elif left["channels"] and any(effect["candidate"] for effect in closure["effects"]):
-        said.append(f"the evidence rests on too few specimens: {_where(left, config)}")
-    elif left["channels"]:
-        said.append(f"no variable is significant. The smallest p-value: {_where(left, config)}")
+        said.append(Markup("a significant residual remains{}").format(where))
+    elif left["channel"] and any(effect["candidate"] for effect in closure["effects"]):
+        said.append(Markup("the evidence rests on too few specimens: it varies{}").format(where))
+    elif left["channel"]:
+        said.append(Markup("no variable is significant. The smallest p-value:{}").format(where))
     else:
         said.append("no variable explains it: it is consistent with scatter")
     return _sentences(*said)
-
-
-def _where(left: Mapping, config: Config) -> str:
-    names, level = left["channels"], left["level"]
-    text = "the residual varies"
-    if names:
-        text += f" with {channel_labels(names, config)}"
-    if level:
-        text += f" {level_words(level)}"
-    if not known(left["p_value"]):
-        return text
-    p = p_value(left["p_value"]).replace(" ", "\u00a0")  # on one line
-    return f"{text} (p\u00a0{p})"
 
 
 def without_load(closure: Mapping) -> dict:
     """Return closure.json of a campaign without a load: F_s and F_c are fitted in place of mu_s and mu_c."""
     text = re.sub(r'(?<="acts_on": ")mu(?=_[sc]")', "F", json.dumps(closure))
     return json.loads(text.replace('"acts_on": "mu"', '"acts_on": "friction"'))
-
-
-def with_left_channels(closure: Mapping, channels: Collection[str]) -> dict:
-    """Return closure.json with `left.channels`: `left.channel` split into the names in `channels`."""
-    left = closure["left"]
-    return {**closure, "left": {**left, "channels": split_channels(left["channel"], channels)}}
 
 
 def _sentences(*clauses: str | Markup) -> Markup:
