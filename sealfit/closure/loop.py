@@ -30,7 +30,7 @@ from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.engine.run_map import run_map
-from sealfit.fit.joint import Fitted, fit, fit_declared, fit_with_effects
+from sealfit.fit.joint import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
 from sealfit.ingest.stored_parts import StoredTraces
@@ -151,7 +151,7 @@ def _on_all(rows: Rows, selection: Selection) -> tuple[Fitted, Fitted]:
     if not selection.added:
         return before, before
     model = replace(selection.after.model, terms=tuple(a.proposal.term for a in selection.added))
-    return before, fit_with_effects(model, rows, selection.after.scatter, before)
+    return before, fit(model, rows, selection.after.scatter, turns=2)
 
 
 class _HeldOut:

@@ -34,7 +34,7 @@ from sealfit.closure.search import (
     search_masked_pairs,
     search_pairs,
 )
-from sealfit.fit.joint import Fitted, fit, fit_declared, fit_with_effects
+from sealfit.fit.joint import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.rows import ALONG, Rows
 from sealfit.fit.joint.whitening import Scatter
@@ -268,9 +268,7 @@ class _Loop:
         )
         added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
-        self.fitted, self.added = _remove_redundant(
-            fit_with_effects(own.model, self.rows, own.scatter, self.fitted), added
-        )
+        self.fitted, self.added = _remove_redundant(fit(own.model, self.rows, own.scatter, turns=2), added)
         # A removed effect is not added again.
         self.refused |= {a.proposal.source for a in added if all(a is not k for k in self.added)}
 

@@ -6,7 +6,7 @@ are fitted alternately until they converge. Priors are in `prior.py`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -140,8 +140,9 @@ def fit(
     """Return the model fitted to `rows`, physics and effects together.
 
     `model` is the start, with v_s and b from a global search, and `scatter` a starting value. `turns` is how
-    often the scatter is re-estimated and the model refitted. If it is 0, the scatter is fixed, and so is the
-    friction, shape (n,), to which gains and noise are proportional; fits to be compared must share it.
+    often the scatter is re-estimated and the model refitted; specimens get no component of their own if the
+    error is much smaller without one. If it is 0, the scatter is fixed, and so is the friction, shape (n,),
+    to which gains and noise are proportional; fits to be compared must share it.
     """
     centre = prior.centre_of(model)
     if scatter is None:
@@ -149,15 +150,38 @@ def fit(
         model = descend(model, rows, scatter, centre, tolerance=ROUGH)
     if turns and model.terms:
         model = _searched(model, rows, scatter)
-    for turn in range(turns):
-        force, jacobian = evaluate(model, rows)
-        scatter = estimate_scatter(
-            rows, rows.force - force, friction_of(model, rows), jacobian, scatter if turn else None
-        )
-        model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, centre)
     if not turns:
         model = descend(model, rows, scatter, centre, friction, tolerance=COMPARED)
-    return fitted_at(model, rows, scatter, friction)
+        return fitted_at(model, rows, scatter, friction)
+    found = _alternately(model, rows, None, turns)
+    if _misses_levels(found):
+        within = tuple(part for part in found.scatter.components if part.level != "specimen")
+        other = _alternately(model, rows, replace(found.scatter, components=within), turns)
+        return other if other.rmse_N * WRONG_SCATTER < found.rmse_N else found
+    return found
+
+
+def _alternately(model: Model, rows: Rows, scatter: Scatter | None, turns: int) -> Fitted:
+    """Return the model fitted in turns with the scatter, which has the components that it starts with."""
+    for _ in range(turns):
+        force, jacobian = evaluate(model, rows)
+        scatter = estimate_scatter(rows, rows.force - force, friction_of(model, rows), jacobian, scatter)
+        model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, prior.centre_of(model))
+    return fitted_at(model, rows, scatter)
+
+
+def _misses_levels(fitted: Fitted) -> bool:
+    """Whether least squares without the scatter of specimens would leave a much smaller error.
+
+    Where specimens differ in v_s or sigma_2, which no component describes, or an effect changes their curves,
+    these count for more than their levels, and all of the error of the levels is taken for scatter.
+    """
+    if not any(part.level == "specimen" and part.variance > 0 for part in fitted.scatter.components):
+        return False
+    root = np.sqrt(fitted.rows.weight)
+    scaled = fitted.jacobian.with_values(fitted.jacobian.values * root[:, None])
+    left = scaled.orthonormal(1e-9).project_out(root * fitted.residual)
+    return float(left @ left) * WRONG_SCATTER**2 < fitted.rmse_N**2
 
 
 def _searched(model: Model, rows: Rows, scatter: Scatter) -> Model:
@@ -168,18 +192,6 @@ def _searched(model: Model, rows: Rows, scatter: Scatter) -> Model:
     found = search_nonlinear(model, rows, scatter)
     kept, own = (fitted_at(m, rows, scatter) for m in (model, found))
     return model if kept.deviance + WRONG_SEARCH * rows.force.size < own.deviance else found
-
-
-def fit_with_effects(model: Model, rows: Rows, scatter: Scatter, former: Fitted) -> Fitted:
-    """Return a model with effects, fitted under re-estimated scatter or, if that is wrong, the former one.
-
-    An effect that is taken out lowers the scatter of runs. Where specimens differ in v_s or sigma_2, which
-    no component describes, their curves then count for more than their levels, and the error is far larger
-    than it need be. `former` is the fit without the effects; the other arguments are those of `fit`.
-    """
-    found = fit(model, rows, scatter, turns=2)
-    other = fit(found.model, rows, former.scatter, turns=0)
-    return other if other.rmse_N * WRONG_SCATTER < found.rmse_N else found
 
 
 def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Fitted:

@@ -214,7 +214,7 @@ def estimate_scatter(
 
     `residual`, measured minus model, and `friction`, to which noise and gains are proportional, have the
     shape (n,) and are in N. `jacobian`, shape (n, p), is the tangent of the model. `start` has starting
-    values.
+    values, and the components to be estimated.
     """
     s0, g, design_effect = row_noise(rows, residual, friction)
     shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * friction) ** 2) * design_effect))
@@ -230,8 +230,8 @@ def estimate_components(
     means = groups.means(np.column_stack([residual, friction]), level)
     noise = groups.means(scatter.noise_sd(friction) ** 2, level)
     count = np.diff(np.r_[groups.starts[level], residual.size])
-    kinds = usable_components(rows)
     known = {(c.level, c.kind): c.variance for c in scatter.components}
+    kinds = [kind for kind in usable_components(rows) if not known or kind in known]
     between = jacobian.means(groups, level)
     inside = between.with_values(between.values * np.sqrt(count)[:, None]).norms() ** 2
     share = inside / np.maximum(jacobian.norms() ** 2, 1e-300)
