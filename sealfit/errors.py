@@ -47,8 +47,8 @@ class Fault:
         parts = [place] if place else []
         if self.column is not None:
             parts.append(f"column '{self.column}'")
-        if self.value is not None:
-            parts.append(_shown(self.value))
+        if self.value is not None and (shown := _shown(self.value)) not in self.reason.split():
+            parts.append(shown)
         head = ": ".join(parts)
         text = f"{head}: {self.reason}" if head else self.reason
         return printable(f"{text} {self.fix}".strip())

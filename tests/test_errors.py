@@ -60,6 +60,11 @@ def test_reasons_that_differ_in_numbers_stand_with_the_examples():
     assert told(group) == f"5 files: for example {examples}."
 
 
+def test_a_number_that_the_reason_has_is_said_once():
+    assert str(Fault("too_many", "60 of 600 rows are bad.", value=60.0)) == "60 of 600 rows are bad."
+    assert str(Fault("spike", "is 160 off.", value=60.0)) == "60: is 160 off."
+
+
 @pytest.mark.parametrize(
     "change", [{"check": "b"}, {"severity": "info"}, {"action": "kept"}, {"fix": "c"}, {"column": "d"}]
 )
