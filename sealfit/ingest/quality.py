@@ -71,7 +71,7 @@ def stroke_faults(
         reason, samples = stroke.short, float(len(stroke.rows))
         fix = "Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config."
         if not stroke.settles:
-            reason, fix = f"the speed never settles: {reason}", "Drive at a constant speed."
+            reason, fix = f"the speed never settles: {reason}", f"Drive at a constant speed. {fix}"
         return [Fault("too_short", f"{reason}.", value=samples, fix=fix, **STROKE_OUT)]
     found = []
     if not stroke.settles:
