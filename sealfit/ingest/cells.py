@@ -70,8 +70,11 @@ def clean(rows: Trace, names: Sequence[str]) -> Trace:
         faults += _row_faults("not_finite", name, rows, wrong)
         faults += _row_faults("overload", name, rows, overload)
     good = rows.where(finite)
-    back = _out_of_order(good.columns["time_s"])
-    faults += _row_faults("time_order", "time_s", good, back)
+    time_s, check = good.columns["time_s"], "time_order"
+    back = _out_of_order(time_s)
+    if back.sum() > SEVERAL * len(back) and (first := _begins_anew(time_s)):
+        back, check = np.arange(len(back)) >= first, "time_anew"
+    faults += _row_faults(check, "time_s", good, back)
     return good.where(~back).with_faults(faults)
 
 
@@ -79,7 +82,12 @@ _ROW_FAULTS = {  # check: (reason, fix)
     "not_finite": ("the computed value is not a finite number.", "Check [trace.compute]."),
     "overload": ("is an instrument's mark for overload.", "Check the sensor's range."),
     "time_order": ("time repeats or runs backwards.", "Check the recorder's clock, or delete the line."),
-}
+    "time_anew": ("is after time began anew: several recordings follow each other, or the clock restarted.",
+                  "Save each recording in a file of its own, and what differs between them in runs.csv."),
+}  # fmt: skip
+SEVERAL = 0.05  # share of the rows out of order from which time is looked at whether it began anew
+RECORDING = 30  # rows before that, fewer are none
+ANEW = 0.01  # share of the time so far that may be left where it does
 
 
 def _row_faults(check: str, name: str, rows: Trace, wrong: np.ndarray) -> list[Fault]:
@@ -92,6 +100,13 @@ def _row_faults(check: str, name: str, rows: Trace, wrong: np.ndarray) -> list[F
         return Fault(check, reason, line=int(rows.line[i]), value=shown, fix=fix, **place)
 
     return listed(np.flatnonzero(wrong), make, check, f"rows: {reason}")
+
+
+def _begins_anew(time_s: np.ndarray) -> int:
+    """Return the row at which time first falls back to where it began; 0 if there is none."""
+    since = time_s - time_s[0]
+    anew = 1 + np.flatnonzero((np.diff(since) < 0) & (since[1:] <= ANEW * since[:-1]))
+    return int(anew[0]) if anew.size and anew[0] >= RECORDING else 0
 
 
 def _out_of_order(time_s: np.ndarray) -> np.ndarray:

@@ -182,11 +182,22 @@ def test_many_faults_are_counted_and_only_the_first_twenty_written_out(tmp_path)
     assert "30 more cells" in faults[-1].reason
 
 
-def test_one_wrong_time_far_ahead_costs_one_row_and_a_restarted_clock_the_file(tmp_path):
+def test_one_wrong_time_far_ahead_costs_one_row_and_a_clock_set_back_the_file(tmp_path):
     assert len(read(tmp_path, changed(50, "900.0,25.0,2.5")).table) == 99
-    fault = refused(tmp_path, csv_of(ROWS + ROWS))
+    fault = refused(tmp_path, csv_of(ROWS + ROWS[40:]))
     assert "rows are bad" in fault.reason
     assert "clock" in fault.fix
+
+
+@pytest.mark.parametrize("times", [2, 5])
+def test_recordings_that_follow_each_other_in_a_file_are_said(tmp_path, times):
+    with pytest.raises(BadFile) as caught:
+        read(tmp_path, csv_of(times * ROWS))
+    first, *_, last = caught.value.faults
+    assert (first.check, first.line) == ("time_anew", 102)
+    assert f"{100 * (times - 1)} of {100 * times} rows are bad" in last.reason
+    assert last.fix.startswith("Save each recording in a file of its own")
+    assert len(read(tmp_path, csv_of(times * ROWS), "quality.max_bad_rows = 0.9").table) == 100
 
 
 @pytest.mark.parametrize(
