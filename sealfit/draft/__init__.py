@@ -47,6 +47,8 @@ def draft(folder: Path) -> Draft:
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)
     names = run_keys.suited_to(read_names(found.traces), roles)
     names = run_keys.improved(names, speeds, found, notes)
+    if table is not None:
+        names = run_keys.beside_table(names, table)
     given = names.given | (set() if table is None else table.given)
     header = trace_keys.header_keys(found, given, roles.load is not None, notes)
     run_keys.source_keys(found, names, table, header, notes)

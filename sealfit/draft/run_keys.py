@@ -168,6 +168,21 @@ def _unaged_apart(names: Names, found: Found) -> Names:
     return replace(names, templates={**names.templates, "specimen_id": template})
 
 
+def beside_table(names: Names, table: RunsTable) -> Names:
+    """Return the names without unknown numbers that the table of runs has, too, in a column of its own."""
+    said = {}
+    for file, one in values_by_file(names, names.files).items():
+        path = PurePosixPath(file)
+        said |= dict.fromkeys((file, path.with_suffix("").as_posix(), path.name, path.stem), one)
+    listed = next(table.cells[theirs] for theirs, ours in table.ours.items() if ours == "file")
+    of_rows = [said.get(cell.replace("\\", "/"), {}) for cell in listed]
+    columns = [[as_number(cell) for cell in cells] for cells in table.cells.values()]
+    for part in names.parts:
+        if part.ours.startswith("part_") and [one.get(part.ours) for one in of_rows] in columns:
+            names = names.without(part)
+    return names
+
+
 def suited_to(names: Names, roles: Roles) -> Names:
     """Return the names as the columns of traces ask for it.
 

@@ -411,6 +411,17 @@ def write_with_log(folder, columns, started, log="log.csv"):
     exports.write(folder, log, "\n".join(rows) + "\n")
 
 
+def test_numbers_in_names_that_the_log_has_too_are_no_channels(tmp_path):
+    rows = ["name,run,rep,days,oil"]
+    for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0), repeats=(1, 2))):
+        run, rep, oil = number // 2 + 1, number % 2 + 1, number % 3
+        exports.write(tmp_path, f"{run:03d}_{rep}_{oil}.csv", plain(one))
+        rows.append(f"{run:03d}_{rep}_{oil}.csv,{run},{rep},{one.days},{oil if number else 7}")
+    exports.write(tmp_path, "log.csv", "\n".join(rows) + "\n")
+    listing, _ = list_traces(tmp_path, parse_config(draft(tmp_path).text, "rig.toml"))
+    assert [name for name in listing.columns if name.startswith("part_")] == ["part_4"]  # differs from 'oil'
+
+
 @pytest.mark.parametrize("log", ["log.csv", "log.txt"])
 def test_a_log_of_any_ending_is_read(tmp_path, log):
     write_with_log(tmp_path, "Start", lambda one: f"2024-03-0{1 + one.days}T08:00:00", log)
