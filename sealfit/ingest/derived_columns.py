@@ -371,7 +371,8 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
         other = first.setdefault((run[i], repeat[i], stroke[i]), i)
         if other != i:
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
-            fix = "Give every file of a run its own repeat number, or each stroke of a repeat its number."
+            fix = "Give every file of a run its own repeat number, files of different runs a run_id each, "
+            fix += "or each stroke of a repeat its number."
             if conditions[i].startswith(UNAGED):
                 fix += " Pieces of unaged rubber that were tested with several series "
                 fix += "need a specimen_id each."
