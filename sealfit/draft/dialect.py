@@ -11,9 +11,11 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from sealfit.config import AGING_CONDITION
 from sealfit.draft.vocabulary import column_role, name_and_unit, plain, setting
+from sealfit.ingest.derived_columns import UNAGED_WORDS
 from sealfit.ingest.files import as_number, split_line
 from sealfit.ingest.runs import time_of, usual_formats
 from sealfit.units import Unit, conversion, unit_of
@@ -277,15 +279,19 @@ def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Settin
             continue  # group/channel/property of a TDMS file: it is about the channel
         name, unit = name_and_unit(match["key"])
         value = match["value"].strip()
-        number = _NUMBER.match(value)
+        number, ours = _NUMBER.match(value), setting(name)
+        is_word = ours in AGING_CONDITION and value.strip(STRAYS + '"').lower() in UNAGED_WORDS
         if _SPECIMEN.fullmatch(plain(match["key"])):
             ours, pattern = "specimen_id", _after(match["key"], r'([^\s;,"][^;,\t"]*)')
-        elif number and as_number(number.group(), decimal or ".") is not None:
-            ours, pattern = setting(name), _after(match["key"], rf"({_SIZE})")
-            unit = unit or unit_of(value[number.end() :].strip(' ;,\t"'))
+        elif is_word or (number and as_number(number.group(), decimal or ".") is not None):
+            pattern = _after(match["key"], rf"({_SIZE})")
+            unit = unit or (unit_of(value[number.end() :].strip(' ;,\t"')) if number else None)
         else:
             continue
         values = tuple(_found(pattern, headers))
+        if "" in values and ours in AGING_CONDITION:
+            pattern = _after(match["key"], rf"({_SIZE}|(?i:{'|'.join(UNAGED_WORDS)})\b)")
+            values = tuple(_found(pattern, headers))
         if "" not in values:
             yield Setting(ours, name, pattern, unit, values, line, text.strip())
 
@@ -293,7 +299,11 @@ def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Settin
 def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]:
     """Return the settings that the header lines of every file give, those that their words name."""
     found: dict[str, Setting] = {}
-    for one in _settings(headers, decimal):
+    said = list(_settings(headers, decimal))
+    ovens = [
+        one for one in said if one.ours == "aging_days" and one.unit and one.unit.dimension == "temperature"
+    ]
+    for one in [*said, *(replace(oven, ours="temperature_C") for oven in ovens)]:
         fits = one.unit is None or one.unit.dimension == SETTINGS.get(one.ours)
         differs = one.ours == "specimen_id" and len(set(one.values)) > 1
         if differs or (one.ours in SETTINGS and fits):

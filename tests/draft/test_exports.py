@@ -161,6 +161,26 @@ def test_the_format_of_a_date_in_the_header_is_found(name, date_format, tmp_path
     assert set(config.trace.header_fields) == ({"started_at"} if two is None else {two.date, two.time})
 
 
+@pytest.mark.parametrize(
+    ("oven", "found"),
+    [
+        (("Lagerung [°C];RT", "Lagerung [°C];70"), ("RT", "70")),
+        (("Lagerung [°C];70", "Lagerung [°C];rt;"), ("70", "rt")),
+        (("Lagerung [°C];70;\nOfentemp. [°C];71", "Lagerung [°C];100\nOfentemp. [°C];101"), ("71", "101")),
+    ],
+)
+def test_a_header_line_of_the_oven_gives_the_temperature_of_unaged_rubber_in_a_word(oven, found):
+    headers = [f"{line}\nLagerdauer [Tage];4".split("\n") for line in oven]
+    settings = {one.ours: one for one in settings_in(headers, ",")}
+    assert settings["temperature_C"].values == found
+    assert settings["aging_days"].values == ("4", "4")
+
+
+def test_a_word_for_unaged_rubber_stands_in_the_line_of_the_days():
+    (days,) = settings_in([["Aged: 4 days"], ["Aged: new"], ["Aged: 0.5 days"]], ".")
+    assert (days.ours, days.unit.name, days.values) == ("aging_days", "d", ("4", "new", "0.5"))
+
+
 def test_a_compression_of_20_is_taken_as_a_height_of_80_and_said(tmp_path):
     exports.nested(tmp_path)
     made = draft(tmp_path)
