@@ -22,6 +22,8 @@ function save(content, type, name) {
 // ---------------------------------------------------------------- dialog
 
 const dialog = document.body.appendChild(document.createElement("dialog"));
+// An enlarged figure has the ids of the one in the page, which must be unique.
+dialog.addEventListener("close", () => dialog.replaceChildren());
 
 // The wheel zooms a drawing about the pointer; its scroll bars move it.
 function open(title, note, svg) {
