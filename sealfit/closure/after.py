@@ -249,8 +249,8 @@ class _Law:
         law = self._values(days)[0]
         gap = (law - measured)[np.isfinite(measured)]
         share = (law / measured - 1)[np.isfinite(measured)]
-        friction = self.after.friction
-        specimen = self.after.scatter.level_variance("specimen", friction).mean() / np.mean(friction**2)
+        variance = self.after.scatter.level_variance("specimen", self.after.loads)
+        specimen = variance.mean() / np.mean(self.after.friction**2)
         for name, value, unit in (
             ("specimen_sd_pct", 100 * np.sqrt(specimen), "%"),
             ("error_df", self.df, ""),

@@ -124,7 +124,7 @@ def _gain(
     if not scored.any():
         return Gain(0.0, 0.0, 0.0, 0.0)
     test, weight = rows.subset(scored), rows.weight[scored]
-    whitening = Whitening(after.scatter, before.friction[scored], test.groups)
+    whitening = Whitening(after.scatter, before.loads[scored], test.groups)
     about = [about_means(own, test, around) for own in left[:, scored]]
     rmse = [float(np.sqrt(np.average(own**2, weights=weight))) for own in about]
     white = [test.groups.sums(whitening(own[:, None])[:, 0] ** 2, proposal.unit) for own in about]
@@ -135,9 +135,9 @@ def _gain(
 
 def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows) -> np.ndarray:
     """Return measured minus model in the rows held out, the model fitted to the others, shape (held out,)."""
-    train, friction = before.rows.subset(~out), before.friction[~out]
-    model = with_reml_smoothness(model, train, before.scatter, friction)
-    kept = fit(model, train, before.scatter, turns=0, friction=friction)
+    train, loads = before.rows.subset(~out), before.loads[~out]
+    model = with_reml_smoothness(model, train, before.scatter, loads)
+    kept = fit(model, train, before.scatter, turns=0, loads=loads)
     return test.force - evaluate(kept.model, test, jacobian=False)[0]
 
 

@@ -19,6 +19,7 @@ from sealfit.closure.small_sample_test import satterthwaite_df
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
+from sealfit.fit.joint.whitening import KINDS, LEVELS_OF_FORCE
 from sealfit.tables import LEVELS as TABLE_OF_LEVELS
 
 # Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3.
@@ -134,7 +135,8 @@ def _p_of_run_means(fitted: Fitted) -> float | None:
     clean = without_repeat_pattern(rows, fitted.residual)
     keys = rows.table[["run_id"]].assign(file=rows.codes("file"), residual=clean, force=fitted.force)
     files = keys.groupby(["run_id", "file"], sort=False).mean().reset_index()
-    spread = np.sqrt(fitted.scatter.level_variance("file", files["force"].to_numpy()) + 1e-300)
+    of_rows = pd.Series(fitted.scatter.level_variance("file", fitted.loads))
+    spread = np.sqrt(of_rows.groupby(rows.codes("file")).mean()[files["file"]].to_numpy() + 1e-300)
     noise = fitted.scatter.noise_sd(files["force"].to_numpy())
     per_file = len(rows.table) / len(files)
     scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.design_effect / per_file))
@@ -149,9 +151,7 @@ def _p_of_run_means(fitted: Fitted) -> float | None:
     first = ~files["run_id"].duplicated().to_numpy()
     root = np.sqrt(count[first])
     size = mean[first] * root
-    left, rank = _residual_of_model(
-        fitted, files["force"].to_numpy(), size, np.flatnonzero(first), root / scale[first]
-    )
+    left, rank = _residual_of_model(fitted, size, np.flatnonzero(first), root / scale[first])
     df_fit = float(runs - rank)
     if df_pure < 1 or df_fit < 1:
         return None
@@ -159,12 +159,12 @@ def _p_of_run_means(fitted: Fitted) -> float | None:
 
 
 def _residual_of_model(
-    fitted: Fitted, force: np.ndarray, size: np.ndarray, chosen: np.ndarray, factor: np.ndarray
+    fitted: Fitted, size: np.ndarray, chosen: np.ndarray, factor: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """Return the residual of one number per run left by model and specimens, and their rank.
 
     The numbers are `size`, shape (runs,), `chosen` is a file of each run, and `factor` that on its tangent,
-    which is the mean over the file's rows. `force` is the model's mean force at each file, shape (files,).
+    which is the mean over the file's rows.
     """
     rows = fitted.rows
     number = rows.table.groupby(["run_id", rows.codes("file")], sort=False).ngroup().to_numpy()
@@ -173,10 +173,12 @@ def _residual_of_model(
     means = np.add.reduceat(fitted.jacobian.values[order], start, axis=0) / np.bincount(number)[:, None]
     place = order[start][chosen]  # a row of each run
     tangent = Tangent(fitted.jacobian.layout.of(place), means[chosen] * factor[:, None])
-    if not any(c.level == "specimen" and c.variance > 0 for c in fitted.scatter.components):
+    kinds = [c.kind for c in fitted.scatter.components if c.level == "specimen" and c.variance > 0]
+    if not kinds:
         basis = tangent.orthonormal(RANK)
         return basis.project_out(size), basis.shape[1]
-    own = OwnColumns(rows.codes("specimen")[place], force[chosen] * factor)
+    loads = fitted.loads[place][:, [KINDS.index(kind) for kind in kinds]]
+    own = OwnColumns(rows.codes("specimen")[place], loads * factor[:, None])
     basis = tangent.orthonormal(RANK, project_out=own.project_out)
     return basis.project_out(own.project_out(size)), basis.shape[1] + own.count
 
@@ -216,7 +218,7 @@ def _scatter_by_level(fitted: Fitted) -> Iterator[tuple[str, float, float]]:
     for level in LEVELS:
         df = next((c.df for c in fitted.scatter.components if c.level == level), None)
         if df is not None:
-            yield level, float(fitted.rows.weight @ fitted.scatter.level_variance(level, fitted.force)), df
+            yield level, float(fitted.rows.weight @ fitted.scatter.level_variance(level, fitted.loads)), df
 
 
 def scatter_list(fitted: Fitted) -> list[dict]:
@@ -255,7 +257,7 @@ def degrees_of_freedom(fitted: Fitted) -> float:
     starts = fitted.rows.groups.starts
     if starts["run"].size - _taken(fitted, "run") < LEAST_SPARE_RUNS:
         return 0.0
-    active = [c.level for c in fitted.scatter.components if c.variance > 0]
+    active = [c.level for c in fitted.scatter.components if c.variance > 0 and c.kind in LEVELS_OF_FORCE]
     level = active[-1] if active and active[-1] != "stroke" else "file"
     if level == "specimen":
         parameters = fitted.model.declared.parameters
@@ -287,7 +289,7 @@ def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
 def sandwiches(fitted: Fitted) -> list[Sandwich]:
     """Return the sandwich covariances of specimens, runs and files, down to the first level with many groups.
 
-    Specimens and runs may differ in parameters that have no variance component, such as v_s.
+    Units may differ in parameters that have no variance component, such as v_s of runs.
     """
     found, rows, white = [], fitted.rows, fitted.white_jacobian
     for level in reversed(LEVELS[1:]):

@@ -303,7 +303,7 @@ def _further_forms(best: Proposal, tried: Sequence[Proposal], found: Sequence[Pr
 def _joint(fitted: Fitted, proposal: Proposal) -> Proposal:
     """Return a proposal fitted jointly with the model, under the current scatter."""
     models = [fitted.model.with_term(proposal.term, values) for values in _starts(fitted.model, proposal)]
-    models = [solve_linear(model, fitted.rows, fitted.scatter, fitted.friction) for model in models]
+    models = [solve_linear(model, fitted.rows, fitted.scatter, fitted.loads) for model in models]
     return replace(proposal, fitted=min(map(fitted.refitted, models), key=lambda f: f.deviance))
 
 
@@ -331,17 +331,17 @@ def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter)
     One is their own fit. The other has v_s and b searched anew, as they may have been biased. That search is
     made with the likeliest effect on each quantity; further effects on it start from its result.
     """
-    rows, friction = fitted.rows, fitted.friction
+    rows, loads = fitted.rows, fitted.loads
     begun: dict[tuple[str, str], np.ndarray] = {}
     for proposal in joint:
         model = fitted.model.with_term(proposal.term, proposal.values)
         target = proposal.term.target
         if target in begun:
-            model = solve_linear(replace(model, theta=begun[target]), rows, scatter, friction)
+            model = solve_linear(replace(model, theta=begun[target]), rows, scatter, loads)
         else:
             model = search_nonlinear(model, rows, scatter)
         starts = [model, proposal.fitted.model]
-        fits = [fit(start, rows, scatter, turns=0, friction=friction) for start in starts]
+        fits = [fit(start, rows, scatter, turns=0, loads=loads) for start in starts]
         anew = min(fits, key=lambda f: f.deviance)
         begun.setdefault(target, anew.model.theta)
         yield replace(proposal, fitted=anew)
@@ -349,7 +349,7 @@ def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter)
 
 def deviance_under(fitted: Fitted, scatter: Scatter) -> float:
     """Return the deviance that a fit would have under another scatter, refitted in its tangent space."""
-    whitening = Whitening(scatter, fitted.friction, fitted.rows.groups)
+    whitening = Whitening(scatter, fitted.loads, fitted.rows.groups)
     residual = whitening(fitted.residual[:, None])[:, 0]
     normal, gradient = whitening.normal(fitted.jacobian, residual)
     step, *_ = np.linalg.lstsq(normal, gradient, rcond=1e-10)

@@ -22,9 +22,9 @@ from sealfit.config import Config
 from sealfit.effects.contract import Effect
 from sealfit.errors import RequestError
 from sealfit.fit.joint.declared import SPEEDS_BETWEEN
-from sealfit.fit.joint.model import Model, evaluate
+from sealfit.fit.joint.model import Model, evaluate, loads_of
 from sealfit.fit.joint.rows import LEVELS, POWER, point_rows, sliding_power
-from sealfit.fit.joint.whitening import Component, Scatter
+from sealfit.fit.joint.whitening import GAIN, Component, Scatter
 from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.columns import add_keys, condition_columns
 from sealfit.ingest.derived_columns import with_day_0
@@ -80,7 +80,9 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
             others.append(Sandwich(np.array(own["covariance"]), information))
         half = mean_half_width(tangent, np.array(model["covariance"]), model["df"], others)
         half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, mean))
-        spread = reach * np.sqrt((half / reach) ** 2 + _one_measurement(model["scatter"], mean))
+        spread = reach * np.sqrt(
+            (half / reach) ** 2 + _one_measurement(model["scatter"], loads_of(after, at))
+        )
         forces = (evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half)
         answer[good] = np.column_stack([*forces, mean - spread, mean + spread])
     return points.reset_index(drop=True).assign(
@@ -261,10 +263,10 @@ def _of_unknown_phase(after: Model, force: np.ndarray) -> np.ndarray:
     return total
 
 
-def _one_measurement(scatter: dict, force: np.ndarray) -> np.ndarray:
+def _one_measurement(scatter: dict, loads: np.ndarray) -> np.ndarray:
     """Return the variance of one new bin on a new specimen, set-up and repeat, shape (n,)."""
     known = Scatter(scatter["s0"], scatter["g"], tuple(Component(**c) for c in scatter["components"]))
-    total = known.noise_sd(force) ** 2
+    total = known.noise_sd(loads[:, GAIN]) ** 2
     for level in LEVELS:
-        total = total + known.level_variance(level, force)
+        total = total + known.level_variance(level, loads)
     return total

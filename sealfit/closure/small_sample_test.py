@@ -337,7 +337,7 @@ class ClusterTests:
         fitted, starts = self.fitted, self.fitted.rows.groups.starts
         units = starts[self.level].size  # without repeats runs and files share their scatter
         finer = tuple(c for c in fitted.scatter.components if starts[c.level].size > units)
-        return Whitening(replace(fitted.scatter, components=finer), fitted.friction, fitted.rows.groups)
+        return Whitening(replace(fitted.scatter, components=finer), fitted.loads, fitted.rows.groups)
 
     def numbers(self, target: tuple[str, str]) -> Numbers:
         """Return the units' numbers along the direction of a quantity: (acts_on, operation)."""

@@ -164,7 +164,7 @@ def reselect_on_all(
             compared = [item.proposal, *others_of(item)]
             if len(compared) == 1:
                 continue
-            base = fitted_at(whole.model.without_term(number), every, whole.scatter, whole.friction)
+            base = fitted_at(whole.model.without_term(number), every, whole.scatter, whole.loads)
             found = named_among(base, [_on_full_campaign(p, every) for p in compared])
             chosen = next(p for p in compared if p.term is found[0].term)
             if chosen is not item.proposal:

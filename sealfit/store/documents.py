@@ -194,7 +194,7 @@ GROUPED = record(  # a covariance from whole groups: for each, the numbers of it
 )
 COMPONENT = record(
     level=Literal["stroke", "file", "run", "specimen"],
-    kind=Literal["offset", "gain"],
+    kind=Literal["offset", "gain", "v_s", "sigma_2"],
     variance=Annotated[Number, Field(ge=0)],
 )
 COMPONENT.__pydantic_config__ = ConfigDict(extra="forbid")

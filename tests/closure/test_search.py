@@ -3,6 +3,7 @@ import pytest
 from bins_helpers import LOAD_N, TRUE, make_bins
 
 from sealfit.closure.channels import (
+    channels_of,
     find_channels,
     flip_level,
     follows_strokes,
@@ -16,9 +17,11 @@ from sealfit.closure.forms import terms_of
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import ScoreTests, log_p_of
 from sealfit.closure.search import search
+from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import ALONG, make_rows
+from sealfit.tables import CALENDAR
 
 CHANNELS = {
     "lab_temperature_C": lambda rng: 22 + rng.normal(),
@@ -386,3 +389,23 @@ def test_a_constant_force_without_noise_gives_no_alarm():
     fitted = fit_declared(make_rows(bins.assign(force_N=40.0), has_aging=True))
     found = search(ScoreTests(fitted), find_channels(fitted.rows), np.random.default_rng(0))
     assert min(c.p_value for c in found) == 1.0
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_specimens_that_differ_in_dry_friction_alone_are_no_change_with_the_calendar(seed):
+    """Their viscous force is the same, so that no factor on the whole force makes them equal."""
+    rng, gains = np.random.default_rng(seed + 1000), {}
+
+    def dry(table, force):
+        gain = gains.setdefault(table["specimen_id"].iloc[0], rng.normal(1.0, 0.03))
+        viscous = TRUE["sigma_2"] * table["speed_mm_s"].to_numpy()
+        return (force - viscous) * gain + 6 * viscous
+
+    settings = {"days": (1.0, 2.0, 4.0, 8.0, 16.0), "repeats": 2, "bins": 6}
+    bins = make_bins(seed, noise_N=0.05, gain=0.004, effect=dry, **settings)
+    rows = make_rows(bins, has_aging=True)
+    fitted = fit_declared(rows)
+    assert any(c.kind == "sigma_2" and c.variance > 0 for c in fitted.scatter.components)
+    channels = [c for c in searched(channels_of(rows, Config()), rows) if c.name in CALENDAR]
+    found = search(ScoreTests(fitted), channels, np.random.default_rng(0))
+    assert min(c.p_value for c in found) > 0.05

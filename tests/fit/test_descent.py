@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 import sealfit.fit.joint.search as joint_search
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fitted_at, search
-from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.model import Term, loads_of
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.search import (
     ROWS_FOR_START,
@@ -74,11 +74,12 @@ def test_a_search_never_ends_worse_than_it_began(gain, noise):
     model, rows, _ = astray(one_specimen=False, aging=False)
     rows = rows.sparse(ROWS_FOR_START)
     scatter = Scatter(noise, 0.0, (Component("file", "gain", gain),))
-    begun = solve_linear(model, rows, scatter, rows.force)
+    loads = loads_of(model, rows, rows.force)
+    begun = solve_linear(model, rows, scatter, loads)
     found = search_nonlinear(model, rows, scatter)
     low, high = bounds_of(found, rows)
     assert np.all((found.vector() >= low) & (found.vector() <= high))
-    before, after = (fitted_at(m, rows, scatter, rows.force).deviance for m in (begun, found))
+    before, after = (fitted_at(m, rows, scatter, loads).deviance for m in (begun, found))
     assert after <= before
 
 

@@ -13,6 +13,12 @@ from sealfit.fit.joint.variance_components import (
     orthonormal,
     reml,
 )
+from sealfit.fit.joint.whitening import KINDS
+
+
+def loads_of(force):
+    """Return the loads of an offset and a gain."""
+    return np.column_stack([np.ones_like(force), force])
 
 
 def nested(files_per_run, runs_per_specimen, specimens):
@@ -30,15 +36,17 @@ def test_the_likelihood_is_that_of_the_dense_covariance_and_its_gradient_is_exac
     force, tangent = rng.normal(40, 10, 72) * rng.choice([-1, 1], 72), orthonormal(rng.normal(size=(72, 8)))
     residual, variance = rng.normal(size=72), rng.uniform(0.1, 0.3, 72)
     kinds = [(level, kind) for level in codes for kind in ("offset", "gain")]
-    sizes = rng.uniform(0.5, 2.0, 8) * np.tile([0.1, 1e-4], 4)
+    kinds += [("specimen", "v_s"), ("specimen", "sigma_2")]
+    sizes = rng.uniform(0.5, 2.0, 10) * np.r_[np.tile([0.1, 1e-4], 4), 0.1, 0.1]
+    loads = np.column_stack([loads_of(force), rng.normal(size=(72, 2))])
     likelihood = RestrictedLikelihood(
-        GroupMeans(residual, variance, force, Groups.of(codes)), Tangent.dense(tangent), kinds
+        GroupMeans(residual, variance, loads, Groups.of(codes)), Tangent.dense(tangent), kinds
     )
 
     def dense(at):
         covariance = np.diag(variance)
         for (level, kind), size in zip(kinds, at, strict=True):
-            load = force if kind == "gain" else np.ones(72)
+            load = loads[:, KINDS.index(kind)]
             covariance = covariance + size * np.outer(load, load) * (codes[level][:, None] == codes[level])
         inverse = np.linalg.inv(covariance)
         gram = tangent.T @ inverse @ tangent
@@ -63,7 +71,7 @@ def test_the_likelihood_does_not_depend_on_the_unit_of_force(unit):
     )
     found = []
     for scale in (1.0, unit):
-        means = GroupMeans(scale * residual, np.full(24, (0.4 * scale) ** 2), scale * force, groups)
+        means = GroupMeans(scale * residual, np.full(24, (0.4 * scale) ** 2), loads_of(scale * force), groups)
         sizes = np.array([1e-4, 0.1 * scale**2])
         value, gradient = RestrictedLikelihood(means, tangent, kinds)(sizes)
         found.append([value - (24 - 5) * np.log(scale), *(gradient * sizes)])
@@ -84,8 +92,8 @@ def test_reml_recovers_scatter_of_files_runs_and_specimens():
         )
         tangent = np.column_stack([np.ones(force.size), force])
         kinds = [("file", "gain"), ("run", "offset"), ("specimen", "gain")]
-        parts = reml(
-            GroupMeans(residual, np.full(force.size, 0.05**2), force, Groups.of(codes)),
+        _, parts = reml(
+            GroupMeans(residual, np.full(force.size, 0.05**2), loads_of(force), Groups.of(codes)),
             Tangent.dense(tangent),
             kinds,
         )
@@ -102,8 +110,8 @@ def test_reml_counts_the_degrees_of_freedom_that_the_model_took():
         tangent = rng.normal(0, 1, (40, 20))
         error = rng.normal(0, 1.0, 40)
         residual = error - tangent @ np.linalg.lstsq(tangent, error, rcond=None)[0]
-        (part,) = reml(
-            GroupMeans(residual, np.full(40, 1e-6), np.ones(40), Groups.of(codes)),
+        _, (part,) = reml(
+            GroupMeans(residual, np.full(40, 1e-6), loads_of(np.ones(40)), Groups.of(codes)),
             Tangent.dense(tangent),
             [("file", "offset")],
         )
@@ -126,8 +134,10 @@ def test_rounding_moves_no_variance_and_scatter_that_is_not_there_is_nothing():
                 [
                     p.variance
                     for p in reml(
-                        GroupMeans(r, np.full(600, 0.05**2), force, Groups.of(codes)), tangent, kinds
-                    )
+                        GroupMeans(r, np.full(600, 0.05**2), loads_of(force), Groups.of(codes)),
+                        tangent,
+                        kinds,
+                    )[1]
                 ]
             )
             for r in (residual, near)
@@ -147,8 +157,10 @@ def test_next_to_no_noise_beside_the_scatter_of_files_with_one_stroke_is_no_erro
     kinds = [("file", "offset"), ("file", "gain"), ("specimen", "gain")]
     for _ in range(20):
         residual = force * rng.normal(0, 0.05, 96)
-        parts = reml(
-            GroupMeans(residual, np.full(96, 2e-8), force, Groups.of(codes)), Tangent.dense(tangent), kinds
+        _, parts = reml(
+            GroupMeans(residual, np.full(96, 2e-8), loads_of(force), Groups.of(codes)),
+            Tangent.dense(tangent),
+            kinds,
         )
         assert all(np.isfinite(part.variance) for part in parts)
 
@@ -161,7 +173,7 @@ def test_a_ripple_explains_no_difference_between_files():
     turn = 2 * np.pi * (bins["displacement_mm"].to_numpy() + start) / 2.3
     waves = fitted.jacobian.append(np.sin(turn)).append(np.cos(turn)).append(turn * np.cos(turn))
     with_waves, without = (
-        estimate_components(fitted.rows, fitted.residual, fitted.friction, tangent, fitted.scatter)
+        estimate_components(fitted.rows, fitted.residual, fitted.loads, tangent, fitted.scatter)
         for tangent in (waves, fitted.jacobian)
     )
     npt.assert_allclose(*([c.variance for c in s.components] for s in (with_waves, without)))

@@ -86,12 +86,13 @@ def test_whitening_and_restricted_likelihood_by_blocks_are_those_of_the_whole():
     rng = np.random.default_rng(3)
     tangent, dense = blocked(rng)
     force = rng.normal(30.0, 5.0, len(dense))
+    loads = np.column_stack([np.ones_like(force), force])
     parts = (
         Component("stroke", "offset", 0.1),
         Component("run", "gain", 0.01),
         Component("specimen", "gain", 0.02),
     )
-    whitening = Whitening(Scatter(0.3, 0.01, parts, 1.5, 2.0), force, groups())
+    whitening = Whitening(Scatter(0.3, 0.01, parts, 1.5, 2.0), loads, groups())
     residual = whitening(rng.normal(size=(len(dense), 1)))[:, 0]
     for found, expected in zip(
         whitening.normal(tangent, residual), whitening.normal(Tangent.dense(dense), residual), strict=True
@@ -106,7 +107,7 @@ def test_whitening_and_restricted_likelihood_by_blocks_are_those_of_the_whole():
         ("run", "gain"),
         ("specimen", "gain"),
     ]
-    given = (rng.normal(size=number), rng.uniform(0.1, 0.3, number), groups().means(force, "stroke"))
+    given = (rng.normal(size=number), rng.uniform(0.1, 0.3, number), groups().means(loads, "stroke"))
     at = np.array([0.1, 1e-4, 0.2, 1e-4, 2e-4])
     answers = []
     for basis in (means.orthonormal(1e-9), Tangent.dense(orthonormal(means.toarray()))):

@@ -51,7 +51,7 @@ def test_whitening_is_a_root_of_the_inverse_covariance(seed, offset, gain, run, 
         Component("run", "offset", run),
     )
     scatter = Scatter(0.4, 0.1, parts, alike, shape)
-    whitening = Whitening(scatter, force, Groups.of(CODES))
+    whitening = Whitening(scatter, np.column_stack([np.ones_like(force), force]), Groups.of(CODES))
     root, dense = whitening(np.eye(30)), covariance(scatter, force)
     normal, gradient = whitening.normal(Tangent.dense(np.eye(30)), root[:, 0])
     npt.assert_allclose(normal, root.T @ root, atol=1e-8)
@@ -63,7 +63,7 @@ def test_whitening_is_a_root_of_the_inverse_covariance(seed, offset, gain, run, 
 def test_a_force_that_does_not_vary_in_its_stroke_has_only_a_mean():
     force = np.repeat(np.arange(3.0, 13.0), 3)
     scatter = Scatter(0.4, 0.1, (Component("file", "gain", 0.02),), 1.0, 4.0)
-    whitening = Whitening(scatter, force, Groups.of(CODES))
+    whitening = Whitening(scatter, np.column_stack([np.ones_like(force), force]), Groups.of(CODES))
     root, dense = whitening(np.eye(30)), covariance(scatter, force)
     npt.assert_allclose(root.T @ root @ dense, np.eye(30), atol=1e-8)
     npt.assert_allclose(whitening.logdet, np.linalg.slogdet(dense)[1], rtol=1e-9)

@@ -12,12 +12,12 @@ from functools import cached_property
 import numpy as np
 
 from sealfit.fit.joint import prior
-from sealfit.fit.joint.model import Model, evaluate, friction_of, term_slope
+from sealfit.fit.joint.model import Model, evaluate, loads_of, term_slope
 from sealfit.fit.joint.rows import Cache, Rows, cached
 from sealfit.fit.joint.search import descend, search_nonlinear, start_model
 from sealfit.fit.joint.tangent import Tangent
-from sealfit.fit.joint.variance_components import estimate_components, estimate_scatter
-from sealfit.fit.joint.whitening import Scatter, Whitening
+from sealfit.fit.joint.variance_components import estimate_components, estimate_scatter, with_curves
+from sealfit.fit.joint.whitening import GAIN, Scatter, Whitening
 
 # Fall of the whitened sum of squares at which a descent ends when fits are only compared. Rivals differ by
 # several units.
@@ -42,7 +42,7 @@ class Fitted:
     scatter: Scatter
     rows: Rows
     force: np.ndarray  # (n,)
-    friction: np.ndarray  # (n,) force without added forces; noise and gains are proportional to it
+    loads: np.ndarray  # (n, kinds) change of the force per unit of each kind of random effect
     jacobian: Tangent  # (n, p)
     white_residual: np.ndarray  # (n,)
     white_jacobian: Tangent  # (n, p)
@@ -54,6 +54,11 @@ class Fitted:
     def residual(self) -> np.ndarray:
         """Measured minus model, shape (n,)."""
         return self.rows.force - self.force
+
+    @property
+    def friction(self) -> np.ndarray:
+        """Force without added forces, shape (n,): noise and gains are proportional to it."""
+        return self.loads[:, GAIN]
 
     @property
     def rmse_N(self) -> float:
@@ -83,7 +88,7 @@ class Fitted:
 
     def refitted(self, model: Model) -> Fitted:
         """Return another model fitted to the same rows, to be compared: scatter and friction are the same."""
-        return fit(model, self.rows, self.scatter, turns=0, friction=self.friction)
+        return fit(model, self.rows, self.scatter, turns=0, loads=self.loads)
 
     @cached
     def slope(self, acts_on: str, operation: str) -> np.ndarray:
@@ -135,14 +140,14 @@ def fit(
     scatter: Scatter | None = None,
     *,
     turns: int = TURNS,
-    friction: np.ndarray | None = None,
+    loads: np.ndarray | None = None,
 ) -> Fitted:
     """Return the model fitted to `rows`, physics and effects together.
 
     `model` is the start, with v_s and b from a global search, and `scatter` a starting value. `turns` is how
     often the scatter is re-estimated and the model refitted; specimens get no component of their own if the
-    error is much smaller without one. If it is 0, the scatter is fixed, and so is the friction, shape (n,),
-    to which gains and noise are proportional; fits to be compared must share it.
+    error is much smaller without one. If it is 0, the scatter is fixed, and so are the loads of its
+    components, shape (n, kinds); fits to be compared must share them.
     """
     centre = prior.centre_of(model)
     if scatter is None:
@@ -151,9 +156,12 @@ def fit(
     if turns and model.terms:
         model = _searched(model, rows, scatter)
     if not turns:
-        model = descend(model, rows, scatter, centre, friction, tolerance=COMPARED)
-        return fitted_at(model, rows, scatter, friction)
+        model = descend(model, rows, scatter, centre, loads, tolerance=COMPARED)
+        return fitted_at(model, rows, scatter, loads)
     found = _alternately(model, rows, None, turns)
+    if scatter := with_curves(rows, found.residual, found.loads, found.jacobian, found.scatter):
+        other = _alternately(found.model, rows, scatter, 1)
+        found = min(found, other, key=lambda f: f.deviance)
     if _misses_levels(found):
         within = tuple(part for part in found.scatter.components if part.level != "specimen")
         other = _alternately(model, rows, replace(found.scatter, components=within), turns)
@@ -165,7 +173,7 @@ def _alternately(model: Model, rows: Rows, scatter: Scatter | None, turns: int) 
     """Return the model fitted in turns with the scatter, which has the components that it starts with."""
     for _ in range(turns):
         force, jacobian = evaluate(model, rows)
-        scatter = estimate_scatter(rows, rows.force - force, friction_of(model, rows), jacobian, scatter)
+        scatter = estimate_scatter(rows, rows.force - force, loads_of(model, rows), jacobian, scatter)
         model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, prior.centre_of(model))
     return fitted_at(model, rows, scatter)
 
@@ -173,8 +181,8 @@ def _alternately(model: Model, rows: Rows, scatter: Scatter | None, turns: int) 
 def _misses_levels(fitted: Fitted) -> bool:
     """Whether least squares without the scatter of specimens would leave a much smaller error.
 
-    Where specimens differ in v_s or sigma_2, which no component describes, or an effect changes their curves,
-    these count for more than their levels, and all of the error of the levels is taken for scatter.
+    Where an effect changes the curves of specimens, these may count for more than their levels, and all of
+    the error of the levels is taken for scatter.
     """
     if not any(part.level == "specimen" and part.variance > 0 for part in fitted.scatter.components):
         return False
@@ -194,14 +202,14 @@ def _searched(model: Model, rows: Rows, scatter: Scatter) -> Model:
     return model if kept.deviance + WRONG_SEARCH * rows.force.size < own.deviance else found
 
 
-def fitted_at(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None) -> Fitted:
+def fitted_at(model: Model, rows: Rows, scatter: Scatter, loads: np.ndarray | None = None) -> Fitted:
     """Return the `Fitted` of a model without refitting."""
     force, jacobian = evaluate(model, rows)
-    friction = friction_of(model, rows) if friction is None else friction
-    whitening = Whitening(scatter, friction, rows.groups)
+    loads = loads_of(model, rows) if loads is None else loads
+    whitening = Whitening(scatter, loads, rows.groups)
     residual, white = whitening((rows.force - force)[:, None])[:, 0], whitening.of(jacobian)
     deviance = float(residual @ residual) + whitening.logdet
-    return Fitted(model, scatter, rows, force, friction, jacobian, residual, white, deviance, whitening)
+    return Fitted(model, scatter, rows, force, loads, jacobian, residual, white, deviance, whitening)
 
 
 def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
@@ -212,10 +220,10 @@ def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
     share the friction, which is kept, and the row noise of the best fit.
     """
     rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
-    scatter = estimate(rows, fitted.residual, fitted.friction, fitted.jacobian, fitted.scatter)
-    model = with_reml_smoothness(fitted.model, rows, scatter, fitted.friction)
-    model = descend(model, rows, scatter, prior.centre_of(model), fitted.friction, tolerance=COMPARED)
-    return fitted_at(model, rows, scatter, fitted.friction)
+    scatter = estimate(rows, fitted.residual, fitted.loads, fitted.jacobian, fitted.scatter)
+    model = with_reml_smoothness(fitted.model, rows, scatter, fitted.loads)
+    model = descend(model, rows, scatter, prior.centre_of(model), fitted.loads, tolerance=COMPARED)
+    return fitted_at(model, rows, scatter, fitted.loads)
 
 
 def effective_df(fitted: Fitted, number: int) -> float:
@@ -227,10 +235,10 @@ def effective_df(fitted: Fitted, number: int) -> float:
 
 
 def with_reml_smoothness(
-    model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray | None = None
+    model: Model, rows: Rows, scatter: Scatter, loads: np.ndarray | None = None
 ) -> Model:
     """Return the model with the smoothness of its free shapes estimated by REML under this scatter."""
     if all(term.smoothness is None for term in model.terms):
         return model
-    at = fitted_at(model, rows, scatter, friction)
+    at = fitted_at(model, rows, scatter, loads)
     return prior.smoothed(model, at.white_jacobian.gram(), at.white_jacobian.against(at.white_residual))

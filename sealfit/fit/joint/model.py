@@ -294,9 +294,17 @@ def _blocks(declared: Declared, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     return index, block[specimen]
 
 
-def friction_of(model: Model, rows: Rows) -> np.ndarray:
-    """Return the force without added forces, shape (n,): the part that rubber, load and gains scale."""
-    return _State.of(model, rows).friction
+def loads_of(model: Model, rows: Rows, friction: np.ndarray | None = None) -> np.ndarray:
+    """Return the change of the force per unit of each kind of random effect, shape (n, kinds).
+
+    That of a gain is friction, the force without added forces; where the model may be far off, another
+    `friction` can be given, shape (n,). That of v_s is per unit of its logarithm.
+    """
+    state = _State.of(model, rows)
+    slopes, friction = state.slopes(), state.friction if friction is None else friction
+    has = {name: (model.declared.index[name] >= 0)[rows.condition] for name in ("v_s", "sigma_2")}
+    v_s, sigma_2 = slopes["v_s"] * state.now["v_s"] * has["v_s"], slopes["sigma_2"] * has["sigma_2"]
+    return np.column_stack([np.ones_like(friction), friction, v_s, sigma_2])
 
 
 def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from sealfit.fit.joint.declared import SAME_SPEED, JointParameter, declare
-from sealfit.fit.joint.model import Model, evaluate, friction_of
+from sealfit.fit.joint.model import Model, evaluate, loads_of
 from sealfit.fit.joint.prior import centre_of, precision_of
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter, Whitening
@@ -179,25 +179,25 @@ def descend(
     rows: Rows,
     scatter: Scatter,
     centre: np.ndarray,
-    friction: np.ndarray | None = None,
+    loads: np.ndarray | None = None,
     *,
     tolerance: float = CONVERGED,
 ) -> Model:
     """Return the model of least penalised whitened sum of squares at fixed scatter, by Levenberg-Marquardt.
 
     The start, `model`, is moved inside the bounds. `centre`, shape (model.size,), is the mean of the prior.
-    `friction`, shape (n,), to which noise and gains are proportional, is by default the model's at the start;
-    it is fixed, so that all steps minimise the same function. The descent ends when the sum of squares falls
-    by less than `tolerance`.
+    `loads` of the random effects, shape (n, kinds), are by default the model's at the start; they are fixed,
+    so that all steps minimise the same function. The descent ends when the sum of squares falls by less than
+    `tolerance`.
     """
     precision = precision_of(model)
     low, high = bounds_of(model, rows)
     vector = np.clip(model.vector(), low, high)
     model = model.at(vector)
     force, jacobian = evaluate(model, rows)
-    if friction is None:
-        friction = friction_of(model, rows)
-    whitening = Whitening(scatter, friction, rows.groups)
+    if loads is None:
+        loads = loads_of(model, rows)
+    whitening = Whitening(scatter, loads, rows.groups)
 
     def cost_of(residual: np.ndarray, at: np.ndarray) -> float:
         return float(residual @ residual + (at - centre) @ precision @ (at - centre))
@@ -264,8 +264,10 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
     low, high = bounds_of(model, rows)
     precision = np.diag(precision_of(model))[group]  # of the prior, which is centred at the present values
     acted_on, *others = _split_by_action(model, rows, group)
-    whitening = Whitening(scatter, acted_on.force, acted_on.groups)
-    constant = [_equations(model, own, Whitening(scatter, own.force, own.groups)) for own in others]
+    whitening, *of_others = (
+        Whitening(scatter, loads_of(model, own, own.force), own.groups) for own in (acted_on, *others)
+    )
+    constant = [_equations(model, own, white) for own, white in zip(others, of_others, strict=True)]
 
     def optimum(trial: Model) -> tuple[float, Model]:
         parts = zip(_equations(trial, acted_on, whitening), *constant, strict=True)
@@ -295,14 +297,14 @@ def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, 
     return rows.cache.once(("split", acts.tobytes()), lambda: (rows.subset(acts), rows.subset(~acts)))
 
 
-def solve_linear(model: Model, rows: Rows, scatter: Scatter, friction: np.ndarray) -> Model:
+def solve_linear(model: Model, rows: Rows, scatter: Scatter, loads: np.ndarray) -> Model:
     """Return the model with its linear parameters at their optimum, all nonlinear parameters fixed.
 
     A new term explains part of what other terms explained before. This solve redistributes it before the
     descent, which would otherwise start far from the optimum and may diverge.
     """
     bounds = bounds_of(model, rows)
-    equations = _equations(model, rows, Whitening(scatter, friction, rows.groups))
+    equations = _equations(model, rows, Whitening(scatter, loads, rows.groups))
     solved = _linear_optimum(model, equations, bounds)[1]
     return model.at(np.clip(solved.vector(), *bounds))
 

@@ -18,6 +18,8 @@ from scipy.sparse import csr_array
 
 from sealfit.fit.joint.rows import Groups
 
+# Share of a column's sum of squares below which others contain it.
+COLLINEAR = 1e-9
 # With a block of more than this share of all columns the tangent is stored dense.
 LARGEST_BLOCK = 0.5
 
@@ -214,21 +216,27 @@ class Tangent:
 
 
 class OwnColumns:
-    """One column per specimen, zero outside its rows; they are orthogonal, so no matrix is inverted.
+    """A few columns per specimen, zero outside its rows: those of different specimens are orthogonal.
 
-    `code`, shape (n,), is the specimen of each row, and `load`, shape (n,), the value of its column there.
-    Columns of zeros do not count.
+    `code`, shape (n,), is the specimen of each row, and `loads`, shape (n,) or (n, k), the values of its
+    columns there. Columns of zeros, and those that others of the specimen contain, do not count.
     """
 
-    def __init__(self, code: np.ndarray, load: np.ndarray) -> None:
-        square = np.bincount(code, load**2)
-        self.count = int((square > 0).sum())
-        self.unit = load / np.sqrt(np.where(square > 0, square, 1.0))[code]
-        self.code, self.summing = code, csr_array((self.unit, (code, np.arange(code.size))))
+    def __init__(self, code: np.ndarray, loads: np.ndarray) -> None:
+        self.code, self.count, self.units = code, 0, []
+        for load in np.atleast_2d(loads.T):
+            left = self.project_out(load)
+            square = np.bincount(code, left**2)
+            kept = square > COLLINEAR * np.bincount(code, load**2)
+            unit = np.where(kept, 1 / np.sqrt(np.where(kept, square, 1.0)), 0.0)[code] * left
+            self.units.append((unit, csr_array((unit, (code, np.arange(code.size))))))
+            self.count += int(kept.sum())
 
     def project_out(self, columns: np.ndarray) -> np.ndarray:
         """Return columns, shape (n,) or (n, m), minus their projection on the specimens' columns."""
-        return columns - (self.unit * (self.summing @ columns)[self.code].T).T
+        for unit, summing in self.units:
+            columns = columns - (unit * (summing @ columns)[self.code].T).T
+        return columns
 
 
 def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np.ndarray]:

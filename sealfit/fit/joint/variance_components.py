@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -9,10 +10,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
-from sealfit.fit.joint.declared import declare
+from sealfit.fit.joint.declared import declare, tested_speeds
 from sealfit.fit.joint.rows import LEVELS, Groups, Rows
 from sealfit.fit.joint.tangent import Tangent
-from sealfit.fit.joint.whitening import Component, Scatter
+from sealfit.fit.joint.whitening import GAIN, KINDS, LEVELS_OF_FORCE, Component, Scatter
 from sealfit.ingest.scatter import two_nonnegative
 
 # ---------------------------------------------------------------- reml
@@ -45,8 +46,6 @@ MOST_SHARE = 30.0
 # it is determined within strokes and explains no difference between them.
 LEAST_BETWEEN = 0.1
 
-KINDS = ("offset", "gain")
-
 
 @dataclass(frozen=True)
 class GroupMeans:
@@ -54,7 +53,7 @@ class GroupMeans:
 
     residual: np.ndarray  # (m,) in N
     variance: np.ndarray  # (m,) of each mean due to row noise, in N^2
-    force: np.ndarray  # (m,) of the model, signed, in N
+    loads: np.ndarray  # (m, kinds) change per unit of each kind of random effect
     groups: Groups  # nested groups of the m means
 
 
@@ -63,15 +62,15 @@ def reml(
     jacobian: Tangent,
     kinds: Sequence[tuple[str, str]],
     start: Sequence[float] | None = None,
-) -> tuple[Component, ...]:
-    """Return the variance components of group means by restricted maximum likelihood.
+) -> tuple[float, tuple[Component, ...]]:
+    """Return half the restricted deviance and the variance components of group means, by REML.
 
     `jacobian`, shape (m, p), is the mean tangent of the model; `kinds` are the level and kind of the
     components, finest level first, and `start` their starting variances.
     """
-    scale_force = max(float(np.sqrt(np.mean(means.force**2))), 1e-12)
     total = max(float(np.var(means.residual)), float(np.mean(means.variance)), 1e-20)
-    unit = np.array([total / (scale_force**2 if kind == "gain" else 1.0) for _, kind in kinds])
+    square = np.maximum(np.mean(means.loads**2, axis=0), 1e-24)
+    unit = np.array([total / square[KINDS.index(kind)] for _, kind in kinds])
     # A lower limit of the noise variance keeps the likelihood from being dominated by rounding.
     means = replace(means, variance=np.maximum(means.variance, LEAST * total))
     likelihood = RestrictedLikelihood(means, jacobian.orthonormal(1e-9), kinds)
@@ -80,7 +79,10 @@ def reml(
         value, gradient = likelihood(unit * sd**2)
         return value, 2.0 * gradient * unit * sd
 
-    most = [MOST_GAIN**2 / u if kind == "gain" else np.inf for u, (_, kind) in zip(unit, kinds, strict=True)]
+    most = [
+        MOST_GAIN**2 / u if kind in ("gain", "v_s") else np.inf
+        for u, (_, kind) in zip(unit, kinds, strict=True)
+    ]
     high = np.sqrt(np.clip(most, LEAST, MOST_SHARE))
     first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, LEAST_START)
     # The parameters are standard deviations: a zero component has its minimum at 0, in logarithms at -inf.
@@ -94,7 +96,8 @@ def reml(
     )
     share = best.x**2
     variances = np.where(share > LEAST, unit * share, 0.0)
-    return tuple(Component(level, kind, float(v)) for (level, kind), v in zip(kinds, variances, strict=True))
+    parts = zip(kinds, variances.tolist(), strict=True)
+    return float(best.fun), tuple(Component(level, kind, v) for (level, kind), v in parts)
 
 
 class RestrictedLikelihood:
@@ -107,8 +110,9 @@ class RestrictedLikelihood:
         groups, self.variance = means.groups, means.variance
         every = basis.append(means.residual)
         self.columns = every.values
-        self.loads = np.column_stack([np.ones_like(means.force), means.force])
-        self.places = [(level, KINDS.index(kind)) for level, kind in kinds]
+        used = list(dict.fromkeys(kind for _, kind in kinds))
+        self.loads = means.loads[:, [KINDS.index(kind) for kind in used]]
+        self.places = [(level, used.index(kind)) for level, kind in kinds]
         self.finest = next(iter(groups.starts))
         self.above = list(dict.fromkeys(level for level, _ in kinds if level != self.finest))
         self.groups = {}  # of the next finer groups, by level
@@ -120,7 +124,7 @@ class RestrictedLikelihood:
 
     def __call__(self, variances: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the value and its derivative with respect to each variance, shape (kinds,)."""
-        size = {level: np.zeros(2) for level in (self.finest, *self.above)}
+        size = {level: np.zeros(self.loads.shape[1]) for level in (self.finest, *self.above)}
         for (level, k), v in zip(self.places, variances, strict=True):
             size[level][k] = v
         own = self.variance + self.loads**2 @ size[self.finest]
@@ -134,12 +138,12 @@ class RestrictedLikelihood:
         for level in self.above:
             q, t = (self._sums(part, level) for part in (square, cross))
             root = np.sqrt(size[level])
-            both = np.eye(2) + root[:, None] * q * root
+            both = np.eye(root.size) + root[:, None] * q * root
             m = root[:, None] * np.linalg.inv(both) * root
             value += float(np.linalg.slogdet(both)[1].sum())
             mt = m @ t
-            gram -= sum(self.layout[level].gram(t[:, kind], mt[:, kind]) for kind in range(2))
-            inner.append((m, mt, np.eye(2) - m @ q))
+            gram -= sum(self.layout[level].gram(t[:, kind], mt[:, kind]) for kind in range(root.size))
+            inner.append((m, mt, np.eye(root.size) - m @ q))
             square, cross = q - q @ m @ q, t - q @ mt
             steps.append((square, cross))
         chol = _root_of(gram[:-1, :-1])
@@ -203,12 +207,19 @@ def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
 # Smallest row noise, as a share of the force. It is below the resolution of any sensor, and keeps the weights
 # of noise-free data finite.
 LEAST_NOISE = 1e-6
+# Fall of half the restricted deviance from which specimens differ in v_s or sigma_2. Where they scatter by
+# 3 % in dry friction but not in the viscous force, a gain does not describe them: in 34 of 40 campaigns
+# without an effect the number of the run was significant, as it distinguishes specimens; with these
+# components in none.
+CURVES_DIFFER = 2.0
+# Number of speeds at which a specimen shows that.
+SPEEDS_OF_A_SPECIMEN = {"v_s": 3, "sigma_2": 2}
 # Number of files from which differences in their shape along strokes are estimated.
 LEAST_FILES = 6
 
 
 def estimate_scatter(
-    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, start: Scatter | None = None
+    rows: Rows, residual: np.ndarray, loads: np.ndarray, jacobian: Tangent, start: Scatter | None = None
 ) -> Scatter:
     """Return row noise and variance components of the residual of a model, by REML.
 
@@ -216,32 +227,62 @@ def estimate_scatter(
     shape (n,) and are in N. `jacobian`, shape (n, p), is the tangent of the model. `start` has starting
     values, and the components to be estimated.
     """
+    friction = loads[:, GAIN]
     s0, g, design_effect = row_noise(rows, residual, friction)
     shape = shape_scatter(rows, residual, np.sqrt((s0**2 + (g * friction) ** 2) * design_effect))
     start = Scatter(s0, g, () if start is None else start.components, design_effect, shape)
-    return estimate_components(rows, residual, friction, jacobian, start)
+    return estimate_components(rows, residual, loads, jacobian, start)
 
 
 def estimate_components(
-    rows: Rows, residual: np.ndarray, friction: np.ndarray, jacobian: Tangent, scatter: Scatter
+    rows: Rows, residual: np.ndarray, loads: np.ndarray, jacobian: Tangent, scatter: Scatter
 ) -> Scatter:
     """Return a scatter with re-estimated components and the same row noise; see `estimate_scatter`."""
+    known = [(part.level, part.kind) for part in scatter.components]
+    kinds = [kind for kind in [*usable_components(rows), *curve_components(rows)] if kind in known]
+    kinds = kinds if known else usable_components(rows)
+    return _estimated(rows, residual, loads, jacobian, scatter, kinds)[1]
+
+
+def with_curves(
+    rows: Rows, residual: np.ndarray, loads: np.ndarray, jacobian: Tangent, scatter: Scatter
+) -> Scatter | None:
+    """Return a scatter with components of the specimens' curves; None if these do not differ.
+
+    The arguments are as for `estimate_components`.
+    """
+    if not (curves := curve_components(rows)):
+        return None
+    kinds = [(part.level, part.kind) for part in scatter.components]
+    given = rows, residual, loads, jacobian, scatter
+    (value, _), (less, found) = _estimated(*given, kinds), _estimated(*given, [*kinds, *curves])
+    return found if less < value - CURVES_DIFFER else None
+
+
+def _estimated(
+    rows: Rows,
+    residual: np.ndarray,
+    loads: np.ndarray,
+    jacobian: Tangent,
+    scatter: Scatter,
+    kinds: Sequence[tuple[str, str]],
+) -> tuple[float, Scatter]:
+    """Return half the restricted deviance, and the scatter with components of these levels and kinds."""
     groups, level = rows.groups, "stroke"
-    means = groups.means(np.column_stack([residual, friction]), level)
-    noise = groups.means(scatter.noise_sd(friction) ** 2, level)
+    means = groups.means(np.column_stack([residual, loads]), level)
+    noise = groups.means(scatter.noise_sd(loads[:, GAIN]) ** 2, level)
     count = np.diff(np.r_[groups.starts[level], residual.size])
-    known = {(c.level, c.kind): c.variance for c in scatter.components}
-    kinds = [kind for kind in usable_components(rows) if not known or kind in known]
+    known = {(part.level, part.kind): part.variance for part in scatter.components}
     between = jacobian.means(groups, level)
     inside = between.with_values(between.values * np.sqrt(count)[:, None]).norms() ** 2
     share = inside / np.maximum(jacobian.norms() ** 2, 1e-300)
-    components = reml(
-        GroupMeans(means[:, 0], noise * scatter.design_effect / count, means[:, 1], groups.at(level)),
+    value, components = reml(
+        GroupMeans(means[:, 0], noise * scatter.design_effect / count, means[:, 1:], groups.at(level)),
         between.columns(share >= LEAST_BETWEEN),
         kinds,
         [known.get(kind, 0.0) for kind in kinds] if known else None,
     )
-    return replace(scatter, components=tuple(replace(c, df=_df(rows, c)) for c in components))
+    return value, replace(scatter, components=tuple(replace(c, df=_df(rows, c)) for c in components))
 
 
 def usable_components(rows: Rows) -> list[tuple[str, str]]:
@@ -258,8 +299,27 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     if not (rows.speed.min() < 0 < rows.speed.max() or np.ptp(size) > 0.2 * size.max()):
         return [(level, "offset") for level in used]
     # Specimens differ in friction, not in the sensor's zero.
-    pairs = [(level, kind) for level in used for kind in KINDS]
+    pairs = [(level, kind) for level in used for kind in LEVELS_OF_FORCE]
     return [pair for pair in pairs if pair != ("specimen", "offset")]
+
+
+def curve_components(rows: Rows) -> list[tuple[str, str]]:
+    """Return (level, kind) of the numbers of the Stribeck curve that specimens may show to differ."""
+    return rows.cache.once(("curve components",), lambda: _curve_components(rows))
+
+
+def _curve_components(rows: Rows) -> list[tuple[str, str]]:
+    starts = rows.groups.starts["specimen"]
+    if starts.size == rows.groups.starts["run"].size:
+        return []
+    parts = np.split(np.arange(rows.force.size), starts[1:])
+    speeds = np.array([tested_speeds(rows, own).size for own in parts])
+    count = Counter(p.quantity for p in declare(rows).parameters)
+    return [
+        ("specimen", kind)
+        for kind, least in SPEEDS_OF_A_SPECIMEN.items()
+        if count[kind] and np.count_nonzero(speeds >= least) - count[kind] >= 2
+    ]
 
 
 def _df(rows: Rows, component: Component) -> float:

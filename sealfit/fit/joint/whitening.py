@@ -5,19 +5,20 @@ A residual is noise of its row plus random offsets and gains of its stroke, file
 .. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_i), \quad
           \mathrm{Var}\, o_l = \sigma_{o,l}^2, \ \mathrm{Var}\, k_l = \sigma_{k,l}^2
 
-where F is the model's friction, its force without added forces. Neighbouring rows are correlated, which
-multiplies the noise variance of all patterns in a stroke by the design effect. Files differ in shape along
-their strokes, which multiplies that of all patterns other than the mean by a further factor, `shape`.
+where F is the model's friction, its force without added forces. Specimens may also differ in v_s and sigma_2,
+with the derivatives of the force in place of F. Neighbouring rows are correlated, which multiplies the noise
+variance of all patterns in a stroke by the design effect. Files differ in shape along their strokes, which
+multiplies that of all patterns other than the mean by a further factor, `shape`.
 
 Within a stroke the components change only two numbers: its mean, and its projection on the variation of F
-about its mean (zero if F is constant). For these a root of the inverse covariance is a product of rank-one
-updates, as groups are nested; all other patterns are divided by their noise. This is exact, and linear in the
-number of rows.
+about its mean (zero if F is constant); what else v_s and sigma_2 change there is left out. For these a root
+of the inverse covariance is a product of rank-one updates, as groups are nested; all other patterns are
+divided by their noise. Time is linear in the number of rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,13 @@ from scipy.sparse.csgraph import connected_components
 
 from sealfit.fit.joint.rows import Groups
 from sealfit.fit.joint.tangent import Tangent
+
+# Kinds of random effects, in the order of the columns of `loads`: the change of a row's force per unit of
+# each. An offset adds to the force, a gain multiplies friction, and v_s stands for its logarithm.
+KINDS = ("offset", "gain", "v_s", "sigma_2")
+GAIN = KINDS.index("gain")
+# Kinds that change all speeds alike.
+LEVELS_OF_FORCE = ("offset", "gain")
 
 # A force whose variation within a stroke is below this share of its mean is constant there.
 FLAT = 1e-9
@@ -53,38 +61,42 @@ class Scatter:
 
     def estimates(self, level: str) -> bool:
         """Return whether the variance of a level was estimated separately; the estimate may be zero."""
-        return any(part.level == level for part in self.components)
+        return any(part.level == level and part.kind in LEVELS_OF_FORCE for part in self.components)
 
     def noise_sd(self, friction: np.ndarray) -> np.ndarray:
         """Return the standard deviation of a row's own noise, shape of `friction`."""
         return np.sqrt(self.s0**2 + (self.g * friction) ** 2)
 
-    def level_variance(self, level: str, force: np.ndarray) -> np.ndarray:
-        """Return the variance of a row at `force` that is due to one level, shape of `force`."""
-        total = np.zeros_like(force, dtype=float)
+    def level_variance(self, level: str, loads: np.ndarray) -> np.ndarray:
+        """Return the variance of rows that is due to one level, shape (n,), from their loads, (n, kinds)."""
+        total = np.zeros(len(loads))
         for part in self.components:
             if part.level == level:
-                total += part.variance * (force**2 if part.kind == "gain" else 1.0)
+                total += part.variance * loads[:, KINDS.index(part.kind)] ** 2
         return total
 
 
 class Between:
     """Whitening of a few numbers per stroke with independent noise, under the variance components.
 
-    `variance`, shape (m,), is that of each number's own noise; `loads`, shape (m,) each, are the changes of
-    the numbers per unit of an `offset` and a `gain`; `components` are finest level first. `logdet` is the log
+    `variance`, shape (m,), is that of each number's own noise; `loads`, shape (m, kinds), are the changes of
+    the numbers per unit of each kind; `components` are finest level first. `logdet` is the log
     determinant of the covariance.
     """
 
     def __init__(
         self,
         variance: np.ndarray,
-        loads: Mapping[str, np.ndarray],
+        loads: np.ndarray,
         groups: Groups,
         components: Sequence[Component],
     ) -> None:
         above = [
-            (groups.starts[part.level], groups.codes[part.level], np.sqrt(part.variance) * loads[part.kind])
+            (
+                groups.starts[part.level],
+                groups.codes[part.level],
+                np.sqrt(part.variance) * loads[:, KINDS.index(part.kind)],
+            )
             for part in components
             if part.variance > 0
         ]
@@ -117,11 +129,12 @@ class Between:
 class Whitening:
     """A root of the inverse covariance of rows, computed once and applied to many columns.
 
-    Noise and gains are proportional to the model's signed friction, shape (n,). The groups are nested,
-    strokes first. `logdet` is the log determinant of the covariance.
+    `loads` are those of the rows, shape (n, kinds); noise is proportional to friction, the load of a gain.
+    The groups are nested, strokes first. `logdet` is the log determinant of the covariance.
     """
 
-    def __init__(self, scatter: Scatter, friction: np.ndarray, groups: Groups) -> None:
+    def __init__(self, scatter: Scatter, loads: np.ndarray, groups: Groups) -> None:
+        friction = loads[:, GAIN]
         finest = next(iter(groups.starts))
         start, code = groups.starts[finest], groups.codes[finest]
         n, m = friction.size, start.size
@@ -141,12 +154,8 @@ class Whitening:
         parts = np.column_stack([mean, about]).ravel(), columns, 2 * np.arange(n + 1)
         self.back = csr_array(parts, shape=(n, 2 * m))
         self.take = csr_array(self.back.T.multiply(1 / sd[None, :]))
-        loads = {
-            "offset": np.column_stack([size, np.zeros(m)]).ravel(),
-            "gain": np.column_stack([level, np.where(flat, 0.0, spread)]).ravel(),
-        }
         variance, strokes = np.tile([1.0, scatter.shape], m), groups.at(finest).repeated(2)
-        self.between = Between(variance, loads, strokes, scatter.components)
+        self.between = Between(variance, self.take @ loads, strokes, scatter.components)
         self.logdet = self.between.logdet + float(2 * np.log(sd).sum() + (n - 2 * m) * np.log(scatter.shape))
 
     def normal(self, tangent: Tangent, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
