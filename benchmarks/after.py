@@ -32,8 +32,9 @@ from sealfit.fit.aging import fit_series
 from sealfit.fit.aging.all_series import law_of
 from sealfit.fit.aging.lifetime import Goal, lifetime, over_laws
 from sealfit.fit.joint import Fitted
-from sealfit.fit.steady import fit_conditions
+from sealfit.fit.steady import SteadyFit, fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
+from sealfit.pipeline import FITS
 from sealfit.simulation import Spec, load_truth, simulate, truth_path
 
 KINDS = ("warming_distance", "warming_time", "conditioning", "zero_offset", "lab_temperature", "two_at_once")
@@ -53,13 +54,14 @@ def count(kind: str, seed: int, strength: str) -> list[Entry]:
     right = sorted(found) == sorted(effect.id for effect in spec.effects)
     after = after_fits(closure.after, tables["steady"], tables["traces"], config)
     conditions = fit_conditions(tables["steady"], config)
-    before = fit_series(conditions, config)
+    before = fit_series(conditions, config)["aging_fit"]
     factor = _factor(spec, closure.after)
     laws = {str(row["condition"]): row for row in truth["physics"]}
     entries = [Entry("effects found as they are", right, None, None)]
     entries += _laws("after", after["aging_fit_after"], laws, factor)
     entries += _laws("before", before, laws, factor)
-    entries += _life("after", after["steady_after"], after["steady_fit_after"], spec, laws, factor)
+    free = {name: after[f"{name}_after"] for name in FITS["fit-steady"]}
+    entries += _life("after", after["steady_after"], free, spec, laws, factor)
     return entries + list(_life("before", tables["steady"], conditions, spec, laws, factor))
 
 
@@ -90,7 +92,7 @@ def _laws(model: str, fit: pd.DataFrame, laws: dict, factor: float) -> Iterator[
 
 
 def _life(
-    model: str, steady: pd.DataFrame, conditions: pd.DataFrame, spec: Spec, laws: dict, factor: float
+    model: str, steady: pd.DataFrame, conditions: SteadyFit, spec: Spec, laws: dict, factor: float
 ) -> Iterator[Entry]:
     celsius = min(law["temperature_C"] for law in laws.values() if law["aging_days"] > 0)
     true = next(law for law in laws.values() if law["temperature_C"] == celsius and law["aging_days"] > 0)

@@ -110,7 +110,7 @@ class Entry(NamedTuple):
 def steady(settings: dict, seed: int) -> Iterator[Entry]:
     """Yield the intervals of fit-steady on one condition of a campaign."""
     fits = fit_conditions(steady_rows(seed=seed, days=(0, 1, 2), model=CURVE, **settings), Config())
-    rows = fits[(fits["quantity"] == "steady") & (fits["condition"] == "unaged")]
+    rows = fits["steady_fit"].query("quantity == 'steady' and condition == 'unaged'")
     for row in rows.dropna(subset="value").itertuples():
         yield Entry(row.parameter, CURVE[row.parameter], row.lo95, row.hi95, row.identified)
 
@@ -118,7 +118,7 @@ def steady(settings: dict, seed: int) -> Iterator[Entry]:
 def aging(settings: dict, seed: int) -> Iterator[Entry]:
     """Yield the intervals of the aging law of every series."""
     table = steady_rows(**{"seed": seed, "days": DAYS, "speeds": FEW, "ways": (1,), **settings})
-    fit = fit_series(fit_conditions(table, Config()), Config())
+    fit = fit_series(fit_conditions(table, Config()), Config())["aging_fit"]
     for quantity, law in LAWS.items():
         truth = law | {"c": -law["a"] * np.log(law["b"])}
         for row in fit[(fit["quantity"] == quantity)].dropna(subset="value").itertuples():

@@ -39,11 +39,11 @@ from sealfit.config import Config
 steady, fit, step = pd.read_parquet(sys.argv[1]), sys.argv[2], sys.argv[3]
 if step == "fit-steady":
     from sealfit.fit.steady import fit_conditions
-    fit_conditions(steady, Config()).to_parquet(fit)
+    pd.to_pickle(fit_conditions(steady, Config()), fit)
 else:
     from sealfit.fit.aging.all_series import joint_laws
     from sealfit.fit.aging import aging_curves, fit_series
-    steady_fit = pd.read_parquet(fit)
+    steady_fit = pd.read_pickle(fit)
     aging_curves(fit_series(steady_fit, Config()))
     joint_laws(steady, steady_fit, Config())
 """
@@ -117,7 +117,7 @@ def measure(
 
 def conditions(sizes: Sequence[int], *, seed: int, cores: Sequence[int], work: Path) -> None:
     """Measure fit-steady and fit-aging of tables with about so many conditions, of every design."""
-    table, fit = work / "steady.parquet", work / "steady_fit.parquet"
+    table, fit = work / "steady.parquet", work / "steady_fit.pickle"
     for (name, (varied, days)), size in itertools.product(DESIGNS.items(), sizes):
         rows = many_conditions(varied, days, size, seed=seed)
         rows.to_parquet(table)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault, OutError, ParameterError, RequestError, StaleError
+from sealfit.pipeline import FITS
 from sealfit.progress import Silent
 from sealfit.store import Store, paths
 from sealfit.store.manifest import ConfigCopy
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from sealfit.fit.aging.joint_law import JointLaw
+    from sealfit.fit.steady import SteadyFit
 
 MODELS = ("after", "before")  # with the loop's effects taken out at their reference, and without effects
 
@@ -188,13 +190,11 @@ def _laws_of(store: Store, asked: LifetimeRequest, model: str) -> tuple[list[Joi
     return law_of(*tables, asked.quantity, asked.law), taken_out
 
 
-def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame], list[dict]]:
+def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, SteadyFit], list[dict]]:
     """Return a model's table `steady`, the fit of its conditions, and the effects taken out of them."""
-    from sealfit.fit import whole_steady_fit
-
     if model == "before":
         store.require("fit-steady")
-        return (store.read("steady"), whole_steady_fit(store.read)), []
+        return _conditions_of(store, ""), []
     try:
         store.require("close-loop")
     except StaleError as error:
@@ -205,7 +205,12 @@ def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, pd.DataFrame
     added = [effect for effect in store.read_json("closure")["effects"] if not effect["candidate"]]
     suffix = "_after" if added else ""
     taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
-    return (store.read(f"steady{suffix}"), whole_steady_fit(store.read, suffix)), taken_out
+    return _conditions_of(store, suffix), taken_out
+
+
+def _conditions_of(store: Store, suffix: str) -> tuple[pd.DataFrame, SteadyFit]:
+    fit = {name: store.read(f"{name}{suffix}") for name in FITS["fit-steady"]}
+    return store.read(f"steady{suffix}"), fit
 
 
 def _own_effects(folder: Path | None) -> dict:

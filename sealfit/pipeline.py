@@ -206,7 +206,7 @@ def _fit_steady(store: Store, staged: Staged, options: Options, progress: Silent
 
     steady = store.read("steady")
     progress.say(f"fitting {steady['condition'].nunique()} conditions")
-    _write(staged, {"steady_fit": fit_conditions(steady, store.seen_config("fit-steady"))})
+    _write(staged, fit_conditions(steady, store.seen_config("fit-steady")))
     return len(steady), "strokes"
 
 
@@ -227,29 +227,28 @@ def _fit_properties(store: Store, staged: Staged, progress: Silent) -> Counted:
 def _fit_aging(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
     if store.state.properties is not None:
         return _fit_properties(store, staged, progress)
-    from sealfit.fit import whole_steady_fit
     from sealfit.fit.aging import aging_curves, fit_series
     from sealfit.fit.aging.all_series import joint_laws
 
     config = store.seen_config("fit-aging")
     no_law = "no aging_days in the condition: there is no aging law to fit"
     progress.say("fitting the aging law" if config.aging else no_law)
-    steady_fit = whole_steady_fit(store.read)
+    steady_fit = {name: store.read(name) for name in MADE["fit-steady"]}
     fitted = fit_series(steady_fit, config)
     laws, curve = joint_laws(store.read("steady"), steady_fit, config)
     curves = aging_curves(fitted)
-    _write(staged, {"aging_laws": laws, "master_curve": curve, "aging_fit": fitted, "aging_curves": curves})
-    return int(steady_fit["condition"].nunique()), "conditions"
+    _write(staged, {**fitted, "aging_laws": laws, "master_curve": curve, "aging_curves": curves})
+    return int(steady_fit["steady_fit"]["condition"].nunique()), "conditions"
 
 
 def _fit_dynamic(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
-    from sealfit.fit import whole_steady_fit
     from sealfit.fit.dynamic import fit_dynamic
 
     progress.say("fitting the pre-sliding part")
-    tables, config = (store.read("steady"), whole_steady_fit(store.read)), store.seen_config("fit-dynamic")
-    _write(staged, fit_dynamic(store.traces(), *tables, config, workers=options.workers))
-    return len(tables[0]), "strokes"
+    steady, config = store.read("steady"), store.seen_config("fit-dynamic")
+    steady_fit = {name: store.read(name) for name in MADE["fit-steady"]}
+    _write(staged, fit_dynamic(store.traces(), steady, steady_fit, config, workers=options.workers))
+    return len(steady), "strokes"
 
 
 def _close_loop(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:
@@ -273,12 +272,8 @@ def _close_loop(store: Store, staged: Staged, options: Options, progress: Silent
 
 
 def _write(staged: Staged, tables: Mapping[str, pd.DataFrame]) -> None:
-    """Write tables, those of a fit in the parts in which it is stored."""
-    from sealfit.fit import stored
-
     for name, table in tables.items():
-        for part, rows in stored(name, table).items():
-            staged.table(part, rows)
+        staged.table(name, table)
 
 
 def _instant(text: str) -> datetime:

@@ -404,7 +404,6 @@ INGESTED = (INPUTS, RUNS, QUALITY, TRACES, TRACES_MEAN, STEADY, BINS)
 FITTED = (STEADY_FIT, AGING_FIT, AGING_CURVES, AGING_LAWS, MASTER_CURVE, DYNAMIC_FIT, DYNAMIC_CURVES)
 BESIDE = (STEADY_COVARIANCE, STEADY_SHIFT, AGING_COVARIANCE)  # of the parameters of a fit
 LOOP = (EFFECTS, RESIDUALS_BEFORE, RESIDUALS_AFTER, LEVELS, CHANNELS, SHAPES, SHAPE_POINTS, CURVES)
-AFTER = (STEADY_AFTER, *(replace(fitted, name=f"{fitted.name}_after") for fitted in FITTED))
-_BESIDE_AFTER = tuple(replace(beside, name=f"{beside.name}_after") for beside in BESIDE)
-_ALL = (*INGESTED, *FITTED, PROPERTY_VALUES, *BESIDE, *LOOP, *AFTER, *_BESIDE_AFTER)
+AFTER = (STEADY_AFTER, *(replace(fitted, name=f"{fitted.name}_after") for fitted in (*FITTED, *BESIDE)))
+_ALL = (*INGESTED, *FITTED, PROPERTY_VALUES, *BESIDE, *LOOP, *AFTER)
 SCHEMAS = {schema.name: schema for schema in _ALL}

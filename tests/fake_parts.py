@@ -140,11 +140,17 @@ class Parts:
         fit = small("steady_fit", 3).assign(
             condition=["a", "b", "c"], parameter="mu_s", value=[0.7, 0.8, 9.0], unit=""
         )
-        return fit.assign(identified=[True, True, False], reason=["", "", "Too few speeds."])
+        fit = fit.assign(identified=[True, True, False], reason=["", "", "Too few speeds."])
+        return {
+            "steady_fit": fit,
+            "steady_covariance": small("steady_covariance"),
+            "steady_shift": small("steady_shift"),
+        }
 
     def fit_series(self, steady_fit, config):
         self._called("fit-aging", config)
-        return small("aging_fit", 1).assign(quantity="mu_s", parameter="a", value=0.04, unit="")
+        fit = small("aging_fit", 1).assign(quantity="mu_s", parameter="a", value=0.04, unit="")
+        return {"aging_fit": fit, "aging_covariance": small("aging_covariance")}
 
     def aging_curves(self, aging_fit):
         return small("aging_curves")

@@ -31,9 +31,8 @@ def test_short_traces_are_read_without_a_fault_and_fit_their_law(short):
     ingested = ingest_campaign(short, load_config())
     assert ingested.faults == []
     fits = fit_conditions(ingested.tables["steady"], load_config())
-    unaged = fits[(fits["condition"] == "unaged") & (fits["quantity"] == "steady")].set_index("parameter")[
-        "value"
-    ]
+    unaged = fits["steady_fit"].query("condition == 'unaged' and quantity == 'steady'")
+    unaged = unaged.set_index("parameter")["value"]
     wanted = {"mu_s": MU_S["mu_0"], "mu_c": MU_C["mu_0"], "v_s": V_S, "sigma_2": SIGMA_2}
     for name, value in wanted.items():  # specimen, set-up and repeat scatter by 0.5 % each
         assert unaged[name] == pytest.approx(value, rel=0.4 if name == "sigma_2" else 0.06)

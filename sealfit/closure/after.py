@@ -11,7 +11,7 @@ import pandas as pd
 
 from sealfit.closure.errors_and_intervals import degrees_of_freedom, t_quantile
 from sealfit.config import Config
-from sealfit.fit.aging import CURVE_POINTS, aging_curves, fit_series
+from sealfit.fit.aging import CURVE_POINTS, LawRows, aging_curves, fit_series, law_fit
 from sealfit.fit.aging.all_series import joint_laws
 from sealfit.fit.aging.law import search_limits
 from sealfit.fit.aging.law_table import Curve, CurveInterval, Estimate, covariance_rows, law_rows, without_law
@@ -20,11 +20,11 @@ from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.model import Model, Term, evaluate
 from sealfit.fit.joint.rows import POWER, Rows
-from sealfit.fit.steady import FORCES, fit_conditions, parameter_units, table_row
+from sealfit.fit.steady import FORCES, SteadyFit, fit_conditions, parameter_units, table_row
 from sealfit.fit.steady.uncertainty import SHIFT
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import timed
-from sealfit.tables import AFTER, AGING_CURVES, AGING_FIT, SCHEMAS
+from sealfit.tables import AFTER, AGING_CURVES, SCHEMAS
 
 # ---------------------------------------------------------------- reference
 # The reference state of the after-model, in which its effects are zero, and the effects' share of the
@@ -138,32 +138,27 @@ SLOW, FAST = 1e-6, 12.0  # Multiples of v_s at which the force is mu_s N, and mu
 WIDEST = 700.0  # Largest logarithm.
 
 
-def after_laws(after: Fitted, steady_fit: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return tables `aging_fit_after` and `aging_curves_after`; empty without aging.
+def after_laws(
+    after: Fitted, steady_fit: SteadyFit, config: Config
+) -> tuple[dict[str, pd.DataFrame], pd.DataFrame]:
+    """Return tables `aging_fit` and `aging_covariance`, and `aging_curves`; empty without aging.
 
-    The laws are compared with the values of single conditions in `steady_fit`, table `steady_fit_after`.
+    The laws are compared with the values of single conditions in `steady_fit`, the fits without the effects.
     mu_0, a and b and their standard errors are those of the joint fit. Their intervals use Student's t with
     the number of specimens less the parameters of one coefficient; that of b is symmetric in its logarithm.
     Effects that are part of the condition (such as days) multiply or change the law; the curves include them.
     Three speeds determine no mu_s and mu_c: the laws are then those of single conditions, as before the loop.
     """
     if "interpolated" in after.model.declared.stribeck.values():
-        law = fit_series(steady_fit, config).assign(model="after")
-        return law, aging_curves(law)
-    rows, curves = [], []
-    known = AGING_FIT.names()
-    open_columns = [name for name in config.series_columns if name in steady_fit and name not in known]
+        laws = fit_series(steady_fit, config)
+        return laws, aging_curves(laws)
+    fit, rows, curves = steady_fit["steady_fit"], [], []
     for law in _laws(after, config) if config.aging else ():
-        rows += [{"rubber": law.rubber, **row} for row in law.rows(steady_fit)]
+        rows.append((law.rubber, law.rows(fit)))
         if law.place is not None:
             curves.append(law.curve())
-    columns = [*known, *open_columns]
     drawn = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=AGING_CURVES.names())
-    if not rows:
-        return pd.DataFrame(columns=columns), drawn
-    keys = steady_fit.groupby("series", sort=True)[open_columns].first().reset_index()
-    table = pd.DataFrame(rows).merge(keys, on="series", how="left", validate="many_to_one")
-    return table.assign(model="after")[columns], drawn
+    return law_fit(rows, fit, config), drawn
 
 
 def law_df(after: Fitted) -> float:
@@ -206,11 +201,10 @@ class _Law:
         self.place = number if min(number) >= 0 else None
         self.df = law_df(after)
 
-    def rows(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
-        """Yield the rows of `aging_fit_after`."""
+    def rows(self, steady_fit: pd.DataFrame) -> LawRows:
+        """Return the rows of tables `aging_fit` and `aging_covariance`."""
         if self.place is None:
-            yield from without_law(self.curve_of)
-            return
+            return list(without_law(self.curve_of)), []
         after, at, config = self.after, self.place, self.config
         sensor = after.whitening((np.sign(after.rows.speed) * config.sensor.u)[:, None])[:, 0]
         shift = after.covariance[at] @ after.white_jacobian.against(sensor)
@@ -221,10 +215,11 @@ class _Law:
             f"The effect {t.effect.id} of {' and '.join(t.channels)} acts on top of it." for t in kept
         )
         interval = self._interval(found)
-        for row in law_rows(self.curve_of, found, interval, self.df):
-            yield {**row, "reason": " ".join(part for part in (row["reason"], words) if part)}
-        yield from self._statistics(steady_fit)
-        yield from covariance_rows(self.curve_of, found.covariance)
+        rows = list(law_rows(self.curve_of, found, interval, self.df))
+        for row in rows:
+            row["reason"] = " ".join(part for part in (row["reason"], words) if part)
+        rows += self._statistics(steady_fit)
+        return rows, list(covariance_rows(self.curve_of, found.covariance))
 
     def _interval(self, found: Estimate) -> CurveInterval:
         """Return the 95 % limits of a, b and c; b is open beyond the search range of laws."""
@@ -328,19 +323,13 @@ def after_fits(
     with timed("after: conditions", rows=len(free), of="strokes"):
         conditions = fit_conditions(free, config)
     with timed("after: laws"):
-        law, curves = after_laws(after, conditions, config)
+        of_series, curves = after_laws(after, conditions, config)
         laws, master = joint_laws(free, conditions, config)
     with timed("after: starts", rows=len(free), of="strokes"):
         dynamic = fit_dynamic(traces, free, conditions, config, workers=workers)
-    found = {
-        "steady_after": free,
-        "steady_fit_after": conditions,
-        "aging_fit_after": law,
-        "aging_curves_after": curves,
-        "aging_laws_after": laws,
-        "master_curve_after": master,
-        **{f"{name}_after": table for name, table in dynamic.items()},
-    }
+    found = {"steady": free, **conditions, **of_series, **dynamic}
+    found |= {"aging_curves": curves, "aging_laws": laws, "master_curve": master}
     return {
-        name: t.assign(model="after") if "model" in SCHEMAS[name].names() else t for name, t in found.items()
+        f"{name}_after": table.assign(model="after") if "model" in SCHEMAS[name].names() else table
+        for name, table in found.items()
     }

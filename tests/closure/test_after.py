@@ -26,7 +26,8 @@ from sealfit.fit.joint.model import Term, evaluate
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.steady import fit_conditions
 from sealfit.fit.steady.uncertainty import shifts_of
-from sealfit.tables import AFTER, AGING_FIT, STEADY_FIT
+from sealfit.pipeline import FITS
+from sealfit.tables import AFTER, AGING_FIT, SCHEMAS
 
 SCATTER = {"setup": 0.003, "specimen": 0.005, "bins": 10}
 WARMING = (Term(EFFECTS["warming_time"], ("time_s",), "mu", "multiply"), {"A": 0.05, "tau": 3.0})
@@ -53,6 +54,11 @@ def warmed():
     bins = make_bins(7, effect=warm, **SCATTER)
     after = fitted(bins, WARMING)
     return steady_of(bins), after, after_fits(after, steady_of(bins), made_traces(bins), Config())
+
+
+def conditions_of(tables):
+    """Return the fits of the conditions without the effects."""
+    return {name: tables[f"{name}_after"] for name in FITS["fit-steady"]}
 
 
 def made_traces(bins):
@@ -99,7 +105,7 @@ def test_the_law_of_a_series_is_that_of_the_joint_fit(warmed):
         assert row["lo95"] < TRUE["mu_s0"] < row["hi95"]
         assert law.loc[(series, "mu_s", "b"), "lo95"] < TRUE["b_s"] < law.loc[(series, "mu_s", "b"), "hi95"]
     assert set(law["model"]) == {"after"}
-    before = fit_conditions(steady_of(make_bins(7, effect=warm, **SCATTER)), Config())
+    before = fit_conditions(steady_of(make_bins(7, effect=warm, **SCATTER)), Config())["steady_fit"]
     unaged = before[(before["condition"] == "unaged") & (before["parameter"] == "mu_s")]
     assert unaged["hi95"].iloc[0] < TRUE["mu_s0"]  # warm
 
@@ -117,7 +123,7 @@ def test_the_curve_of_a_law_passes_through_it_with_its_errors(warmed):
 def test_life_is_longer_than_warm_rubber_makes_it_look(warmed):
     steady, _, tables = warmed
     goal = Goal(TRUE["mu_s0"] - TRUE["a_s"] * np.log1p(8.0 / TRUE["b_s"]))
-    after = lifetime(law_of(tables["steady_after"], tables["steady_fit_after"], "mu_s", "log")[0], goal, 60.0)
+    after = lifetime(law_of(tables["steady_after"], conditions_of(tables), "mu_s", "log")[0], goal, 60.0)
     before = lifetime(law_of(steady, fit_conditions(steady, Config()), "mu_s", "log")[0], goal, 60.0)
     assert after.low < 8.0 < after.high
     assert before.high < 8.0
@@ -125,7 +131,7 @@ def test_life_is_longer_than_warm_rubber_makes_it_look(warmed):
 
 def test_the_effects_uncertainty_is_common_to_all_conditions(warmed):
     _, after, tables = warmed
-    free, conditions = tables["steady_after"], tables["steady_fit_after"]
+    free, conditions = tables["steady_after"], conditions_of(tables)
     known = free.drop(columns=shifts_of(free))
     _, alone = shared_levels(known, fit_conditions(known, Config()))
     levels, covariance = shared_levels(free, conditions)
@@ -149,7 +155,7 @@ def test_an_offset_is_taken_out_of_both_directions():
     npt.assert_allclose(free["effects_start_N"], after.model.values[0]["A"])
     shift = free[shifts_of(free)].to_numpy()[:, 0] * free["direction"].to_numpy()
     npt.assert_allclose(shift, shift[0])  # along the motion it has the sign of the direction
-    one = fit_conditions(free, Config())
+    one = fit_conditions(free, Config())["steady_fit"]
     unaged = one[
         (one["condition"] == "unaged") & (one["parameter"] == "mu_s") & (one["quantity"] == "steady")
     ].iloc[0]
@@ -178,8 +184,9 @@ def test_starts_are_fitted_to_forces_without_the_offset():
         "speed_set_mm_s": 1.0,
     }
     steady = pd.DataFrame([{**steady, "load_N": 50.0, "force_N": 30.0, "effects_start_N": 2.0, "used": True}])
-    asked = trace.assign(steady=distance > 3.0), steady, pd.DataFrame(columns=STEADY_FIT.names()), Config()
-    curve = fit_dynamic(*asked)["dynamic_curves"]
+    none = {name: pd.DataFrame(columns=SCHEMAS[name].names()) for name in FITS["fit-steady"]}
+    traces = trace.assign(steady=distance > 3.0)
+    curve = fit_dynamic(traces, steady, none, Config())["dynamic_curves"]
     assert curve["force_N"].max() == pytest.approx(30.0, abs=0.01)
 
 
@@ -199,7 +206,7 @@ def test_an_effect_of_days_alone_stays_in_the_values():
     npt.assert_array_equal(free["force_N"], steady["force_N"])
     assert shifts_of(free) == []
     law, curves = after_laws(after, fit_conditions(free, Config()), Config())
-    fit_of = law.set_index(["quantity", "parameter"])
+    fit_of = law["aging_fit"].set_index(["quantity", "parameter"])
     curve = curves[curves["quantity"] == "mu_s"]
     mu_0, a, b = (fit_of.loc[("mu_s", name), "value"] for name in ("mu_0", "a", "b"))
     shape = term.effect.shape({"aging_days": curve["aging_days"].to_numpy()}, **after.model.values[0])
@@ -254,8 +261,8 @@ def test_a_condition_may_be_called_rubber():
     bins = make_bins(7, days=(4.0,), **SCATTER)
     steady = fit_conditions(steady_of(bins), Config())
     law, _ = after_laws(fitted(bins), steady, Config(condition=["rubber", "temperature_C", "aging_days"]))
-    assert list(law.columns) == [*AGING_FIT.names(), "temperature_C"]
-    assert set(law["rubber"]) == {"rubber"}
+    assert list(law["aging_fit"].columns) == [*AGING_FIT.names(), "temperature_C"]
+    assert set(law["aging_fit"]["rubber"]) == {"rubber"}
 
 
 def test_three_speeds_have_laws_of_the_mean_coefficient_as_before_the_loop():

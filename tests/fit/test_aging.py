@@ -23,7 +23,8 @@ NAME = "temperature_C=60, compression_ratio_pct=80"
 
 
 def law(fit, quantity, parameter, series=NAME):
-    rows = fit[(fit.quantity == quantity) & (fit.parameter == parameter) & (fit.series == series)]
+    laws = fit["aging_fit"]
+    rows = laws[(laws.quantity == quantity) & (laws.parameter == parameter) & (laws.series == series)]
     assert len(rows) == 1
     return rows.iloc[0]
 
@@ -212,7 +213,7 @@ def test_the_published_laws_come_back_through_both_stages(aged):
         printed = {"mu_s": 0.11159, "mu_c": 0.06621}[quantity]
         npt.assert_allclose(law(aged, quantity, "c").value, printed, atol=8e-4)
         assert statistic(aged, f"{quantity}:max_error_pct").value < 0.1
-    assert list(aged.columns) == [*AGING_FIT.names(), "temperature_C", "compression_ratio_pct"]
+    assert list(aged["aging_fit"].columns) == [*AGING_FIT.names(), "temperature_C", "compression_ratio_pct"]
     assert law(aged, "mu_s", "b").unit == "d"
 
 
@@ -333,7 +334,7 @@ def test_without_unaged_rubber_mu_0_is_called_extrapolated(campaign):
 def test_mu_0_is_one_number_for_all_series_of_a_rubber(campaign):
     table = campaign(days=DAYS, series=((60.0, 80.0), (80.0, 80.0)), specimen=0.01)
     fit = fit_series(fit_conditions(table, Config()), Config())
-    values = fit[(fit.quantity == "mu_s") & (fit.parameter == "mu_0")].value
+    values = fit["aging_fit"].query("quantity == 'mu_s' and parameter == 'mu_0'").value
     assert len(values) == 2
     assert values.nunique() == 1
 
@@ -366,8 +367,8 @@ def test_without_aging_days_the_table_is_empty_with_its_schema(campaign):
     config = Config(condition=["temperature_C"])
     steady = fit_conditions(campaign(days=(0,)), config)
     fit = fit_series(steady, config)
-    assert fit.empty
-    assert list(fit.columns)[: len(AGING_FIT.names())] == AGING_FIT.names()
+    assert fit["aging_fit"].empty
+    assert list(fit["aging_fit"].columns)[: len(AGING_FIT.names())] == AGING_FIT.names()
     curves = aging_curves(fit)
     assert curves.empty
     assert list(curves.columns) == AGING_CURVES.names()
@@ -394,7 +395,9 @@ def test_a_condition_of_a_few_slow_speeds_does_not_bend_the_law_of_mu_c(campaign
     few = steady[(steady["condition"] != name) | (steady["speed_mm_s"].abs() < 2.5)]
     assert few.loc[few["condition"] == name, "speed_mm_s"].abs().nunique() == 3
     fits = [fit_conditions(table, Config()) for table in (steady, few)]
-    alone = fits[1].set_index(["condition", "quantity", "parameter"]).loc[(name, "steady", "mu_c")]
+    alone = (
+        fits[1]["steady_fit"].set_index(["condition", "quantity", "parameter"]).loc[(name, "steady", "mu_c")]
+    )
     assert alone["identified"]
     assert "too few for a Stribeck curve" in alone["reason"]
     whole, part = (law(fit_series(fit, Config()), "mu_c", "mu_0") for fit in fits)

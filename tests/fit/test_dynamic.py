@@ -9,7 +9,6 @@ import pytest
 from bristle_helpers import integrated
 
 from sealfit.config import load_config
-from sealfit.fit import whole_steady_fit
 from sealfit.fit.dynamic import bristle_rows, fit_dynamic
 from sealfit.fit.dynamic.bristle_model import Curve, Stroke
 from sealfit.fit.dynamic.presliding import fit_stiffness
@@ -18,7 +17,7 @@ from sealfit.fit.steady import fit_conditions
 from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.physics import LuGre
-from sealfit.pipeline import STEPS, run
+from sealfit.pipeline import FITS, STEPS, run
 from sealfit.simulation import Spec, simulate
 from sealfit.store import Store
 
@@ -262,7 +261,7 @@ def stored(tmp_path_factory):
         patch.setattr(partitions, "PART_FILES", 20)
         run(SIMULATED, out, steps=STEPS[:2])
     store = Store.open(out)
-    tables = store.read("steady"), whole_steady_fit(store.read)
+    tables = store.read("steady"), {name: store.read(name) for name in FITS["fit-steady"]}
     return store, tables, fit_dynamic(store.read("traces"), *tables, store.config)
 
 

@@ -236,7 +236,8 @@ def aging_campaign(
 
 def _laws(steady, fits, config):
     """Return the tables of the laws for all series; those of 73 conditions would take half a minute."""
-    laws, curve = joint_laws(steady, table("steady_fit", fits), config)
+    beside = {name: table(name, []) for name in ("steady_covariance", "steady_shift")}
+    laws, curve = joint_laws(steady, {"steady_fit": table("steady_fit", fits), **beside}, config)
     return {"aging_laws": table("aging_laws", laws), "master_curve": table("master_curve", curve)}
 
 

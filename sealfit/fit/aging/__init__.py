@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -16,9 +16,10 @@ from sealfit.fit.aging import law_table
 from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
 from sealfit.fit.aging.law_table import Curve, Estimate, OneQuantity
 from sealfit.fit.joint.declared import DAYS_FOR_LAW
+from sealfit.fit.steady import SteadyFit
 from sealfit.fit.steady.condition import FULL
 from sealfit.physics import aging_law
-from sealfit.tables import AGING_CURVES, AGING_FIT
+from sealfit.tables import AGING_COVARIANCE, AGING_CURVES, AGING_FIT
 
 PAIRS = (("mu_s", "mu_c"), ("F_s", "F_c"))
 # Number of the curve of values that no law is fitted to.
@@ -29,7 +30,11 @@ SMALLEST = 1e-6
 CURVE_POINTS = 61
 
 
-def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
+# Rows of tables `aging_fit` and `aging_covariance`.
+LawRows = tuple[list[dict], list[dict]]
+
+
+def fit_series(steady_fit: SteadyFit, config: Config) -> dict[str, pd.DataFrame]:
     r"""Fit the aging law to every series, mu_0 shared by all series of a rubber.
 
     .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b), \quad c = -a \ln b
@@ -40,17 +45,17 @@ def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     Parameters
     ----------
-    steady_fit : DataFrame
-        Table `steady_fit` with the column `aging_days`; only identified values are used.
+    steady_fit : dict of DataFrame
+        The fits of the conditions, with the column `aging_days`; only identified values are used.
     config : Config
         Names the condition columns.
 
     Returns
     -------
-    DataFrame
-        Table `aging_fit`: per series and quantity mu_0, a, b, c; "statistics" and "covariance" rows, whose
-        `parameter` starts with the quantity ("mu_s:mu_0,mu_s:ln b"). Empty without `aging_days` in the
-        condition or without aged rubber.
+    dict of DataFrame
+        Table `aging_fit`: per series and quantity mu_0, a, b, c, and "statistics" rows, whose `parameter`
+        starts with the quantity ("mu_s:chi2"); and table `aging_covariance` of mu_0, a and ln b. Empty
+        without `aging_days` in the condition or without aged rubber.
 
     Notes
     -----
@@ -58,32 +63,50 @@ def fit_series(steady_fit: pd.DataFrame, config: Config) -> pd.DataFrame:
     Student's t. The degrees of freedom are values minus parameters of the quantity, as specimens are the unit
     of evidence. `u_sys` is the change of the fit if the sensor's error changes all steady values together.
     """
-    open_columns = [name for name in config.series_columns if name in steady_fit.columns]
-    columns = [*AGING_FIT.names(), *open_columns]
-    has_aging = config.aging and "aging_days" in steady_fit.columns
-    rubbers = steady_fit.groupby("rubber", sort=True) if has_aging else ()
-    rows = [{"rubber": rubber, **row} for rubber, own in rubbers for row in _fit_rubber(own)]
-    if not rows:
-        return pd.DataFrame({name: steady_fit[name].iloc[:0] for name in columns})
-    keys = steady_fit.groupby("series", sort=True)[open_columns].first().reset_index()
-    return pd.DataFrame(rows).merge(keys, on="series", how="left", validate="many_to_one")[columns]
+    fit = steady_fit["steady_fit"]
+    has_aging = config.aging and "aging_days" in fit.columns
+    laws = {}
+    for rubber in sorted(set(fit["rubber"])) if has_aging else ():
+        laws[rubber] = _fit_rubber({name: own[own["rubber"] == rubber] for name, own in steady_fit.items()})
+    return law_fit(laws.items(), fit, config)
+
+
+def law_fit(
+    laws: Iterable[tuple[str, LawRows]], about: pd.DataFrame, config: Config
+) -> dict[str, pd.DataFrame]:
+    """Return tables `aging_fit` and `aging_covariance` of laws, each with its rubber.
+
+    `about` has the columns of every series.
+    """
+    rows = [[], []]
+    for rubber, own in laws:
+        for kept, new in zip(rows, own, strict=True):
+            kept += [{"rubber": rubber, **row} for row in new]
+    found = {}
+    for schema, own in zip((AGING_FIT, AGING_COVARIANCE), rows, strict=True):
+        fixed = schema.names()
+        others = [name for name in config.series_columns if name in about and name not in fixed]
+        keys = about.groupby("series", sort=True)[others].first().reset_index()
+        table = pd.DataFrame(own, columns=fixed)
+        found[schema.name] = table.merge(keys, on="series", how="left", validate="many_to_one")
+    return found
 
 
 # ---------------------------------------------------------------- one rubber
-def _fit_rubber(own: pd.DataFrame) -> list[dict]:
+def _fit_rubber(steady_fit: SteadyFit) -> LawRows:
+    own, shift = steady_fit["steady_fit"], steady_fit["steady_shift"]
     found = own[(own["quantity"] == "steady") & own["identified"].to_numpy(bool) & own["value"].notna()]
     pair = next((pair for pair in PAIRS if found["parameter"].isin(pair).any()), None)
     if pair is None:
-        return []
+        return [], []
     found = found[found["parameter"].isin(pair) & found["aging_days"].notna()]
     found = _of_one_meaning(found, own, pair)
     found = found.assign(quantity=found["parameter"]).sort_values(["condition", "quantity"], kind="stable")
-    shifts = values_of(own, "sensor_shift")
-    moved = [shifts.get(key, 0.0) for key in zip(found["condition"], found["quantity"], strict=True)]
-    covariance = steady_covariance(found, values_of(own, "covariance"))
+    sensor = shift[shift["source"] == "sensor"].set_index(["condition", "parameter"])["value"]
+    moved = sensor.reindex(pd.MultiIndex.from_frame(found[["condition", "quantity"]])).to_numpy(float)
     series = list(dict.fromkeys(own.loc[own["aging_days"].to_numpy(float) > 0, "series"]))
-    found = found.assign(moved=np.nan_to_num(np.array(moved, float)))
-    return laws_of_series(found, series, pair, covariance)
+    found = found.assign(moved=np.nan_to_num(moved))
+    return laws_of_series(found, series, pair, steady_covariance(found, steady_fit["steady_covariance"]))
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
@@ -124,24 +147,19 @@ def _numbers_of(found: pd.DataFrame, curves: list[Curve]) -> np.ndarray:
     return np.where((found["aging_days"] == 0).to_numpy() & has_law, -1, own)
 
 
-def values_of(steady_fit: pd.DataFrame, quantity: str) -> dict[tuple[str, str], float]:
-    """Return the values of table `steady_fit` with a `quantity`, by condition and parameter."""
-    rows = steady_fit[steady_fit["quantity"] == quantity]
-    return rows.set_index(["condition", "parameter"])["value"].to_dict()
-
-
-def steady_covariance(used: pd.DataFrame, known: dict[tuple[str, str], float]) -> csr_array:
+def steady_covariance(used: pd.DataFrame, known: pd.DataFrame) -> csr_array:
     """Return the covariance of steady values, shape (n, n); it is 0 between conditions.
 
-    `used` has the values: `condition`, `quantity` (mu_s, ...) and `value`. `known` are the covariances,
-    `values_of(steady_fit, "covariance")`.
+    `used` has the values: `condition`, `quantity` (mu_s, ...) and `value`; `known` is table
+    `steady_covariance`.
     """
     quantity, n = used["quantity"].to_numpy(object), len(used)
+    value_of = known.set_index(["condition", "parameter", "other"])["value"].to_dict()
     pairs, found = [], []
     for condition, places in used.groupby("condition", sort=False).indices.items():
         for i, j in product(places.tolist(), repeat=2):
             names = sorted((quantity[i], quantity[j]), reverse=True)  # mu_s before mu_c
-            value = known.get((condition, f"{names[0]},{names[1]}"), np.nan)
+            value = value_of.get((condition, *names), np.nan)
             pairs.append((i, j))
             found.append(value if np.isfinite(value) else 0.0)
     covariance = csr_array((found, np.reshape(pairs, (-1, 2)).T), shape=(n, n))
@@ -187,8 +205,8 @@ def between_scatter(values: Values) -> tuple[float, LawFit]:
 # ---------------------------------------------------------------- table
 def laws_of_series(
     found: pd.DataFrame, series: Sequence[str], quantities: Sequence[str], covariance, **replicates
-) -> list[dict]:
-    """Return the rows of table `aging_fit` of one rubber.
+) -> LawRows:
+    """Return the rows of the laws of one rubber.
 
     `found` has the values: `series`, `quantity`, `aging_days`, `value`, `unit`, and `moved`, their change if
     the sensor reads one standard uncertainty too high; values of one condition are adjacent. `series` and
@@ -198,17 +216,17 @@ def laws_of_series(
     curves = _curves_of(found, series, quantities)
     fitted = [name for name in quantities if any(c.place >= 0 and c.quantity == name for c in curves)]
     if not fitted:
-        return [row for curve in curves for row in law_table.without_law(curve)]
+        return [row for curve in curves for row in law_table.without_law(curve)], []
     days, value, moved = (found[name].to_numpy(float) for name in ("aging_days", "value", "moved"))
     origin = np.array([quantities.index(name) for name in found["quantity"]], int)
     number = _numbers_of(found, curves)
     kept = number > WITHOUT_LAW
     values = Values(days, value, origin, number, covariance, **replicates).part(kept)
-    return list(_rows(values, curves, fitted, moved[kept]))
+    return _rows(values, curves, fitted, moved[kept])
 
 
-def _rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndarray) -> Iterator[dict]:
-    """Yield the rows of all curves; `fitted` are the quantities with a law, in the order of their origin."""
+def _rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndarray) -> LawRows:
+    """Return the rows of all curves; `fitted` are the quantities with a law, in the order of their origin."""
     quantities = {}
     model = np.empty(values.value.size)
     for q, name in enumerate(fitted):
@@ -221,40 +239,50 @@ def _rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndar
     intervals = law_table.curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))
     covariance, shift = law_table.curve_errors(joint, moved)
     x = joint.x[values.places_of_curve]
+    rows, covariances = [], []
     for curve in curves:
         if curve.place < 0:
-            yield from law_table.without_law(curve)
+            rows += law_table.without_law(curve)
             continue
         one = quantities[curve.quantity]
         found = Estimate(x[curve.place], covariance[curve.place], shift[curve.place])
-        yield from law_table.law_rows(curve, found, intervals[curve.place], one.level_df)
-        yield from law_table.statistics_rows(curve, joint, one)
-        yield from law_table.covariance_rows(curve, found.covariance)
+        rows += law_table.law_rows(curve, found, intervals[curve.place], one.level_df)
+        rows += law_table.statistics_rows(curve, joint, one)
+        covariances += law_table.covariance_rows(curve, found.covariance)
+    return rows, covariances
 
 
 # ---------------------------------------------------------------- curves
-def aging_curves(aging_fit: pd.DataFrame) -> pd.DataFrame:
-    """Return table `aging_curves`: the laws of table `aging_fit` up to the last tested day, with 95 % bands.
+def aging_curves(laws: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Return table `aging_curves`: laws of series up to the last tested day, with 95 % bands.
 
-    A band is that of the population mean, from the covariance of mu_0, a and ln b.
+    `laws` are tables `aging_fit` and `aging_covariance`. A band is that of the population mean, from the
+    covariance of mu_0, a and ln b.
     """
-    tables = []
-    for series, own in aging_fit.groupby("series", sort=False) if len(aging_fit) else ():
+    tables, fit, covariance = [], laws["aging_fit"], laws["aging_covariance"]
+    of_law = dict(iter(covariance.groupby(["series", "quantity"])))
+    for series, own in fit.groupby("series", sort=False):
         known = own.set_index(["quantity", "parameter"])["value"].to_dict()
         for quantity in [quantity for quantity, parameter in known if parameter == "mu_0"]:
-            tables.append(pd.DataFrame(_curve(known, quantity)).assign(series=series, quantity=quantity))
+            curve = _curve(known, quantity, of_law.get((series, quantity)))
+            tables.append(pd.DataFrame(curve).assign(series=series, quantity=quantity))
     none = pd.DataFrame({name: np.zeros(0) for name in AGING_CURVES.names()})
     none = none.astype(dict.fromkeys(("series", "quantity"), "str"))
     return pd.concat([curve for curve in tables if len(curve)] or [none], ignore_index=True)[none.columns]
 
 
-def _curve(known: dict[tuple[str, str], float], quantity: str) -> dict[str, np.ndarray]:
-    """Return the curve of one quantity, empty without a law; `known` are values by quantity and parameter."""
+def _curve(
+    known: dict[tuple[str, str], float], quantity: str, of_law: pd.DataFrame | None
+) -> dict[str, np.ndarray]:
+    """Return the curve of one quantity, empty without a law.
+
+    `known` are values by quantity and parameter, and `of_law` the rows of the law's covariance.
+    """
     mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
     if np.isnan([mu_0, a, b]).any():
         return {}
-    covariances = {parameter: value for (kind, parameter), value in known.items() if kind == "covariance"}
-    covariance = covariance_matrix(covariances, [f"{quantity}:{name}" for name in ("mu_0", "a", "ln b")])
+    covariances = of_law.set_index(["parameter", "other"])["value"].to_dict()
+    covariance = covariance_matrix(covariances, ("mu_0", "a", "ln b"))
     t = law_table.t_of_95(known["statistics", f"{quantity}:error_df"])
     days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
     ratio = days / b

@@ -24,13 +24,13 @@ from scipy.special import fdtrc
 
 from sealfit.config import Config
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.aging import PAIRS, steady_covariance, values_of
+from sealfit.fit.aging import PAIRS, steady_covariance
 from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw, fit_laws, left_out, rivals_of
 from sealfit.fit.aging.law import Values, fit_law, law_model
 from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.search import pairs_and_shared
 from sealfit.fit.least_squares import covariance_of, even_grid
-from sealfit.fit.steady import FORCES, parameter_units, solve_conditions
+from sealfit.fit.steady import FORCES, SteadyFit, parameter_units, solve_conditions
 from sealfit.fit.steady.condition import FULL, Condition
 from sealfit.fit.steady.stribeck import search_limits
 from sealfit.fit.steady.uncertainty import UnitVariance, shifts_of
@@ -59,15 +59,16 @@ START_POINTS = 20
 # mu_s and mu_c of all conditions from the forces.
 
 
-def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> tuple[pd.DataFrame, csr_array]:
+def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataFrame, csr_array]:
     """Return mu_s and mu_c at every aged condition and the unaged rubber, and their covariance.
 
-    The table has `condition`, `quantity` (mu_s, mu_c, F_s or F_c), `value`, and the condition's columns of
-    `steady_fit`. The covariance of measurement, shape (n, n), is 0 between series before the loop.
-    `steady_fit` has the separate fits, of which only identified values are used, with `aging_days`. FitError
-    if there is no row to fit.
+    The table has `condition`, `quantity` (mu_s, mu_c, F_s or F_c), `value`, and the condition's columns. The
+    covariance of measurement, shape (n, n), is 0 between series before the loop. `steady_fit` are the
+    separate fits, of which only identified values are used, with `aging_days`. FitError if there is no row to
+    fit.
     """
-    rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["aging_days"].notna()]
+    fit = steady_fit["steady_fit"]
+    rows = fit[(fit["quantity"] == "steady") & fit["aging_days"].notna()]
     of_parameters = [name for name in STEADY_FIT.names() if name not in ("condition", "series", "rubber")]
     about = rows.drop(columns=of_parameters, errors="ignore").drop_duplicates("condition")
     known = rows[rows["identified"].to_numpy(bool) & rows["value"].notna()]
@@ -77,7 +78,8 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> tuple[pd.Da
     conditions, _, variance = solve_conditions(steady, steady_fit)
     place = {c.name: k for k, c in enumerate(conditions)}
     series = series_of_curve(about.reset_index(drop=True), aging=True)
-    known_shifts, count = values_of(steady_fit, "effect_shift"), len(shifts_of(steady))
+    count, known_shifts = len(shifts_of(steady)), steady_fit["steady_shift"]
+    known_shifts = known_shifts.set_index(["condition", "parameter", "source"])["value"].to_dict()
     tables, covariances, shifts, covered = [], [], [], set()
     for places in about.groupby(series, sort=False).indices.values():
         of = [place[name] for name in about["condition"].to_numpy(object)[places]]
@@ -88,10 +90,10 @@ def shared_levels(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> tuple[pd.Da
             covered |= {c.name for c in curve.own}
     alone = free[free["condition"].isin(set(about["condition"]) - covered)]
     keys = zip(alone["condition"], alone["quantity"], strict=True)
-    shift = [[known_shifts.get((c, f"{q}:{k + 1}"), 0.0) for k in range(count)] for c, q in keys]
+    shift = [[known_shifts.get((c, q, str(k + 1)), 0.0) for k in range(count)] for c, q in keys]
     shift = np.reshape(shift, (len(alone), count))
     # Effects are common to all conditions: their part in the separate fits' covariances is subtracted here.
-    within = steady_covariance(alone, values_of(steady_fit, "covariance"))
+    within = steady_covariance(alone, steady_fit["steady_covariance"])
     row, column = within.nonzero()
     common = csr_array(((shift[row] * shift[column]).sum(axis=1), (row, column)), shape=within.shape)
     table = pd.concat([*tables, alone], ignore_index=True)
@@ -203,7 +205,7 @@ class _Curve:
 AgedValues = Mapping[tuple[str, str], Aged]
 
 
-def aged_values(steady: pd.DataFrame, steady_fit: pd.DataFrame) -> AgedValues:
+def aged_values(steady: pd.DataFrame, steady_fit: SteadyFit) -> AgedValues:
     """Return mu_s and mu_c (F_s and F_c) of every rubber at the conditions where the forces determine them.
 
     The arguments are those of `shared_levels`.
@@ -228,13 +230,13 @@ def aged_of(rows: pd.DataFrame, *scatter) -> Aged:
 
 
 def joint_laws(
-    steady: pd.DataFrame, steady_fit: pd.DataFrame, config: Config
+    steady: pd.DataFrame, steady_fit: SteadyFit, config: Config
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions.
 
     They are fitted to the forces in table `steady`, with `steady_fit` and its condition columns.
     """
-    aging = config.aging and "aging_days" in steady_fit.columns
+    aging = config.aging and "aging_days" in steady_fit["steady_fit"].columns
     aged = aged_values(steady, steady_fit) if aging else {}
     return law_tables(aged, {q: parameter_units(config.units, q in FORCES)["mu_s"] for _, q in aged})
 
@@ -335,17 +337,18 @@ def _master_curve(law: JointLaw) -> pd.DataFrame:
 
 
 def law_of(
-    steady: pd.DataFrame, steady_fit: pd.DataFrame, quantity: str, name: str | None = None
+    steady: pd.DataFrame, steady_fit: SteadyFit, quantity: str, name: str | None = None
 ) -> list[JointLaw]:
     """Return the laws of one quantity, such as "mu_s", in order of BIC, or only a named one.
 
     RequestError if rubber is not aged, the quantity was not fitted or is not identified, there are several
     rubbers, or no such law can be fitted.
     """
-    if "aging_days" not in steady_fit.columns:
+    fit = steady_fit["steady_fit"]
+    if "aging_days" not in fit.columns:
         raise RequestError("this rig ages no rubber.", fix="Name aging_days in the config's condition.")
     values = aged_values(steady, steady_fit)
-    rows = steady_fit[(steady_fit["quantity"] == "steady") & (steady_fit["parameter"] == quantity)]
+    rows = fit[(fit["quantity"] == "steady") & (fit["parameter"] == quantity)]
     if len(rows) and quantity not in {one for _, one in values}:
         raise RequestError(
             f"{quantity} is not identified in any condition: {rows['reason'].mode()[0]}",

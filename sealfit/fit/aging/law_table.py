@@ -416,14 +416,18 @@ def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Itera
 
 
 def covariance_rows(curve: Curve, covariance: np.ndarray) -> Iterator[dict]:
-    """Return the rows with the covariance of mu_0, a and ln b, shape (3, 3)."""
+    """Return the rows of table `aging_covariance`: the covariance of mu_0, a and ln b, shape (3, 3)."""
     names, units = ("mu_0", "a", "ln b"), (curve.unit, curve.unit, "")
     for i in range(3):
         for j in range(i + 1):
-            yield table_row(
-                quantity="covariance",
-                parameter=f"{curve.quantity}:{names[j]},{curve.quantity}:{names[i]}",
-                value=covariance[j, i],
-                unit=" ".join(f"({u})" for u in (units[j], units[i]) if u),
-                identified=bool(np.isfinite(covariance[j, i])),
-            ) | {"series": curve.series}
+            known = bool(np.isfinite(covariance[j, i]))
+            yield {
+                "series": curve.series,
+                "model": "before",
+                "quantity": curve.quantity,
+                "parameter": names[j],
+                "other": names[i],
+                "value": float(covariance[j, i]) if known else np.nan,
+                "unit": " ".join(f"({u})" for u in (units[j], units[i]) if u),
+                "identified": known,
+            }

@@ -21,10 +21,9 @@ from scipy.optimize import minimize_scalar
 from scipy.special import stdtr, stdtrit
 
 from sealfit.config import Config
-from sealfit.fit.aging import SMALLEST, aging_curves, laws_of_series
+from sealfit.fit.aging import SMALLEST, LawRows, aging_curves, law_fit, laws_of_series
 from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, aged_of, law_tables, laws_of
 from sealfit.fit.aging.joint_law import Aged, JointLaw
-from sealfit.tables import AGING_FIT
 
 # Largest ratio of the variance between batches to that between specimens that is searched.
 MOST_RATIO = 1e6
@@ -178,21 +177,18 @@ def far_off(specimens: pd.DataFrame) -> pd.DataFrame:
 
 
 def fit_properties(specimens: pd.DataFrame, config: Config) -> dict[str, pd.DataFrame]:
-    """Return tables `aging_fit`, `aging_curves`, `aging_laws` and `master_curve` of table `property_values`.
+    """Return the tables of the laws of table `property_values`, for series and for all series.
 
     The config names the condition columns.
     """
-    rows, aged, units = [], {}, {}
+    series, aged, units = [], {}, {}
     for (rubber, quantity), own in specimens.groupby(["rubber", "quantity"], sort=True):
         means, units[quantity] = means_of(own), str(own["unit"].iloc[0])
-        rows += [{"rubber": rubber, **row} for row in _law_per_series(means, quantity, units[quantity])]
+        series.append((rubber, _law_per_series(means, quantity, units[quantity])))
         aged[rubber, quantity] = means.aged()
-    open_columns = [name for name in config.series_columns if name in specimens]
-    keys = specimens.groupby("series", sort=True)[open_columns].first().reset_index()
-    columns = [*AGING_FIT.names(), *open_columns]
-    fit = pd.DataFrame(rows).merge(keys, on="series", how="left").reindex(columns=columns)
+    fit = law_fit(series, specimens, config)
     laws, curve = law_tables(aged, units)
-    return {"aging_fit": fit, "aging_curves": aging_curves(fit), "aging_laws": laws, "master_curve": curve}
+    return {**fit, "aging_curves": aging_curves(fit), "aging_laws": laws, "master_curve": curve}
 
 
 def laws_of_property(specimens: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
@@ -204,7 +200,7 @@ def laws_of_property(specimens: pd.DataFrame, quantity: str, name: str | None = 
     return laws_of({pair: means_of(own).aged() for pair, own in groups}, quantity, name)
 
 
-def _law_per_series(means: Means, quantity: str, unit: str) -> list[dict]:
+def _law_per_series(means: Means, quantity: str, unit: str) -> LawRows:
     table = means.table
     days, series = table["aging_days"].to_numpy(float), table["series"]
     columns = [name for name in (TEMPERATURE, COMPRESSION) if name in table]

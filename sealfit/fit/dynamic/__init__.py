@@ -16,7 +16,7 @@ from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke
 from sealfit.fit.dynamic.presliding import Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
 from sealfit.fit.dynamic.starts import Along, Start, starts_of, strokes_along, whole_strokes
 from sealfit.fit.joint.rows import nesting_run, records
-from sealfit.fit.steady import condition_keys, parameter_units, table_row
+from sealfit.fit.steady import SteadyFit, condition_keys, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 
@@ -114,7 +114,7 @@ OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]
 def fit_dynamic(
     traces: pd.DataFrame | Sequence[StoredTraces],
     steady: pd.DataFrame,
-    steady_fit: pd.DataFrame,
+    steady_fit: SteadyFit,
     config: Config,
     *,
     workers: int = 1,
@@ -127,9 +127,8 @@ def fit_dynamic(
         Table `traces`, or its stored partitions, which are read one at a time.
     steady : DataFrame
         Table `steady` or `steady_after`; rows with `used` false are left out.
-    steady_fit : DataFrame
-        Its table `steady_fit` with the Stribeck curve of each condition; a curve that is not identified is
-        flat.
+    steady_fit : dict of DataFrame
+        Its fits, with the Stribeck curve of each condition; a curve that is not identified is flat.
     config : Config
         Names the condition columns, the units and the sensor's accuracy.
     workers : int
@@ -150,13 +149,14 @@ def fit_dynamic(
     assumes one unknown error of |force| for all samples.
     """
     steady = steady[steady["used"].astype(bool) & steady["condition"].notna()].reset_index(drop=True)
-    asked = _asked(traces, steady, steady_fit)
+    steady = steady.assign(size_N=steady["force_N"] * steady["direction"])
+    asked = _asked(traces, steady, _curves(steady, steady_fit))
     found = run_map(partial(_fit_some, config=config), asked, workers=workers)
     rows, curves, broken, largest = (_together(tables) for tables in zip(*found, strict=True))
     tables = [
         rows,
         largest_rows(largest, config) if len(largest) else largest,
-        break_away_rows(broken, _widened(steady_fit), config) if len(broken) else broken,
+        break_away_rows(broken, _widened(steady_fit["steady_fit"]), config) if len(broken) else broken,
     ]
     keys = condition_keys(steady, config)
     table = pd.concat([part for part in tables if len(part)], ignore_index=True)
@@ -167,22 +167,22 @@ def fit_dynamic(
     return {"dynamic_fit": table.astype({"direction": "Int64"}), "dynamic_curves": curves}
 
 
-# The traces of some conditions, and their rows of `steady` and `steady_fit`.
-Asked = tuple[pd.DataFrame | StoredTraces, pd.DataFrame, pd.DataFrame]
+# The traces of some conditions, their rows of `steady`, and their Stribeck curves.
+Asked = tuple[pd.DataFrame | StoredTraces, pd.DataFrame, Mapping[str, Curve]]
 
 
 def _asked(
-    traces: pd.DataFrame | Sequence[StoredTraces], steady: pd.DataFrame, steady_fit: pd.DataFrame
+    traces: pd.DataFrame | Sequence[StoredTraces], steady: pd.DataFrame, curves: Mapping[str, Curve]
 ) -> list[Asked]:
     """Return the conditions to fit, in partitions that are read together."""
     if isinstance(traces, pd.DataFrame):
-        return [(traces, steady, steady_fit)]
+        return [(traces, steady, curves)]
     piece = {condition: k for k, part in enumerate(traces) for condition in part.conditions}
-    rows = [dict(iter(table.groupby(table["condition"].map(piece)))) for table in (steady, steady_fit)]
+    rows = dict(iter(steady.groupby(steady["condition"].map(piece))))
     return [
-        (part, rows[0][k], rows[1].get(k, steady_fit.iloc[:0]))
+        (part, rows[k], {name: curves[name] for name in curves.keys() & part.conditions})
         for k, part in enumerate(traces)
-        if k in rows[0]
+        if k in rows
     ]
 
 
@@ -196,24 +196,23 @@ def _together(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
 
 def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
     """Return the rows of the fit, the mean starts, the break-aways and the largest forces of conditions."""
-    traces, steady, steady_fit = asked
+    traces, steady, curve_of = asked
     if not isinstance(traces, pd.DataFrame):
         traces = traces.read(OF_TRACES, coded=["file"])
     groups = steady.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False)
     numbers = {"group": groups.ngroup(), "file_number": pd.factorize(steady["file"])[0]}
-    table = steady.assign(size_N=steady["force_N"] * steady["direction"], **numbers).reset_index(drop=True)
+    table = steady.assign(**numbers).reset_index(drop=True)
     along = _less_effects(strokes_along(traces, table), table)
     starts = {start.row: start for start in starts_of(along)}
     wholes = {whole.row: whole for whole in whole_strokes(along)}
     begun = steady.iloc[list(starts)]
     table.loc[list(starts), "run_number"] = pd.factorize(nesting_run(begun, records(begun)))[0]
-    fitted = _fitted(steady_fit)
     tables = [[], [], [], []]
     for name, own in table.sort_values("group", kind="stable").groupby("condition", sort=True):
         start, whole = (
             [parts[row] for row in own.index.tolist() if row in parts] for parts in (starts, wholes)
         )
-        curve = _curve(name, fitted, own)
+        curve = curve_of[name]
         of_starts = own.loc[[one.row for one in start]]
         braked = bool((of_starts["size_N"] > 0).all())  # as the model needs
         found = fit_stiffness(_evidence(start, of_starts, curve), curve) if braked else None
@@ -284,22 +283,28 @@ def _numbered(numbers: np.ndarray) -> np.ndarray:
     return numbers if (numbers != numbers[:1]).any() else np.arange(len(numbers))
 
 
-# Values of table `steady_fit` by parameter, of each condition and quantity.
-Known = Mapping[tuple[str, str], Mapping[str, float]]
+def _curves(steady: pd.DataFrame, steady_fit: SteadyFit) -> dict[str, Curve]:
+    """Return the Stribeck curve of each condition in `steady`, from its identified parameters."""
+    fit, covariance = steady_fit["steady_fit"], steady_fit["steady_covariance"]
+    known = fit[fit["identified"].to_numpy(bool)].groupby("condition")
+    values = {name: dict(zip(own["parameter"], own["value"], strict=True)) for name, own in known}
+    covariances = {
+        name: own.set_index(["parameter", "other"])["value"].to_dict()
+        for name, own in covariance.groupby("condition")
+    }
+    return {
+        name: _curve(values.get(name, {}), covariances.get(name, {}), own)
+        for name, own in steady.groupby("condition")
+    }
 
 
-def _fitted(steady_fit: pd.DataFrame) -> Known:
-    """Return the values of table `steady_fit`, of parameters only identified ones."""
-    rows = steady_fit[steady_fit["identified"].to_numpy(bool) | (steady_fit["quantity"] != "steady")]
-    groups = rows.groupby(["condition", "quantity"], sort=False)
-    return {key: dict(zip(own["parameter"], own["value"].tolist(), strict=True)) for key, own in groups}
+def _curve(
+    values: Mapping[str, float], covariances: Mapping[tuple[str, str], float], steady: pd.DataFrame
+) -> Curve:
+    """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified.
 
-
-def _curve(condition: str, fitted: Known, steady: pd.DataFrame) -> Curve:
-    """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified."""
-    values, covariances, statistics = (
-        fitted.get((condition, quantity), {}) for quantity in ("steady", "covariance", "statistics")
-    )
+    `values` are identified parameters and statistics by name, `covariances` those of pairs of parameters.
+    """
     load = steady["load_N"].mean(skipna=False)
     sigma_2 = max(float(values.get("sigma_2", 0.0)), 0.0)
     for static, coulomb, factor in (("mu_s", "mu_c", load), ("F_s", "F_c", 1.0)):
@@ -308,8 +313,6 @@ def _curve(condition: str, fitted: Known, steady: pd.DataFrame) -> Curve:
             unit = np.array([factor, factor, 1.0, 1.0])
             covariance = covariance_matrix(covariances, (static, coulomb, "v_s", "sigma_2"))
             parameters = unit * [*known, sigma_2]
-            return Curve(
-                *parameters.tolist(), covariance * np.outer(unit, unit), int(statistics.get("df", 1))
-            )
+            return Curve(*parameters.tolist(), covariance * np.outer(unit, unit), int(values.get("df", 1)))
     flat = float(np.median(steady["size_N"] - sigma_2 * steady["speed_mm_s"].abs()))
     return Curve(flat, flat, np.inf, sigma_2)

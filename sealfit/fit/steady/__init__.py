@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +33,7 @@ from sealfit.fit.steady.uncertainty import (
 )
 from sealfit.ingest.columns import condition_columns
 from sealfit.ingest.scatter import Scatter, repeat_scatter
-from sealfit.tables import STEADY_FIT
+from sealfit.tables import STEADY_COVARIANCE, STEADY_FIT, STEADY_SHIFT, Schema
 from sealfit.units import Units
 
 # Level of the test for lack of fit.
@@ -46,7 +46,11 @@ NUMBERS = ("value", "se", "lo95", "hi95", "u_sys")
 FORCES = {"mu_s": "F_s", "mu_c": "F_c"}
 
 
-def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
+# Tables of the fit of conditions, by name.
+SteadyFit = Mapping[str, pd.DataFrame]
+
+
+def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
     r"""Fit Eq. 14 to every condition, and mark the parameters that its speeds determine.
 
     .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
@@ -64,13 +68,13 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     Returns
     -------
-    DataFrame
-        Table `steady_fit` plus the condition columns. `quantity` is "steady" (one row per parameter),
-        "statistics", "covariance" (`parameter` "mu_s,mu_c": type A, for the aging fit), "sensor_shift"
-        (change of the parameter if the sensor reads every |force| one standard uncertainty too high; `u_sys`
-        is its magnitude) or, if effects were subtracted from the forces, "effect_shift" (`parameter`
-        "mu_s:1": change along each principal direction of the effects' uncertainty; it is included in the
-        covariance and the intervals, and common to all conditions).
+    dict of DataFrame
+        Tables `steady_fit`, `steady_covariance` and `steady_shift`, with the condition columns. In
+        `steady_fit` `quantity` is "steady" (one row per parameter) or "statistics". In `steady_shift`
+        `source` is "sensor" (change of the parameter if the sensor reads every |force| one standard
+        uncertainty too high; `u_sys` is its magnitude) or, if effects were subtracted from the forces, the
+        number of a principal direction of the effects' uncertainty, from 1 (it is included in the covariance
+        and the intervals, and common to all conditions).
 
     Raises
     ------
@@ -88,31 +92,36 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     for start in range(0, len(conditions), BLOCK):
         block = slice(start, start + BLOCK)
         bound(conditions[block], variance.at(block).rise())
-    rows = [
-        {"condition": c.name, **row}
-        for k, c in enumerate(conditions)
-        for row in _rows(c, variance.at(k), scatter, config)
-    ]
-    table = pd.DataFrame(rows).merge(keys, on="condition", how="left", validate="many_to_one")
-    fixed = STEADY_FIT.names()
-    return table[[*fixed, *(name for name in keys.columns if name not in fixed)]]
+    rows = {schema: [] for schema in (STEADY_FIT, STEADY_COVARIANCE, STEADY_SHIFT)}
+    for k, c in enumerate(conditions):
+        for schema, row in _rows(c, variance.at(k), scatter, config):
+            rows[schema].append({"condition": c.name, **row})
+    others = [name for name in keys.columns if name not in STEADY_FIT.names()]
+    found = {}
+    for schema, own in rows.items():
+        columns = [name for name in schema.names() if name == "condition" or name not in keys]
+        table = pd.DataFrame(own, columns=columns)
+        table = table.merge(keys, on="condition", how="left", validate="many_to_one")
+        found[schema.name] = table[[*schema.names(), *others]]
+    return found
 
 
 def solve_conditions(
-    steady: pd.DataFrame, fitted: pd.DataFrame | None = None
+    steady: pd.DataFrame, fitted: SteadyFit | None = None
 ) -> tuple[list[Condition], Scatter, UnitVariance]:
     """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
 
     A Stribeck curve that does not differ significantly from a straight line is dropped. With repeats, which
-    determine the weights, the estimates of `fitted`, the table `steady_fit` of these rows, are used, and
-    nothing is fitted again. FitError if there is no row to fit.
+    determine the weights, the estimates of `fitted`, the fit of these rows, are used, and nothing is fitted
+    again. FitError if there is no row to fit.
     """
     runs = run_means(steady)
     scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
     runs = runs.assign(weight=run_weights(runs, scatter))
     conditions = [make_condition(name, own) for name, own in runs.groupby("condition", sort=True)]
     if fitted is not None and scatter.df > 0:
-        rows = fitted[(fitted["quantity"] == "steady") & fitted["value"].notna()]
+        rows = fitted["steady_fit"]
+        rows = rows[(rows["quantity"] == "steady") & rows["value"].notna()]
         known = rows.groupby("condition")["value"].agg(np.array)  # in the order of NAMES
         for condition in conditions:
             condition.take(known[condition.name])
@@ -158,7 +167,10 @@ def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
 
 # ---------------------------------------------------------------- table
-def _rows(condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config) -> Iterator[dict]:
+def _rows(
+    condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config
+) -> Iterator[tuple[Schema, dict]]:
+    """Yield the rows of a condition, each with the table it belongs to."""
     unit_of = parameter_units(config.units, condition.has_load)
     fitted = condition.jacobian(), condition.arrays[-1], condition.values, condition.names
     covariance, shift = linearised(*fitted)
@@ -181,23 +193,21 @@ def _rows(condition: Condition, variance: UnitVariance, scatter: Scatter, config
             stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0
             row |= {"value": condition.values[j], "se": None if stuck else np.sqrt(covariance[j, j])}
             row |= {"lo95": None if open_below else low, "hi95": high, "u_sys": abs(shift[j])}
-        yield table_row(quantity="steady", parameter=spelled[name], unit=unit_of[name], **row)
-    yield from _statistics(condition, variance, scatter, config)
+        row |= {"quantity": "steady", "parameter": spelled[name], "unit": unit_of[name]}
+        yield STEADY_FIT, table_row(**row)
+    for row in _statistics(condition, variance, scatter, config):
+        yield STEADY_FIT, row
     for i, one in enumerate(condition.names if np.isfinite(variance.value) else ()):
         for j, other in enumerate(condition.names[: i + 1]):
-            yield table_row(
-                quantity="covariance",
-                parameter=f"{spelled[other]},{spelled[one]}",
-                value=covariance[i, j],
-                unit=_product(unit_of[other], unit_of[one]),
-                identified=judged[one][0] and judged[other][0],
-            )
+            row = {"model": "before", "parameter": spelled[other], "other": spelled[one]}
+            row |= {"value": covariance[i, j] if np.isfinite(covariance[i, j]) else np.nan}
+            row |= {"unit": _product(unit_of[other], unit_of[one])}
+            yield STEADY_COVARIANCE, row | {"identified": judged[one][0] and judged[other][0]}
     for j, name in enumerate(condition.names):
-        row = {"unit": unit_of[name], "identified": judged[name][0]}
-        yield table_row(quantity="sensor_shift", parameter=spelled[name], value=shift[j], **row)
-        for number, moved in enumerate(effects[j], start=1):
-            parameter = f"{spelled[name]}:{number}"
-            yield table_row(quantity="effect_shift", parameter=parameter, value=moved, **row)
+        row = {"model": "before", "parameter": spelled[name], "unit": unit_of[name]}
+        row["identified"] = judged[name][0]
+        for source, value in (("sensor", shift[j]), *enumerate(effects[j], start=1)):
+            yield STEADY_SHIFT, {**row, "source": str(source), "value": value}
 
 
 def _widened(value: float, low: float, high: float, reach: float) -> tuple[float, float]:
