@@ -16,10 +16,10 @@ from scipy.interpolate import BSpline
 from sealfit.closure import criteria
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
-from sealfit.fit.joint.declared import SAME_SPEED
 from sealfit.fit.joint.rows import ALONG, LEVELS, POWER, Rows, one_load, open_columns
 from sealfit.ingest.columns import force_inputs
 from sealfit.ingest.quality import STILL_RISING
+from sealfit.ingest.strokes import SPEEDS_APART
 from sealfit.tables import CALENDAR
 
 FINER = {level: k for k, level in enumerate(("sample", *LEVELS))}
@@ -115,7 +115,7 @@ def find_channels(
 def _one_setting(name: str, values: np.ndarray) -> bool:
     """Whether the speeds or loads of a campaign, shape (n,), are one setting."""
     if name == "speed_mm_s":
-        return bool(values.max() <= SAME_SPEED * values.min())
+        return bool(values.max() <= SPEEDS_APART * values.min())
     return name == "load_N" and one_load(values)
 
 

@@ -12,8 +12,9 @@ from sealfit.closure import criteria
 from sealfit.closure.channels import level_values, settings
 from sealfit.fit.joint import Fitted, fit, fit_declared, fitted_at
 from sealfit.fit.joint.declared import has_law
-from sealfit.fit.joint.rows import LEVELS, POWER, SAME_SPEED, Rows, sliding_power
+from sealfit.fit.joint.rows import LEVELS, POWER, Rows, sliding_power
 from sealfit.fit.joint.search import search_nonlinear
+from sealfit.ingest.strokes import SPEEDS_APART
 
 # A file is tried if its residual in the fit to all files has a p-value below this, times the number of files.
 SCREEN_P = 0.05
@@ -143,7 +144,7 @@ def _like_others_of_its_speed(fitted: Fitted, number: int) -> bool:
     )
     speed = groups.means(np.abs(fitted.rows.speed), "file")
     ratio = speed / speed[number]
-    same = np.maximum(ratio, 1 / ratio) < SAME_SPEED
+    same = np.maximum(ratio, 1 / ratio) < SPEEDS_APART
     same[number] = False
     others = relative[same]
     if others.size < LEAST_OF_SPEED:

@@ -37,7 +37,8 @@ MOST_OFF_SPEED = 0.3
 FEWEST_SAMPLES = 10
 # Share of a turn below which what comes before the first or after the last whole turn is no turn of its own.
 PART_OF_TURN = 0.05
-# Ratio of two steady speeds of strokes of one file; those of one speed differ by far less.
+# Ratio of measured speeds from which they are two settings. The speed of rigs without speed control varies by
+# nearly so much.
 SPEEDS_APART = 1.25
 
 
@@ -255,15 +256,21 @@ def several_speeds(speeds: Sequence[float]) -> list[float]:
 
 
 def _several(speeds: list[float]) -> list[float]:
-    groups: list[list[float]] = []  # that differ by a quarter or more, the slowest first
-    for speed in sorted(speeds):
-        if not groups or speed > SPEEDS_APART * groups[-1][0]:
-            groups.append([])
-        groups[-1].append(speed)
+    groups = speed_clusters(np.sort(speeds))
     own = all(len(group) == 1 for group in groups)
     kept = groups if own else [group for group in groups if len(group) > 1]
     apart = all(a[-1] * SPEEDS_APART < b[0] for a, b in pairwise(kept))
-    return [group[0] for group in kept] if len(kept) > 1 and apart else []
+    return [float(group[0]) for group in kept] if len(kept) > 1 and apart else []
+
+
+def speed_clusters(speeds: np.ndarray) -> list[np.ndarray]:
+    """Return clusters of sorted positive speeds, each within `SPEEDS_APART` of its slowest."""
+    cuts, base = [], 0.0
+    for place, speed in enumerate(speeds):
+        if speed > SPEEDS_APART * base:
+            base = speed
+            cuts.append(place)
+    return np.split(speeds, cuts[1:]) if len(speeds) else []
 
 
 def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strokes) -> Stroke:

@@ -9,10 +9,11 @@ from sealfit.closure.left_out import between_speeds
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
 from sealfit.fit.joint import _searched, fit, fit_declared
-from sealfit.fit.joint.declared import declare, speed_clusters
+from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
 from sealfit.fit.joint.rows import make_rows, set_speeds, thin
 from sealfit.fit.joint.search import start_model
+from sealfit.ingest.strokes import speed_clusters
 
 WAVE = Effect(
     id="wave",

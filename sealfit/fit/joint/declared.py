@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import fdtrc
 
-from sealfit.fit.joint.rows import SAME_SPEED, Rows
+from sealfit.fit.joint.rows import Rows
+from sealfit.ingest.strokes import speed_clusters
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
 # Number of tested speeds that a Stribeck curve needs. With sigma_2 >= 0 three speeds determine it at these
@@ -242,13 +243,3 @@ def tested_speeds(rows: Rows, chosen: np.ndarray) -> np.ndarray:
     _, stroke = np.unique(rows.codes("stroke")[chosen], return_inverse=True)
     means = np.sort(np.bincount(stroke, np.abs(rows.speed[chosen])) / np.bincount(stroke))
     return np.array([part.mean() for part in speed_clusters(means)])
-
-
-def speed_clusters(speeds: np.ndarray) -> list[np.ndarray]:
-    """Return clusters of sorted positive speeds, each within 25 % of its slowest."""
-    cuts, base = [], 0.0
-    for place, speed in enumerate(speeds):
-        if place == 0 or speed > SAME_SPEED * base:
-            base = speed
-            cuts.append(place)
-    return np.split(speeds, cuts[1:]) if speeds.size else []

@@ -11,6 +11,7 @@ import pandas as pd
 from scipy.sparse import csr_array
 
 from sealfit.ingest.quality import LEAST_KNOWN, NO_VALUE
+from sealfit.ingest.strokes import SPEEDS_APART
 from sealfit.tables import BINS
 
 
@@ -70,9 +71,6 @@ class Groups:
 
 # `direction` of a row that is the mean of both directions.
 BOTH_DIRECTIONS = 0
-# Measured speeds within this ratio are one setting. The speed of rigs without speed control varies by so
-# much.
-SAME_SPEED = 1.25
 
 KEYS = ["file", "run_id"]
 # How a run of a file with both directions, or with several steady speeds in a stroke, ends.
@@ -96,7 +94,7 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     extent = pd.DataFrame({"file": record, "run": run, "direction": rows["direction"], "pace": pace})
     grouped = extent.groupby(["file", "run"])
     merged = grouped["direction"].transform("nunique").eq(2)
-    merged &= grouped["pace"].transform("max") <= SAME_SPEED * grouped["pace"].transform("min")
+    merged &= grouped["pace"].transform("max") <= SPEEDS_APART * grouped["pace"].transform("min")
     merged = merged.groupby(run).transform("all")
     if not merged.any():
         return rows

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from sealfit.fit.joint.declared import SAME_SPEED, JointParameter, declare
+from sealfit.fit.joint.declared import JointParameter, declare
 from sealfit.fit.joint.model import Model, evaluate, loads_of
 from sealfit.fit.joint.prior import centre_of, precision_of
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.joint.whitening import Scatter, Whitening
+from sealfit.ingest.strokes import SPEEDS_APART
 
 # Number of grid values of v_s.
 GRID = 80
@@ -166,7 +167,7 @@ def stribeck_range(speeds: np.ndarray) -> tuple[float, float]:
     v_s).
     """
     positive = np.sort(speeds[speeds > 0])
-    above = positive[positive > SAME_SPEED * positive[0]]
+    above = positive[positive > SPEEDS_APART * positive[0]]
     second = above[0] if above.size else positive[0]
     return float(second / 2), float(positive[-1])
 

@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from sealfit.fit.joint.declared import speed_clusters
 from sealfit.fit.least_squares import project
 from sealfit.fit.steady import stribeck
 from sealfit.fit.steady.stribeck import NAMES, StribeckFit
 from sealfit.fit.steady.uncertainty import shifts_of, speed_levels
+from sealfit.ingest.strokes import speed_clusters
 from sealfit.physics import stribeck_force
 
 # Number of speed levels within one direction that each model needs.

@@ -16,9 +16,9 @@ import pandas as pd
 from scipy.special import fdtrc, stdtrit
 
 from sealfit.errors import FitError
-from sealfit.fit.joint.declared import speed_clusters
 from sealfit.fit.joint.rows import BOTH_DIRECTIONS, merge_directions
 from sealfit.ingest.scatter import Scatter
+from sealfit.ingest.strokes import speed_clusters
 
 # Level of the preliminary test for set-up scatter (Bancroft 1944). A level of 5 % would miss it too often.
 POOLING_P = 0.25
