@@ -209,16 +209,6 @@ def test_a_turned_sign_is_remarked(campaign):
     assert "16 runs have a force along the motion" in row.reason
 
 
-def test_an_offset_between_the_directions_is_remarked(campaign):
-    weak = TRUTH | {"mu_s": 0.47}
-    table = campaign(days=(0,), model=weak, repeats=1)
-    fits = fit_conditions(table.assign(force_N=table.force_N - 3.0), Config())
-    assert "offset of -2.98 N" in statistic(fits, "lack_of_fit_p").reason
-    assert "may hide a curve" in steady(fits, "v_s").reason
-    clean = fit_conditions(table, Config())
-    assert "offset" not in " ".join(clean["steady_fit"].reason)
-
-
 # ---------------------------------------------------------------- units, load, sensor, repeats
 def test_without_load_forces_are_fitted_in_the_true_unit(campaign):
     config = Config(

@@ -82,11 +82,10 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
 
     Other rows are unchanged. The magnitude of the force is averaged over the two directions, so that an
     offset between them cancels. Gain and set-up of a file are common to both directions, which are therefore
-    not independent. `half_N`, half of the difference between the directions, is added (NaN in other rows). In
-    a merged row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
+    not independent. In a merged row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id`
+    has no sign.
     """
-    rows = steady.assign(half_N=np.nan)
-    record = records(rows)
+    rows, record = steady, records(steady)
     run = rows["run_id"].where(nesting_run(rows, record) == rows["run_id"], rows["run_id"].str.rstrip("+-"))
     pace = rows["speed_mm_s"].abs()
     if "speed_set_mm_s" in rows.columns:
@@ -102,10 +101,9 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     own = rows.assign(run_id=run, file=record, **size)[merged]
     numbers = [c for c in own.columns if pd.api.types.is_float_dtype(own[c])]
     directions = own.groupby([*KEYS, "direction"], sort=False)[numbers].mean()
-    force = directions["force_N"].unstack("direction")
     means = own.drop(columns=numbers).groupby(KEYS, sort=False).first()
     means[numbers] = directions.groupby(level=KEYS, sort=False).mean()
-    means = means.assign(direction=BOTH_DIRECTIONS, half_N=(force[1] - force[-1]) / 2)
+    means = means.assign(direction=BOTH_DIRECTIONS)
     return pd.concat([rows[~merged], means.reset_index()[list(rows.columns)]], ignore_index=True)
 
 

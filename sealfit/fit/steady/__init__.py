@@ -230,9 +230,6 @@ def _statistics(
             "scatter between runs, or something the model lacks); "
             f"intervals are widened {np.sqrt(variance.value):.2g} times."
         )
-    offset = condition.offset()
-    if offset:
-        lack += f" The two directions differ: offset of {offset:.3g} {force_unit}, in no declared model."
     if condition.left_out:
         lack += f" {condition.left_out} runs without load were left out of the fit."
     own = no_repeats or ("own" if variance.own else "pooled")

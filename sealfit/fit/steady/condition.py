@@ -19,8 +19,6 @@ from sealfit.physics import stribeck_force
 FULL, VISCOUS, CONSTANT = 4, 2, 1
 # Level of the test for a Stribeck curve.
 SIGNIFICANT = 0.05
-# Remark on a condition without a Stribeck curve whose directions differ.
-HIDDEN = "The offset between the two directions counts as scatter here and may hide a curve; see close-loop."
 # Parameters of each model.
 COLUMNS = {FULL: NAMES, VISCOUS: ("mu_c", "sigma_2"), CONSTANT: ("mu_c",)}
 
@@ -89,24 +87,6 @@ class Condition:
             return self.columns() @ self.values
         mu_s, mu_c, v_s, sigma_2 = self.values
         return stribeck_force(speed, load, mu_s=mu_s, mu_c=mu_c, v_s=v_s, sigma_2=sigma_2)
-
-    def offset(self) -> float:
-        """Half the difference between the residuals of the directions if above 4 standard errors, else 0.
-
-        The declared model has no offset, but it widens the intervals and can mask a Stribeck curve.
-        """
-        rest = self.runs["force"].to_numpy(float) - self.model_force()
-        direction = self.runs["direction"].to_numpy()
-        one, other = rest[direction > 0], rest[direction < 0]
-        halves = self.runs["half"].dropna().to_numpy(float)
-        if min(len(one), len(other)) >= 3:
-            half = (one.mean() - other.mean()) / 2
-            error = np.sqrt(one.var(ddof=1) / len(one) + other.var(ddof=1) / len(other)) / 2
-        elif len(halves) >= 3:
-            half, error = halves.mean(), halves.std(ddof=1) / np.sqrt(len(halves))
-        else:
-            return 0.0
-        return float(half) if abs(half) > 4 * error else 0.0
 
     @property
     def speeds(self) -> int:
@@ -288,8 +268,6 @@ def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
             "v_s": (False, f"{flat}, so v_s has no meaning."),
         }
         verdict["mu_c"] = (True, "of the fit without Stribeck curve; mu_s = mu_c is not rejected.")
-        if condition.offset():
-            verdict |= {name: (verdict[name][0], f"{verdict[name][1]} {HIDDEN}") for name in NAMES[:3]}
     elif condition.low is None:
         unknown = "as many parameters as runs and no repeats: nothing shows how far to trust it."
         verdict |= {name: (False, unknown) for name in NAMES}

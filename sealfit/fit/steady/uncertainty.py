@@ -42,9 +42,8 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
 
     Rows of table `steady` with `used` false are left out. The two directions of a file are merged. The
     columns are `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown),
-    `load` (NaN where unknown), `force` (F sgn v), `half` (half of the difference between the directions in a
-    merged row) and `files`, sorted by the first three; and the columns of `SHIFT`. FitError if a column is
-    missing, no row is used, or a run has speed 0.
+    `load` (NaN where unknown), `force` (F sgn v) and `files`, sorted by the first three; and the columns of
+    `SHIFT`. FitError if a column is missing, no row is used, or a run has speed 0.
     """
     missing = [name for name in NEEDED if name not in steady.columns]
     if missing:
@@ -65,7 +64,6 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
             "load": rows["load_N"].astype(float),
             "force": rows["force_N"].astype(float)
             * rows["direction"].astype(int).replace(BOTH_DIRECTIONS, 1),
-            "half": rows["half_N"],
             **{name: rows[name].astype(float) for name in shifts_of(rows)},
         }
     )
