@@ -32,17 +32,15 @@ def levenberg_marquardt(
     start: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
-    *,
-    damping: float = DAMPING,
     linear: Linear | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the local least-squares optima from starting points, (problems, p), and their sums of squares.
 
     `evaluate(x, rows)` returns weighted residuals, shape (r, n), and their derivatives, shape (r, p, n), of
     the problems `rows`, shape (r,), at x, shape (r, p). Starts are moved inside the closed bounds, shape (p,)
-    or (problems, p), which are infinite for none and equal for a fixed parameter. `damping` is that of the
-    first step, small for starts close to the optimum. `linear` has the products of the derivatives, if they
-    are not arrays. A sum of squares is infinite if the residual is not finite at the start.
+    or (problems, p), which are infinite for none and equal for a fixed parameter. `linear` has the products
+    of the derivatives, if they are not arrays. A sum of squares is infinite if the residual is not finite at
+    the start.
 
     The scale of each parameter is the largest norm of its column so far (More 1978, Lecture Notes in
     Mathematics 630, 105-116). The damped step is computed by singular values, more accurately than by normal
@@ -51,7 +49,7 @@ def levenberg_marquardt(
     linear = linear or Linear()
     low, high = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
     x, todo = np.clip(start, low, high), np.arange(len(start))
-    damping = np.full(len(x), damping)
+    damping = np.full(len(x), DAMPING)
     length = np.full(len(x), np.inf)  # of the last step, in standard errors
     scale = np.zeros(x.shape)
     with np.errstate(all="ignore"):  # a trial step that overflows is rejected
@@ -164,10 +162,6 @@ CHUNK = 2_000_000
 CLOSE = 1e-9
 # Largest number of steps of this search.
 MOST_STEPS = 60
-# Damping of the final steps, which start from a minimum that is known to half of its digits.
-LEAST_DAMPING = 1e-15
-# Steps of the nonlinear parameter for a numerical derivative of fourth order.
-STEPS_OF_DERIVATIVE = 1e-3 * np.array([-2, -1, 0, 1, 2])
 
 
 def solve_kept(gram, moment, keep):
@@ -315,8 +309,6 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     bracket = tuple(grid[problem, k + step] for step in range(3))
     stops = {"xatol": CLOSE, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
     valley = find_minimum(rss_at, bracket, args=(problem,), tolerances=stops, maxiter=MOST_STEPS).x
-    start = np.column_stack([solved(valley, problem)[1][:, 0], valley])
-    valley = _to_all_digits(problems.some(problem), start, grid[problem][:, [0, -1]])
     every = np.arange(len(problems.y))
     problem = np.concatenate([problem, every])
     u = np.concatenate([valley, grid[every, np.argmin(rss, axis=1)]])
@@ -324,26 +316,6 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     order = np.lexsort([rss, problem])
     best = order[np.unique(problem[order], return_index=True)[1]]
     return BatchFit(u[best], coefficients[best], rss[best])
-
-
-def _to_all_digits(problems: Separable, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Return the nonlinear parameters at full accuracy, (r,), from starts near the optimum, (r, p + 1).
-
-    A search by the sum of squares alone gives only half of the digits.
-    """
-    root = np.sqrt(problems.weight)
-
-    def evaluate(x, own):
-        columns = problems.basis(x[:, -1:] + STEPS_OF_DERIVATIVE, own) * root[own][:, None, :, None]
-        below2, below, here, above, above2 = np.moveaxis(np.einsum("rgnp,rp->rgn", columns, x[:, :-1]), 1, 0)
-        along = (below2 - 8 * below + 8 * above - above2) / (12 * STEPS_OF_DERIVATIVE[-2])
-        slope = np.concatenate([np.swapaxes(columns[:, 2], 1, 2), along[:, None]], axis=1)
-        return here - problems.y[own] * root[own], slope
-
-    linear = np.tile(np.where(problems.nonnegative, 0.0, -np.inf), (len(start), 1))
-    low = np.column_stack([linear, ends[:, 0]])
-    high = np.column_stack([np.full(linear.shape, np.inf), ends[:, 1]])
-    return levenberg_marquardt(evaluate, start, low, high, damping=LEAST_DAMPING)[0][:, -1]
 
 
 def even_grid(low, high, per_decade: int) -> np.ndarray:

@@ -101,7 +101,8 @@ def test_the_stribeck_speed_does_not_depend_on_the_unit_of_force():
     inner = (fit.limits[0] < np.log(fit.values[:, 2])) & (np.log(fit.values[:, 2]) < fit.limits[1])
     assert inner.mean() > 0.9
     fine = solve_stribeck(SPEEDS, LOAD, 10 * force, weight / 100)  # the same problems, other rounding
-    npt.assert_allclose(fine.values[inner, 2], fit.values[inner, 2], rtol=1e-7)
+    # Half of the digits of a sum of squares, and fewer where its minimum is flat.
+    npt.assert_allclose(fine.values[inner, 2], fit.values[inner, 2], rtol=1e-5)
 
 
 def test_padding_and_company_change_nothing():
