@@ -12,8 +12,15 @@ import pandas as pd
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.fit import covariance_matrix
-from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke
-from sealfit.fit.dynamic.presliding import Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
+from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke, over_strokes
+from sealfit.fit.dynamic.presliding import (
+    AT,
+    Stiffness,
+    break_away_rows,
+    fit_stiffness,
+    largest_rows,
+    peaks,
+)
 from sealfit.fit.dynamic.starts import Along, Start, starts_of, strokes_along, whole_strokes
 from sealfit.fit.joint.rows import nesting_run, records
 from sealfit.fit.steady import SteadyFit, condition_keys, parameter_units, table_row
@@ -199,30 +206,32 @@ def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
     traces, steady, curve_of = asked
     if not isinstance(traces, pd.DataFrame):
         traces = traces.read(OF_TRACES, coded=["file"])
-    groups = steady.groupby(["condition", "speed_set_mm_s", "direction"], dropna=False)
-    numbers = {"group": groups.ngroup(), "file_number": pd.factorize(steady["file"])[0]}
-    table = steady.assign(**numbers).reset_index(drop=True)
+    file = pd.factorize(steady["file"])[0]
+    table = steady.assign(file_number=file).reset_index(drop=True)
     along = _less_effects(strokes_along(traces, table), table)
     starts = {start.row: start for start in starts_of(along)}
     wholes = {whole.row: whole for whole in whole_strokes(along)}
     begun = steady.iloc[list(starts)]
     table.loc[list(starts), "run_number"] = pd.factorize(nesting_run(begun, records(begun)))[0]
     tables = [[], [], [], []]
-    for name, own in table.sort_values("group", kind="stable").groupby("condition", sort=True):
-        start, whole = (
-            [parts[row] for row in own.index.tolist() if row in parts] for parts in (starts, wholes)
-        )
-        curve = curve_of[name]
-        of_starts = own.loc[[one.row for one in start]]
+    for name, own in table.sort_values(AT, kind="stable").groupby("condition", sort=True):
+        of_starts = own[own.index.isin(starts.keys())]
+        start, curve = [starts[row] for row in of_starts.index], curve_of[name]
         braked = bool((of_starts["size_N"] > 0).all())  # as the model needs
         found = fit_stiffness(_evidence(start, of_starts, curve), curve) if braked else None
-        models = found.forces_N if found is not None and found.seen else None
-        made = [pd.DataFrame(bristle_rows(found, curve, config, braked=braked))]
-        cells = Cells(start, table) if start else None
-        made += [_mean_starts(cells, models), peaks(cells)] if start else [pd.DataFrame(), pd.DataFrame()]
-        made.append(peaks(Cells(whole, table)) if whole else pd.DataFrame())
-        for kept, one in zip(tables, made, strict=True):
-            kept.append(one.assign(condition=name))
+        seen = found is not None and found.seen
+        models = dict(zip(of_starts.index, found.forces_N, strict=True)) if seen else {}
+        rows = pd.DataFrame(bristle_rows(found, curve, config, braked=braked))
+        tables[0].append(rows.assign(condition=name))
+        for key, group in own.groupby(AT, dropna=False, sort=False):
+            at = dict(zip(AT, key, strict=True))
+            begun, ran = ([parts[row] for row in group.index if row in parts] for parts in (starts, wholes))
+            if begun:
+                fitted = [models[part.row] for part in begun] if seen else None
+                tables[1].append(_mean_start(Cells(begun), fitted).assign(**at))
+                tables[2].append(peaks(Cells(begun), file).assign(**at))
+            if ran:
+                tables[3].append(peaks(Cells(ran), file).assign(**at))
     return [_together(parts) for parts in tables]
 
 
@@ -234,10 +243,10 @@ def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Al
     return [replace(stroke, force_N=stroke.force_N - size[stroke.row]) for stroke in strokes]
 
 
-def _mean_starts(cells: Cells, models: Sequence[np.ndarray] | None) -> pd.DataFrame:
-    """Return the mean starts, measured and, if there is a fit, modelled, as table `dynamic_curves`."""
-    force, error, n = cells.over_strokes(cells.force_N)
-    model = cells.over_strokes(cells.means(models))[0] if models else np.full(n.shape, np.nan)
+def _mean_start(cells: Cells, models: Sequence[np.ndarray] | None) -> pd.DataFrame:
+    """Return the mean start, measured and, if there is a fit, modelled, as rows of `dynamic_curves`."""
+    force, error, n = over_strokes(cells.force_N)
+    model = over_strokes(cells.means(models))[0] if models else np.full(n.shape, np.nan)
     table = {
         "distance_mm": cells.middle_mm,
         "force_N": force,
@@ -245,9 +254,7 @@ def _mean_starts(cells: Cells, models: Sequence[np.ndarray] | None) -> pd.DataFr
         "n": n,
         "model_N": model,
     }
-    group, cell = np.nonzero(n > 0)
-    at = cells.at.iloc[group].reset_index(drop=True)
-    return at.assign(**{name: values[group, cell] for name, values in table.items()})
+    return pd.DataFrame(table)[n > 0]
 
 
 def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:

@@ -7,10 +7,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-import pandas as pd
 
 from sealfit.fit.dynamic.starts import LEAST, Part
-from sealfit.ingest.segments import Pieces
 from sealfit.ingest.stored_parts import noise_from_bends
 from sealfit.physics import bristle_limit
 
@@ -19,74 +17,41 @@ MOST_CELLS = 200
 
 
 class Cells:
-    """Cells of distance for strokes of one condition, in groups of one commanded speed and direction.
+    """Cells of distance for strokes of one condition, commanded speed and direction.
 
-    `table` has the group of each stroke, by the row of its part; the strokes of a group are adjacent. `at`
-    has the speed and direction of the groups, and `file` the number of each stroke's file.
-
-    The cells of a group extend to the median distance of its strokes, `reach_mm`, shape (groups,). Their
-    number, `count`, is the median number of samples of a stroke, `samples`, at most MOST_CELLS. Arrays are
-    padded to the largest number of cells; `middle_mm`, shape (groups, cells), is the midpoint of each.
+    They extend to the median distance of the strokes, `reach_mm`. Their number, `count`, is the median number
+    of samples of a stroke, `samples`, at most MOST_CELLS; `middle_mm`, shape (cells,), are their midpoints.
     """
 
-    def __init__(self, parts: Sequence[Part], table: pd.DataFrame) -> None:
+    def __init__(self, parts: Sequence[Part]) -> None:
         self.parts = parts
-        own = table.loc[[part.row for part in parts]]
-        self.groups = Pieces(np.unique(own["group"], return_counts=True)[1])
-        self.file = own["file_number"].to_numpy()
-        self.at = own[["speed_set_mm_s", "direction"]].iloc[self.groups.start].reset_index(drop=True)
-        self._size = np.array([part.force_N.size for part in parts])
-        reach = np.array([part.distance_mm[-1] for part in parts], float)
-        self.samples, self.reach_mm = (
-            np.array([np.median(values[own]) for own in self.groups.slices]) for values in (self._size, reach)
-        )
-        self.count = np.clip(self.samples.astype(int), LEAST, MOST_CELLS)
-        width = int(self.count.max())
-        self.middle_mm = (np.arange(width) + 0.5) * (self.reach_mm / self.count)[:, None]
-        # The cell of every sample in a flat array; samples beyond the last cell are in an extra column.
-        distance = np.concatenate([part.distance_mm for part in parts])
-        count = np.repeat(self.groups.spread(self.count), self._size)
-        cell = (distance / np.repeat(self.groups.spread(self.reach_mm), self._size) * count).astype(np.int64)
-        cell = np.where(cell < count, cell, width)
-        self._cell = cell + np.repeat(np.arange(len(parts)) * (width + 1), self._size)
-        self._shape = len(parts), width + 1
-
-    @cached_property
-    def own(self) -> np.ndarray:
-        """Mask of the cells of a stroke's group, shape (strokes, cells)."""
-        return np.arange(self._shape[1] - 1) < self.groups.spread(self.count)[:, None]
-
-    @cached_property
-    def _hits(self) -> np.ndarray:
-        return np.bincount(self._cell, minlength=self._shape[0] * self._shape[1]).reshape(self._shape)[:, :-1]
+        self.samples = float(np.median([part.force_N.size for part in parts]))
+        self.reach_mm = float(np.median([part.distance_mm[-1] for part in parts]))
+        self.count = int(np.clip(int(self.samples), LEAST, MOST_CELLS))
+        self.middle_mm = (np.arange(self.count) + 0.5) * (self.reach_mm / self.count)
+        self.force_N = self.means([part.force_N for part in parts])  # (strokes, cells)
 
     def means(self, values: Sequence[np.ndarray]) -> np.ndarray:
         """Return each stroke's mean in each cell, shape (strokes, cells); NaN without a sample."""
-        total = np.bincount(self._cell, np.concatenate(values), minlength=self._shape[0] * self._shape[1])
-        return np.where(
-            self._hits > 0, total.reshape(self._shape)[:, :-1] / np.maximum(self._hits, 1), np.nan
-        )
+        found = np.full((len(self.parts), self.count), np.nan)
+        for row, part, own in zip(found, self.parts, values, strict=True):
+            cell = (part.distance_mm / self.reach_mm * self.count).astype(np.int64)
+            inside = cell < self.count
+            hits, total = (np.bincount(cell[inside], of, self.count) for of in (None, own[inside]))
+            np.divide(total, hits, out=row, where=hits > 0)
+        return found
 
-    @cached_property
-    def force_N(self) -> np.ndarray:
-        """Mean force of each stroke in each cell, shape (strokes, cells)."""
-        return self.means([part.force_N for part in self.parts])
 
-    def totals(self, values: np.ndarray) -> np.ndarray:
-        """Return the sums over groups, shape (groups, ...), of values of strokes, shape (strokes, ...)."""
-        return np.add.reduceat(values, self.groups.start, axis=0)
+def over_strokes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the mean over strokes in each cell, its standard error and their number, shape (cells,) each.
 
-    def over_strokes(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the mean over strokes in each cell, its standard error and their number, (groups, cells).
-
-        `values`, shape (strokes, cells), are NaN if missing.
-        """
-        there = np.isfinite(values)
-        n = self.totals(there.astype(np.int64))
-        mean = np.where(n > 0, self.totals(np.where(there, values, 0.0)) / np.maximum(n, 1), np.nan)
-        away = np.where(there, values - np.repeat(mean, self.groups.size, axis=0), 0.0)
-        variance = self.totals(away**2) / np.maximum(n - 1, 1)
-        return mean, np.where(n > 1, np.sqrt(variance / np.maximum(n, 1)), np.nan), n
+    `values`, shape (strokes, cells), are NaN if missing.
+    """
+    there = np.isfinite(values)
+    n = there.sum(axis=0)
+    mean = np.where(n > 0, np.where(there, values, 0.0).sum(axis=0) / np.maximum(n, 1), np.nan)
+    variance = np.where(there, (values - mean) ** 2, 0.0).sum(axis=0) / np.maximum(n - 1, 1)
+    return mean, np.where(n > 1, np.sqrt(variance / np.maximum(n, 1)), np.nan), n
 
 
 # ---------------------------------------------------------------- rises

@@ -23,6 +23,7 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 import pandas as pd
+from scipy.ndimage import convolve1d
 from scipy.special import stdtrit
 
 from sealfit.config import Config
@@ -201,56 +202,70 @@ def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tup
 # The peak of the force before steady sliding, per commanded speed and direction.
 
 
-def peaks(cells: Cells) -> pd.DataFrame:
+def peaks(cells: Cells, file: np.ndarray) -> pd.DataFrame:
     """Return the break-away force F_ba and its ratio to the sliding force, per unit of evidence.
 
-    A unit is a file, or a stroke of a single file. The sliding force is extrapolated to the peak along the
-    line through the beginning of steady sliding, so that warming along the stroke does not count as
-    break-away. The position of the peak is taken from the mean of the other units, and the force of a start
-    is read there, as the maximum of noisy samples is biased. For the test for a peak, `top` is the force
-    above sliding where the mean of all units is largest, `noise` its standard error in units of that of a
-    sample, and `places` the number of positions; `F` is the sliding force.
+    A unit is a file, or a stroke of a single file; `file`, shape (n,), is the number of the file in each row
+    of table `steady`. The sliding force is extrapolated to the peak along the line through the beginning of
+    steady sliding, so that warming along the stroke does not count as break-away. The position of the peak is
+    taken from the mean of the other units, and the force of a start is read there, as the maximum of noisy
+    samples is biased. For the test for a peak, `top` is the force above sliding where the mean of all units
+    is largest, `noise` its standard error in units of that of a sample, and `places` the number of positions;
+    `F` is the sliding force.
 
-    The table has one row per unit, with its commanded speed and direction; units with an unknown value are
-    left out.
+    The table has one row per unit; units with an unknown value are left out.
     """
-    of, count = cells.groups.of, cells.count
-    each = np.arange(len(of))
-    # Of the window, in cells.
-    half = np.ceil(count * np.maximum(SAMPLES / cells.samples, SHARE) / 2).astype(int)
+    half = int(np.ceil(cells.count * max(SAMPLES / cells.samples, SHARE) / 2))  # of the window, in cells
     lines = np.array([astuple(part.sliding) for part in cells.parts], float)
     mean_N, middle, slope, samples, extent = lines.T
-    distance = cells.middle_mm[of]
-    sliding = mean_N[:, None] + slope[:, None] * (distance - middle[:, None])
-    force = cells.force_N
-    there = np.isfinite(force)
-    wide = half[of]
+    sliding = mean_N[:, None] + slope[:, None] * (cells.middle_mm - middle[:, None])
+    there = np.isfinite(cells.force_N)
     total, hits, above = (
-        _window(np.where(there, values, 0.0), wide)
-        for values in (force, np.ones(force.shape), force - sliding)
+        convolve1d(np.where(there, values, 0.0), np.ones(2 * half + 1), axis=1, mode="constant")
+        for values in (cells.force_N, 1.0, cells.force_N - sliding)
     )
     mean = np.where(hits > 0, total / np.maximum(hits, 1), np.nan)
-    unit = _units(of, cells.file)
-    own, whole = _places(above * cells.own, hits * cells.own, unit, cells)
-    peak, line = mean[each, own], sliding[each, own]
-    whole = whole[of]
-    per_cell = (cells.samples / count)[of]
-    away = (distance[each, whole] - middle) / np.maximum(extent, 1e-300)
-    error = np.sqrt(1 / samples + away**2)  # of the line, in standard deviations of a sample
-    table = {
-        FORCE: np.where(peak > 0.0, peak, np.nan),
-        RATIO: np.divide(peak, line, out=np.full(len(of), np.nan), where=(peak > 0.0) & (line > 0.0)),
-        SLIDING: np.where(mean_N > 0.0, mean_N, np.nan),
-        TOP: mean[each, whole] - sliding[each, whole],
-        NOISE: np.hypot(error, 1 / np.sqrt(np.maximum(hits[each, whole] * per_cell, 1.0))),
-        PLACES: np.maximum(count / (2 * half + 1), 1.0)[of],
-        WHERE: distance[each, whole],
-        REACH: cells.reach_mm[of],
-    }
-    group = of[np.unique(unit, return_index=True)[1]]
-    made = cells.at.iloc[group].reset_index(drop=True)
-    made = made.assign(**{name: _mean_of(values, unit) for name, values in table.items()})
-    return made.dropna(subset=list(table)).reset_index(drop=True)
+    file = file[[part.row for part in cells.parts]]
+    several = (file != file[0]).any()
+    unit = np.unique(file, return_inverse=True)[1] if several else np.arange(len(file))
+    whole = _highest(above, hits)
+    rows = []
+    for members in (np.flatnonzero(unit == number) for number in range(unit.max() + 1)):
+        others = np.delete(np.arange(len(unit)), members)
+        at = _highest(above[others], hits[others]) if others.size else whole
+        peak, line = mean[members, at], sliding[members, at]
+        away = (cells.middle_mm[whole] - middle[members]) / np.maximum(extent[members], 1e-300)
+        error = np.sqrt(1 / samples[members] + away**2)  # of the line, in standard deviations of a sample
+        inside = np.maximum(hits[members, whole] * cells.samples / cells.count, 1.0)  # samples in the window
+        row = {
+            FORCE: peak[peak > 0.0],
+            RATIO: (peak / line)[(peak > 0.0) & (line > 0.0)],
+            SLIDING: mean_N[members][mean_N[members] > 0.0],
+            TOP: mean[members, whole] - sliding[members, whole],
+            NOISE: np.hypot(error, 1 / np.sqrt(inside)),
+            PLACES: max(cells.count / (2 * half + 1), 1.0),
+            WHERE: cells.middle_mm[whole],
+            REACH: cells.reach_mm,
+        }
+        rows.append({name: _mean_of(np.atleast_1d(values)) for name, values in row.items()})
+    return pd.DataFrame(rows).dropna(ignore_index=True)
+
+
+def _highest(above: np.ndarray, hits: np.ndarray) -> int:
+    """Return the cell in which the mean force above sliding of strokes is largest.
+
+    `above` and `hits`, shape (strokes, cells), are the sum of the force above sliding over a window about
+    each cell, and the number of cells in the sum.
+    """
+    total, count = above.sum(axis=0), hits.sum(axis=0)
+    sure = count > count.max() / 2  # means of fewer cells are too noisy
+    return int(np.argmax(np.where(sure, total / np.maximum(count, 1), -np.inf)))
+
+
+def _mean_of(values: np.ndarray) -> float:
+    """Return the mean of the known values; NaN if there is none."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else np.nan
 
 
 def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: Config) -> pd.DataFrame:
@@ -336,58 +351,3 @@ def _pooled(values: pd.DataFrame, groups: Sequence[pd.Series]) -> tuple[dict[str
         name: np.sqrt(np.divide(squares[name].to_numpy(), df, out=np.full(len(df), np.nan), where=df > 0))
         for name in values
     }, df
-
-
-def _units(group: np.ndarray, file: np.ndarray) -> np.ndarray:
-    """Return the number of each stroke's unit of evidence: its file, or itself if its group has one file."""
-    each = np.arange(len(file))
-    first = np.searchsorted(group, group)  # groups lie one after the other
-    alone = np.bincount(group, file != file[first])[group] == 0
-    own = np.where(alone, each, len(file) + group * (int(file.max()) + 1) + file)
-    return np.unique(own, return_inverse=True)[1]
-
-
-def _mean_of(values: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return the mean of the known values of every unit, shape (units,); NaN if there is none."""
-    known = np.isfinite(values)
-    n = np.bincount(unit, known)
-    return np.where(n > 0, np.bincount(unit, np.where(known, values, 0.0)) / np.maximum(n, 1), np.nan)
-
-
-def _places(
-    above: np.ndarray, hits: np.ndarray, unit: np.ndarray, cells: Cells
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cells of the peaks: per stroke from its group's other units, per group from all units.
-
-    `above` and `hits`, shape (strokes, cells), are the sum of the force above sliding over a window about
-    each cell, and the number of cells in the sum; `unit`, shape (strokes,), is the unit of evidence of each
-    stroke.
-    """
-
-    def highest(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-        sure = count > count.max(axis=1, keepdims=True) / 2  # means of fewer cells are too noisy
-        return np.argmax(np.where(sure, total / np.maximum(count, 1), -np.inf), axis=1)
-
-    of = cells.groups.of
-    total, count = cells.totals(above), cells.totals(hits)
-    order = np.argsort(unit, kind="stable")
-    first = np.flatnonzero(np.r_[True, np.diff(unit[order]) > 0])
-    own_total, own_count = (np.add.reduceat(values[order], first, axis=0)[unit] for values in (above, hits))
-    several = np.bincount(of[order][first])[of] > 1
-    others = highest(
-        total[of] - np.where(several[:, None], own_total, 0.0),
-        count[of] - np.where(several[:, None], own_count, 0.0),
-    )
-    return others, highest(total, count)
-
-
-def _window(values: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return the sums over each cell and `half`, shape (strokes,), cells on each side, shape of `values`."""
-    most, columns = int(half.max()), values.shape[1]
-    padded = np.pad(values.astype(float), ((0, 0), (most, most)))
-    total = values.astype(float)
-    for away in range(1, most + 1):
-        reached = (half >= away)[:, None]
-        for at in (most - away, most + away):
-            total += np.where(reached, padded[:, at : at + columns], 0.0)
-    return total
