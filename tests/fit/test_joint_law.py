@@ -12,7 +12,6 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.aging import joint_law
 from sealfit.fit.aging.joint_law import MOST_LEFT_OUT, Aged, fit_joint_law, fit_laws, left_out, rivals_of
 from sealfit.fit.aging.joint_least_squares import solved_many
 from sealfit.fit.aging.lifetime import (
@@ -205,12 +204,11 @@ def test_many_draws_at_once_are_fitted_as_each_alone():
         assert x == pytest.approx(alone(law, covariance, values), rel=1e-5, abs=1e-6)
 
 
-def test_the_error_at_values_left_out_is_that_of_a_law_fitted_without_them(monkeypatch):
+def test_the_error_at_values_left_out_is_that_of_a_law_fitted_without_them():
     """With a common error of a series, so that what is left out is correlated with what stays."""
     aged = campaign(scatter=0.01)
     common = 1e-5 * (aged.series()[:, None] == aged.series()) + np.diag(aged.variance)
     law = fit_joint_law(replace(aged, variance=common), "log", "rate")
-    monkeypatch.setattr(joint_law, "Spread", None)  # the covariance is decomposed once, not for each fit
     covariance, found = law.aged.covariance(law.scatter).toarray(), left_out(law)
     for name, masks in (("series", aged.whole_series()), ("last_day", aged.last_days())):
         fits = [(out, alone(law, covariance, aged.value, ~out)) for out in masks]

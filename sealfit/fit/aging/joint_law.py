@@ -12,7 +12,7 @@ from scipy.special import fdtrc, stdtrit
 
 from sealfit.effects import aging_laws
 from sealfit.errors import FitError
-from sealfit.fit.aging.joint_least_squares import solved, solved_many
+from sealfit.fit.aging.joint_least_squares import solved
 from sealfit.fit.aging.law import paule_mandel
 from sealfit.fit.joint.prior import covariance_of
 from sealfit.fit.joint.whitening import blockwise
@@ -217,7 +217,7 @@ class JointLaw:
         error, left = self.aged.replicates_df, self.aged.value.size - self.x.size
         if not (error > 0 and left > 0):
             return np.nan
-        x = solved(self, self.aged.spread.whitening(0.0), self.x)
+        x = solved(self, self.aged, self.aged.spread.whitening(0.0), self.x)
         chi2 = self.aged.spread.chi2(self.aged.value - self.at(self.aged, x), 0.0)
         return float(fdtrc(left, error, chi2 / left))
 
@@ -304,7 +304,7 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
     )
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
-        x = solved(empty, aged.spread.whitening(scatter), x)
+        x = solved(empty, aged, aged.spread.whitening(scatter), x)
         residual = aged.value - empty.at(aged, x)
         chi2 = partial(aged.spread.chi2, residual)
         before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), residual / aged.scale)
@@ -350,12 +350,14 @@ def left_out(law: JointLaw) -> dict[str, float]:
     Each of up to `MOST_LEFT_OUT` series is left out in turn.
     """
     aged, whole = law.aged, law.aged.whole_series()
-    plain = replace(aged, variance=None)  # `part` need not copy the covariance
-    white, found = aged.spread.whitening(law.scatter), {}
+    found = {}
     for name, masks in (("series", whole if len(whole) > 2 else []), ("last_day", aged.last_days())):
-        kept = np.array([out for out in masks if plain.part(~out).drivers() == aged.drivers()])
-        found[name] = np.nan
-        if len(kept):
-            predicted = law.at(aged, solved_many(law, white, np.broadcast_to(aged.value, kept.shape), kept))
-            found[name] = float(np.sqrt(np.mean((predicted - aged.value)[kept] ** 2)))
+        errors = [np.zeros(0)]
+        for out in masks:
+            part = aged.part(~out)
+            if part.drivers() == aged.drivers():
+                x = solved(law, part, part.spread.whitening(law.scatter), law.x)
+                errors.append((law.at(aged, x) - aged.value)[out])
+        errors = np.concatenate(errors)
+        found[name] = float(np.sqrt(np.mean(errors**2))) if errors.size else np.nan
     return found

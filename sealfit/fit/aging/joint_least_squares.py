@@ -1,8 +1,7 @@
-"""Least squares of a joint law of aging: of all values, of subsets, or of many draws of the values."""
+"""Least squares of a joint law of aging: of some values, or of many draws of the values."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from scipy.sparse import csr_array
 from sealfit.fit.least_squares import levenberg_marquardt
 
 if TYPE_CHECKING:
-    from sealfit.fit.aging.joint_law import JointLaw
+    from sealfit.fit.aging.joint_law import Aged, JointLaw
 
 # Starting values of E in kJ/mol.
 ENERGIES = (0.0, 50.0, 100.0)
@@ -33,59 +32,45 @@ POLISHED = 4
 DEPENDENT = 1e-20
 
 
-def solved(law: JointLaw, white: csr_array, start: np.ndarray | None = None) -> np.ndarray:
+def solved(law: JointLaw, aged: Aged, white: csr_array, start: np.ndarray | None = None) -> np.ndarray:
     """Return the least-squares parameters, shape (p,), from a start or from the best points of a grid.
 
-    `law` gives the shape, its target, the values and the references; `white` is W, shape (n, n), with W C W'
-    = 1 for the covariance C of the values.
+    `law` gives the shape, its target and the references; `white` is W, shape (n, n), with W C W' = 1 for the
+    covariance C of the values in `aged`.
     """
-    problem = _Projected(law, white, law.aged.value[None])
+    problem = _Projected(law, aged, white, aged.value[None])
     nonlinear = problem.grid() if start is None else start[None, LINEAR:]
     x, rss = problem.polished(nonlinear, np.zeros(len(nonlinear), int))
     return x[np.argmin(rss)]
 
 
-def solved_many(
-    law: JointLaw, white: csr_array, values: np.ndarray, masks: np.ndarray | None = None
-) -> np.ndarray:
-    """Return the parameters for many sets of values, shape (sets, p), computed together.
+def solved_many(law: JointLaw, white: csr_array, values: np.ndarray) -> np.ndarray:
+    """Return the parameters for many sets of values, shape (sets, n) -> (sets, p), computed together.
 
-    As `solved`, from the law's parameters. The values in `masks` are left out; both have the shape (sets, n).
+    As `solved`, from the law's parameters.
     """
-    return _Projected(law, white, values, masks).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
+    return _Projected(law, law.aged, white, values).polished(np.tile(law.x[LINEAR:], (len(values), 1)))[0]
 
 
 class _Projected:
-    """Variable projection of a law on sets of values: mu_0 and a are solved for.
+    """Variable projection of a law on sets of values, shape (sets, n): mu_0 and a are solved for.
 
-    Its arguments are those of `solved_many`. Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
+    The other arguments are those of `solved`. Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
     doi:10.1137/0710036, with the tangent of Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995.
     """
 
-    def __init__(self, law: JointLaw, white: csr_array, values: np.ndarray, masks: np.ndarray | None = None):
-        self.law, self.values, self.white, self.aside = law, values, white, None
-        level = np.tile(white.sum(axis=1), (1 if masks is None else len(masks), 1, 1))
-        if masks is not None:
-            self.aside = [_columns_of(white, out) for out in masks]
-            self._take_aside(level, range(len(masks)))
-        self.column = level / np.linalg.norm(level, axis=2, keepdims=True)  # of mu_0
-        self.level = (level[:, 0] / (level[:, 0] ** 2).sum(axis=1, keepdims=True)) @ white
-        self.measured = self._whitened(values[:, None], np.arange(len(values)))
+    def __init__(self, law: JointLaw, aged: Aged, white: csr_array, values: np.ndarray) -> None:
+        self.law, self.aged, self.values, self.white = law, aged, values, white
+        level = white.sum(axis=1)
+        self.column = level / np.linalg.norm(level)  # of mu_0
+        self.level = (level / (level @ level)) @ white
+        self.measured = self._whitened(values[:, None])
         self.reach = float((white.data**2).sum())
 
-    def _take_aside(self, many: np.ndarray, of: Iterable[int]) -> None:
-        """Project the values left out of the sets `of` out of whitened rows, shape (r, m, n), in place."""
-        for own, k in zip(many, of, strict=True):
-            rows, basis = self.aside[k]
-            own[:, rows] -= (own[:, rows] @ basis) @ basis.T
-
-    def _whitened(self, many: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return rows, shape (r, m, n), of the sets `of`, shape (r,), whitened, with mu_0 projected out."""
+    def _whitened(self, many: np.ndarray) -> np.ndarray:
+        """Return rows, shape (r, m, n), whitened, with mu_0 projected out."""
         many = (self.white @ many.reshape(-1, many.shape[2]).T).T.reshape(many.shape)
-        if self.aside is not None:
-            self._take_aside(many, of)
-        column = self.column[of] if len(self.column) > 1 else self.column
-        return many - (many @ np.swapaxes(column, 1, 2)) * column
+        return many - (many @ self.column)[..., None] * self.column
 
     def solve(self, nonlinear: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mu_0 and a, shape (r, 2), the whitened residual, (r, n), and its derivative, (r, p - 2, n).
@@ -96,16 +81,15 @@ class _Projected:
         law, measured = self.law, self.measured[of]
         # The law with mu_0 = 0 and a = -1 is the loss.
         unit = np.concatenate([np.tile([0.0, -1.0], (len(nonlinear), 1)), nonlinear], axis=1)
-        plain = law.slope(law.aged, unit)[:, 1:]
-        columns = self._whitened(plain, of)
+        plain = law.slope(self.aged, unit)[:, 1:]
+        columns = self._whitened(plain)
         square = (columns[:, :1] ** 2).sum(axis=2, keepdims=True)
         sound = square > DEPENDENT * self.reach * (plain[:, :1] ** 2).max(axis=2, keepdims=True)
         column = np.divide(columns[:, :1], np.sqrt(square), out=np.zeros(measured.shape), where=sound)
         along = (measured * column).sum(axis=2, keepdims=True)
         a = np.divide(along, np.sqrt(square), out=np.zeros(square.shape), where=sound)
         slope = columns[:, 1:] - (columns[:, 1:] * column).sum(axis=2, keepdims=True) * column
-        level = self.level[of] if len(self.level) > 1 else self.level
-        mu_0 = ((self.values[of] - a[:, 0] * plain[:, 0]) * level).sum(axis=1, keepdims=True)
+        mu_0 = ((self.values[of] - a[:, 0] * plain[:, 0]) @ self.level)[:, None]
         return np.concatenate([mu_0, a[:, 0]], axis=1), (along * column - measured)[:, 0], -a * slope
 
     def grid(self) -> np.ndarray:
@@ -129,14 +113,3 @@ class _Projected:
         )
         found, rss = levenberg_marquardt(lambda x, rows: self.solve(x, of[rows])[1:], nonlinear, low, high)
         return np.concatenate([self.solve(found, of)[0], found], axis=1), rss
-
-
-def _columns_of(white: csr_array, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows, shape (t,), and an orthonormal basis there, (t, k), of the columns of some values.
-
-    Leaving a value out equals giving it a parameter, whose column is projected out. It is 0 in the rows of
-    independent values.
-    """
-    columns = white[:, np.flatnonzero(out)]
-    rows = np.flatnonzero(np.diff(columns.indptr))
-    return rows, np.linalg.qr(columns[rows].toarray())[0]
