@@ -29,6 +29,7 @@ from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw, fit_laws, left_
 from sealfit.fit.aging.law import Values, fit_law, law_model
 from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.search import pairs_and_shared
+from sealfit.fit.joint.whitening import log_determinant
 from sealfit.fit.least_squares import covariance_of, even_grid
 from sealfit.fit.steady import FORCES, SteadyFit, parameter_units, solve_conditions
 from sealfit.fit.steady.condition import FULL, Condition
@@ -304,7 +305,7 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
         return None
     origin = np.zeros(aged.value.size, int)
     fitted = fit_law(Values(aged.days, aged.value, origin, series, aged.covariance(law.scatter)))
-    bic = fitted.chi2 + aged.spread.log_determinant(law.scatter) + fitted.x.size * np.log(aged.value.size)
+    bic = fitted.chi2 + log_determinant(fitted.values.whitening) + fitted.x.size * np.log(aged.value.size)
     squares = []
     for out in aged.last_days() if min(days) > 3 else []:
         part = fit_law(fitted.values.part(~out), fitted.x)

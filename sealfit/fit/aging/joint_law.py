@@ -15,15 +15,13 @@ from sealfit.errors import FitError
 from sealfit.fit.aging.joint_least_squares import solved
 from sealfit.fit.aging.law import paule_mandel
 from sealfit.fit.joint.prior import covariance_of
-from sealfit.fit.joint.whitening import blockwise
+from sealfit.fit.joint.whitening import log_determinant, whitening_of
 from sealfit.physics.aging_laws import LOSSES, Loss
 
 # Gas constant in kJ/(mol K).
 GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000
 # Smallest variance of a value. It keeps the weights of values without scatter finite.
 TINY = 1e-300
-# Variances below this share of the largest are rounding.
-ROUNDING = 1e-14
 # Largest number of series that are left out in turn for held-out errors. The root mean square of their errors
 # is then known to a tenth.
 MOST_LEFT_OUT = 50
@@ -79,10 +77,13 @@ class Aged:
         own = (scatter * (about if self.size is None else self.size)) ** 2 + TINY
         return csr_array(diags_array(measured) if measured.ndim == 1 else measured) + diags_array(own)
 
-    @cached_property
-    def spread(self) -> Spread:
-        """The covariance as a function of the scatter."""
-        return Spread(self.covariance(0.0), self.scale)
+    def whitening(self, scatter: float) -> csr_array:
+        """Return W with W C W' = 1 for the covariance C at a scatter, shape (n, n)."""
+        return whitening_of(self.covariance(scatter))
+
+    def chi2(self, residual: np.ndarray, scatter: float) -> float:
+        """Return r' C^-1 r of a residual, shape (n,)."""
+        return float(((self.whitening(scatter) @ residual) ** 2).sum())
 
     @property
     def scale(self) -> np.ndarray:
@@ -129,34 +130,6 @@ class Aged:
     def last_days(self) -> list[np.ndarray]:
         """Return the mask of the last day of each of these series, shape (n,) each."""
         return [own & (self.days == self.days[own].max()) for own in self.whole_series()]
-
-
-class Spread:
-    """The covariance C(s) = M + s^2 diag(size)^2 of values for any scatter s, decomposed once.
-
-    M, shape (n, n), is the measured covariance. Divided by the sizes, shape (n,), C is M' + s^2, and its
-    eigenvectors are those of M' for every s. They are found for each independent block of M.
-    """
-
-    def __init__(self, measured: csr_array, size: np.ndarray) -> None:
-        self._size = np.maximum(size, ROUNDING * size.max())
-        scaled = diags_array(1 / self._size) @ measured @ diags_array(1 / self._size)
-        self._axes = blockwise(lambda blocks: np.linalg.eigh(blocks)[1], scaled)
-        variance = self._axes.multiply(scaled @ self._axes).sum(axis=0)
-        self._variance = np.maximum(variance, max(ROUNDING * variance.max(), TINY))
-
-    def whitening(self, scatter: float) -> csr_array:
-        """Return W with W C W' = 1, shape (n, n)."""
-        scale = diags_array(1 / np.sqrt(self._variance + scatter**2))
-        return csr_array(scale @ self._axes.T @ diags_array(1 / self._size))
-
-    def chi2(self, residual: np.ndarray, scatter: float) -> float:
-        """Return r' C^-1 r of a residual, shape (n,)."""
-        return float((self._axes.T @ (residual / self._size)) ** 2 @ (1 / (self._variance + scatter**2)))
-
-    def log_determinant(self, scatter: float) -> float:
-        """Return ln det C."""
-        return float(np.log(self._variance + scatter**2).sum() + 2 * np.log(self._size).sum())
 
 
 # ---------------------------------------------------------------- joint law
@@ -217,8 +190,8 @@ class JointLaw:
         error, left = self.aged.replicates_df, self.aged.value.size - self.x.size
         if not (error > 0 and left > 0):
             return np.nan
-        x = solved(self, self.aged, self.aged.spread.whitening(0.0), self.x)
-        chi2 = self.aged.spread.chi2(self.aged.value - self.at(self.aged, x), 0.0)
+        x = solved(self, self.aged, self.aged.whitening(0.0), self.x)
+        chi2 = self.aged.chi2(self.aged.value - self.at(self.aged, x), 0.0)
         return float(fdtrc(left, error, chi2 / left))
 
     def at(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
@@ -304,16 +277,17 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
     )
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
-        x = solved(empty, aged, aged.spread.whitening(scatter), x)
+        x = solved(empty, aged, aged.whitening(scatter), x)
         residual = aged.value - empty.at(aged, x)
-        chi2 = partial(aged.spread.chi2, residual)
+        chi2 = partial(aged.chi2, residual)
         before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), residual / aged.scale)
         if abs(scatter - before) <= CONVERGED * before:
             break
-    bic = aged.spread.chi2(aged.value - empty.at(aged, x), scatter) + aged.spread.log_determinant(scatter)
-    bic += len(names) * float(np.log(aged.value.size))
-    white = aged.spread.whitening(scatter) @ empty.slope(aged, x).T
-    covariance = covariance_of(white.T @ white, np.zeros((len(names),) * 2))
+    white = aged.whitening(scatter)
+    chi2 = float(((white @ (aged.value - empty.at(aged, x))) ** 2).sum())
+    bic = chi2 + log_determinant(white) + len(names) * float(np.log(aged.value.size))
+    slope = white @ empty.slope(aged, x).T
+    covariance = covariance_of(slope.T @ slope, np.zeros((len(names),) * 2))
     return replace(empty, x=x, covariance=covariance, scatter=scatter, bic=bic)
 
 
@@ -356,7 +330,7 @@ def left_out(law: JointLaw) -> dict[str, float]:
         for out in masks:
             part = aged.part(~out)
             if part.drivers() == aged.drivers():
-                x = solved(law, part, part.spread.whitening(law.scatter), law.x)
+                x = solved(law, part, part.whitening(law.scatter), law.x)
                 errors.append((law.at(aged, x) - aged.value)[out])
         errors = np.concatenate(errors)
         found[name] = float(np.sqrt(np.mean(errors**2))) if errors.size else np.nan

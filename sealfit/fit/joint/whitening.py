@@ -208,3 +208,8 @@ def blockwise(function: Callable[[np.ndarray], np.ndarray], matrix: csr_array) -
 def whitening_of(covariance: csr_array) -> csr_array:
     """Return W with W C W' = 1, lower triangular within the independent blocks of C, shape (n, n)."""
     return blockwise(lambda blocks: np.linalg.inv(np.linalg.cholesky(blocks)), covariance)
+
+
+def log_determinant(white: csr_array) -> float:
+    """Return ln det C of the covariance that `whitening_of` was given, from its result."""
+    return float(-2 * np.log(white.diagonal()).sum())
