@@ -11,7 +11,7 @@ from sealfit.errors import RequestError
 from sealfit.fit import steady
 from sealfit.fit.aging.all_series import aged_values, joint_laws, law_of, shared_levels
 from sealfit.fit.aging.joint_law import fit_joint_law
-from sealfit.fit.steady import fit_conditions, solve_conditions
+from sealfit.fit.steady import fit_conditions
 from sealfit.fit.steady.uncertainty import run_means
 from sealfit.physics import aging_law, stribeck_force
 
@@ -202,19 +202,3 @@ def test_coefficients_of_a_rig_that_reads_torque_have_their_true_unit(campaign):
     table = campaign(noise=0.004)
     laws, _ = joint_laws(table, fit_conditions(table, config), config)
     assert set(laws.loc[laws["parameter"].isin(["mu_0", "a"]), "unit"]) == {"mN m/N"}
-
-
-@pytest.mark.parametrize("repeats", [1, 3])
-def test_conditions_are_taken_from_the_table_as_they_were_fitted(campaign, repeats):
-    """With repeats nothing is fitted again. One day has too few speeds for a Stribeck curve."""
-    table = campaign(noise=0.01, repeats=repeats)
-    few = (table["aging_days"] == 8) & (table["speed_set_mm_s"] > 1)
-    table = table[~few]
-    fits = fit_conditions(table, Config())
-    fitted, _, factors = solve_conditions(table)
-    taken, _, same = solve_conditions(table, fits)
-    assert [c.model for c in taken] == [c.model for c in fitted]
-    for one, other in zip(taken, fitted, strict=True):
-        assert one.values == pytest.approx(other.values, rel=1e-9)
-        assert one.chi2 == pytest.approx(other.chi2, rel=1e-6)
-    assert same.value == pytest.approx(factors.value, rel=1e-6)

@@ -76,7 +76,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataF
     curved = set(known.loc[known["parameter"] == "v_s", "condition"])
     free = known[known["parameter"].isin([name for pair in PAIRS for name in pair])]
     free = free.assign(quantity=free["parameter"])[["condition", "quantity", "value"]]
-    conditions, _, variance = solve_conditions(steady, steady_fit)
+    conditions, _, variance = solve_conditions(steady)
     place = {c.name: k for k, c in enumerate(conditions)}
     series = series_of_curve(about.reset_index(drop=True), aging=True)
     count, known_shifts = len(shifts_of(steady)), steady_fit["steady_shift"]

@@ -106,26 +106,16 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
     return found
 
 
-def solve_conditions(
-    steady: pd.DataFrame, fitted: SteadyFit | None = None
-) -> tuple[list[Condition], Scatter, UnitVariance]:
+def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, UnitVariance]:
     """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
 
-    A Stribeck curve that does not differ significantly from a straight line is dropped. With repeats, which
-    determine the weights, the estimates of `fitted`, the fit of these rows, are used, and nothing is fitted
-    again. FitError if there is no row to fit.
+    A Stribeck curve that does not differ significantly from a straight line is dropped. FitError if there is
+    no row to fit.
     """
     runs = run_means(steady)
     scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
     runs = runs.assign(weight=run_weights(runs, scatter))
     conditions = [make_condition(name, own) for name, own in runs.groupby("condition", sort=True)]
-    if fitted is not None and scatter.df > 0:
-        rows = fitted["steady_fit"]
-        rows = rows[(rows["quantity"] == "steady") & rows["value"].notna()]
-        known = rows.groupby("condition")["value"].agg(np.array)  # in the order of NAMES
-        for condition in conditions:
-            condition.take(known[condition.name])
-        return conditions, scatter, _unit_variance(conditions, scatter)
     solve(conditions)
     if not scatter.df > 0:
         conditions = _more_likely_weights(conditions)

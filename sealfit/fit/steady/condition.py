@@ -69,12 +69,6 @@ class Condition:
         """Runs minus parameters; a parameter at its bound counts too, which makes intervals wider."""
         return max(len(self.runs) - len(self.names), 0)
 
-    def take(self, values: np.ndarray) -> None:
-        """Take estimates, shape (p,), which determine the model by their number."""
-        _, _, force, weight = self.arrays
-        self.model, self.values = len(values), values
-        self.chi2 = float(weight @ (force - self.model_force()) ** 2)
-
     def jacobian(self) -> np.ndarray:
         """Derivative of F sgn v with respect to the parameters, shape (n, p)."""
         speed, load, _, _ = self.arrays
