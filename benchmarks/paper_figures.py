@@ -100,7 +100,7 @@ def _sensitivity(name: str, title: str, quantity: str) -> Plot:
         f"Friction force over speed from -30 to 30 mm/s for {quantity} from {values[0]:g} to {values[-1]:g}."
     )
     legend = [Key(f"{value:g}", colour) for value, colour in zip(values, shades(len(values)), strict=True)]
-    return Plot(name, title, (Panel("", alt, draw, height=3.2),), tuple(legend))
+    return Plot(name, title, (Panel("", alt, draw),), tuple(legend))
 
 
 def _forces(found: Found, name: str, title: str, places: Sequence[tuple[At, str]]) -> Plot:
@@ -116,7 +116,7 @@ def _forces(found: Found, name: str, title: str, places: Sequence[tuple[At, str]
     alt = f"Friction force over speed: unaged and {', '.join(label for _, label in places)}; run means from "
     alt += f"{forces.min():.3g} to {forces.max():.3g} N and the fitted model."
     legend = [Key(line.label, line.colour) for line in shown] + [Key("run means", FLOOR, "point")]
-    return Plot(name, title, (Panel("", alt, draw, height=3.2),), tuple(legend))
+    return Plot(name, title, (Panel("", alt, draw),), tuple(legend))
 
 
 def _coefficients(
@@ -141,7 +141,7 @@ def _coefficients(
 
         every = pd.concat(values)["value"]
         alt = f"{quantity} over {label}, a line per day: from {every.max():.3g} to {every.min():.3g}."
-        panels.append(Panel("", alt, draw, height=2.9))
+        panels.append(Panel("", alt, draw))
     legend = [Key(f"{day:g} d", colour) for (day, _), colour in zip(by_day, colours, strict=True)]
     return Plot(name, title, tuple(panels), tuple(legend))
 
@@ -173,7 +173,7 @@ def _predicted(found: Found, name: str, title: str, at: At) -> Plot:
     alt = "Friction force over speed: run means and the prediction, which differ by at most "
     alt += f"{abs(off).max():.1%}."
     legend = (Key("predicted by Eq. 15", CYCLE[0]), Key("run means", FLOOR, "point"))
-    return Plot(name, title, (Panel("", alt, draw, height=3.2),), legend)
+    return Plot(name, title, (Panel("", alt, draw),), legend)
 
 
 def _law(found: Found, name: str, title: str) -> Plot:
@@ -200,4 +200,4 @@ def _law(found: Found, name: str, title: str) -> Plot:
     legend += [Key("fit per condition, 95 %", FLOOR, "point"), Key("Eq. 15, 95 % band", FLOOR, "band")]
     legend += [Key("Eq. 15 as printed; x: printed values", BLACK, "dotted")]
     legend += [Key(f"the printed prediction, start {needed:.3f}", QUIET, "dashed")]
-    return Plot(name, title, (Panel("", alt, draw, height=3.2),), tuple(legend))
+    return Plot(name, title, (Panel("", alt, draw),), tuple(legend))

@@ -181,16 +181,13 @@ COMPUTED = (
 )
 
 
-NO_PANEL = "<svg/>"
-
-
 def remember_computations() -> None:
     """Let pure functions remember what they returned, by their arguments; plots are not drawn."""
     for module, name in COMPUTED:
         __import__(module)
         real = getattr(sys.modules[module], name)
         setattr(sys.modules[module], name, _remembering(real))
-    page.draw = lambda plot: Drawn("<svg/>", b"png", b"pdf", tuple(NO_PANEL for _ in plot.panels))
+    page.draw = lambda plot: Drawn("<svg/>", b"png", b"pdf")
 
 
 def _remembering(real: Callable) -> Callable:

@@ -153,28 +153,28 @@ def fit(
     if scatter is None:
         scatter = Scatter(s0=max(float(np.std(rows.force)) * 0.01, 1e-12), g=0.0)
         model = descend(model, rows, scatter, centre, tolerance=ROUGH)
-    if turns and model.terms:
-        model = _searched(model, rows, scatter)
     if not turns:
         model = descend(model, rows, scatter, centre, loads, tolerance=COMPARED)
         return fitted_at(model, rows, scatter, loads)
-    found = _alternately(model, rows, None, turns)
+    if model.terms:
+        model = _searched(model, rows, scatter)
+    found = _alternately(model, rows, None, centre, turns)
     if scatter := with_curves(rows, found.residual, found.loads, found.jacobian, found.scatter):
-        other = _alternately(found.model, rows, scatter, 1)
+        other = _alternately(found.model, rows, scatter, centre, 1)
         found = min(found, other, key=lambda f: f.deviance)
     if _misses_levels(found):
         within = tuple(part for part in found.scatter.components if part.level != "specimen")
-        other = _alternately(model, rows, replace(found.scatter, components=within), turns)
+        other = _alternately(model, rows, replace(found.scatter, components=within), centre, turns)
         return other if other.rmse_N * WRONG_SCATTER < found.rmse_N else found
     return found
 
 
-def _alternately(model: Model, rows: Rows, scatter: Scatter | None, turns: int) -> Fitted:
+def _alternately(model: Model, rows: Rows, scatter: Scatter | None, centre: np.ndarray, turns: int) -> Fitted:
     """Return the model fitted in turns with the scatter, which has the components that it starts with."""
     for _ in range(turns):
         force, jacobian = evaluate(model, rows)
         scatter = estimate_scatter(rows, rows.force - force, loads_of(model, rows), jacobian, scatter)
-        model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, prior.centre_of(model))
+        model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, centre)
     return fitted_at(model, rows, scatter)
 
 
