@@ -170,15 +170,19 @@ def _residual_of_model(
     number = rows.table.groupby(["run_id", rows.codes("file")], sort=False).ngroup().to_numpy()
     order = np.argsort(number, kind="stable")
     start = np.flatnonzero(np.r_[True, np.diff(number[order]) > 0])
-    means = np.add.reduceat(fitted.jacobian.values[order], start, axis=0) / np.bincount(number)[:, None]
+    means, loads = (
+        np.add.reduceat(values[order], start, axis=0)[chosen]
+        / np.bincount(number)[chosen, None]
+        * factor[:, None]
+        for values in (fitted.jacobian.values, fitted.loads)
+    )
     place = order[start][chosen]  # a row of each run
-    tangent = Tangent(fitted.jacobian.layout.of(place), means[chosen] * factor[:, None])
+    tangent = Tangent(fitted.jacobian.layout.of(place), means)
     kinds = [c.kind for c in fitted.scatter.components if c.level == "specimen" and c.variance > 0]
     if not kinds:
         basis = tangent.orthonormal(RANK)
         return basis.project_out(size), basis.shape[1]
-    loads = fitted.loads[place][:, [KINDS.index(kind) for kind in kinds]]
-    own = OwnColumns(rows.codes("specimen")[place], loads * factor[:, None])
+    own = OwnColumns(rows.codes("specimen")[place], loads[:, [KINDS.index(kind) for kind in kinds]])
     basis = tangent.orthonormal(RANK, project_out=own.project_out)
     return basis.project_out(own.project_out(size)), basis.shape[1] + own.count
 
