@@ -143,14 +143,16 @@ _BOMS = (  # UTF-32 first: its mark begins with that of UTF-16
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_OTHERS = {  # how files of other formats begin, in small letters, after blanks and a byte-order mark
-    b"pk\x03\x04": "a zip archive or .xlsx workbook",
+_PACKED = {
+    b"PK\x03\x04": "a zip archive or .xlsx workbook",
     b"\x1f\x8b": "gzip",
     b"\xd0\xcf\x11\xe0": "an .xls workbook",
-    b"tdsm": "a TDMS file",
-    b"par1": "a Parquet file",
-    b"matlab 5.0 mat-file": "a MAT-file",
-    b"matlab 7.3 mat-file": "a MAT-file",
+    b"TDSm": "a TDMS file",
+    b"PAR1": "a Parquet file",
+    b"MATLAB 5.0 MAT-file": "a MAT-file",
+    b"MATLAB 7.3 MAT-file": "a MAT-file",
+}
+_MARKED_UP = {
     b"<!doctype html": "a web page",
     b"<html": "a web page",
     b"<?xml": "an XML file",
@@ -181,7 +183,7 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
     `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then tries UTF-8, then takes
     Latin-1. BadFile if the bytes are not text in that encoding, or begin as files of other formats do.
     """
-    _refuse_others(raw)
+    _refuse_packed(raw)
     automatic = encoding == "auto"
     if automatic:
         encoding = next((name for mark, name in _BOMS if raw.startswith(mark)), None) or _guess(raw)
@@ -210,12 +212,19 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
     return raw
 
 
-def _refuse_others(raw: bytes) -> None:
-    begin = raw[:256].removeprefix(codecs.BOM_UTF8).lstrip().lower()
-    for mark, what in _OTHERS.items():
-        if begin.startswith(mark):
+def _refuse_packed(raw: bytes) -> None:
+    for magic, what in _PACKED.items():
+        if raw.startswith(magic):
             fix = "Export it as CSV, or give the file the ending of its format."
-            raise bad_file("binary_file", f"is {what}, not a table of text.", fix)
+            raise bad_file("binary_file", f"is {what}, not text.", fix)
+
+
+def refuse_marked_up(text: bytes) -> None:
+    """Raise `BadFile` for text of a format that is not a table: HTML, XML or JSON."""
+    begin = text[:256].lstrip().lower()
+    for mark, what in _MARKED_UP.items():
+        if begin.startswith(mark):
+            raise bad_file("no_table", f"is {what}, not a table.", "Export the trace as CSV.")
 
 
 def find_layout(text: bytes, settings: TraceFormat) -> Layout:

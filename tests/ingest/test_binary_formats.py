@@ -150,7 +150,7 @@ def test_the_ending_in_capitals_counts_and_the_config_may_say_it(tmp_path):
     npt.assert_array_equal(read(tmp_path, "t.TDMS").columns["force_N"], expected)
     npt.assert_array_equal(read(tmp_path, "t.dat", '[trace]\nformat = "tdms"').columns["force_N"], expected)
     fault = refused(tmp_path, "t.dat")
-    assert "is a TDMS file, not a table of text" in fault.reason
+    assert "is a TDMS file, not text" in fault.reason
 
 
 # ---------------------------------------------------------------- Excel
