@@ -6,7 +6,7 @@ The number of a line is that of the sheet's row. Numbers are written without los
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 from datetime import timedelta
 from itertools import takewhile
@@ -36,20 +36,24 @@ def read_sheet(
     """Return a sheet of a workbook as text: its name or number (from 1), or None for the only one with cells.
 
     `LONGEST` is the one with the most rows. With `head`, `HEAD_ROWS` rows are enough. Numbers are written
-    with the mark `decimal`. A merged cell has its value in its first place only; the others are empty. So is
-    a formula whose value was not saved. BadFile if it is no workbook that can be read, has no such sheet, or
-    merged cells that may not be there; CampaignError if openpyxl is not installed.
+    with the mark `decimal`. A merged cell has its value in its first place only; the others are empty.
+    BadFile if it is no workbook that can be read, has no such sheet, formulas without values, or merged cells
+    that may not be there; CampaignError if openpyxl is not installed.
     """
-    with _book(raw, by_row=merged) as book:
-        own = book[_title(book, sheet)]
+    with _book(raw, formulas=True, by_row=merged) as book:
+        title = _title(book, sheet)
+        lines, formulas = _lines(book[title], decimal, head)
         if not merged:
-            _refuse_merged(own)
-        return "\n".join(_lines(own, decimal, head)).encode("utf-8", "replace")
+            _refuse_merged(book[title])
+    if formulas:
+        with _book(raw, formulas=False) as book:
+            lines, _ = _lines(book[title], decimal, head, formulas)
+    return "\n".join(lines).encode("utf-8", "replace")
 
 
 def rows_of_sheets(raw: bytes) -> dict[str, int]:
     """Return the number of rows with cells of every sheet, the most first; errors as `read_sheet`."""
-    with _book(raw) as book:
+    with _book(raw, formulas=True) as book:
         return _rows(book)
 
 
@@ -59,14 +63,14 @@ def _rows(book) -> dict[str, int]:
 
 
 @contextmanager
-def _book(raw: bytes, *, by_row: bool = True) -> Iterator:
-    """Open a workbook with the values that Excel saved of its formulas.
+def _book(raw: bytes, *, formulas: bool, by_row: bool = True) -> Iterator:
+    """Open a workbook with its formulas or with the values that Excel kept of them.
 
     Read `by_row` it takes little memory, and does not say which cells are merged.
     """
     _refuse_others(raw)
     openpyxl = library("openpyxl", "xlsx")
-    options = {"read_only": by_row, "data_only": True, "keep_links": False}
+    options = {"read_only": by_row, "data_only": not formulas, "keep_links": False}
     with damage_named("xlsx"), closing(openpyxl.load_workbook(io.BytesIO(raw), **options)) as book:
         for sheet in book.worksheets if by_row else ():
             sheet.reset_dimensions()  # some writers note a size that is not so
@@ -118,21 +122,35 @@ def _has_cell(row: Sequence[object]) -> bool:
     return any(cell is not None for cell in row)
 
 
-def _lines(sheet, decimal: str, head: bool) -> list[str]:
-    """Return the rows as lines.
+def _lines(
+    sheet, decimal: str, head: bool, saved: Collection[tuple[int, int]] = ()
+) -> tuple[list[str], set[tuple[int, int]]]:
+    """Return the rows as lines, and row and column (from 1) of every formula.
 
-    A row is at least as long as the longest above it: what it lacks are empty cells.
+    A row is at least as long as the longest above it: what it lacks are empty cells. `saved` are the places
+    of formulas whose values are read; raises `BadFile` if Excel kept none of one.
     """
-    lines, width = [], 0
-    for row in sheet.iter_rows(max_row=HEAD_ROWS if head else None, values_only=True):
-        cells = [_cell(value, decimal) for value in row]
+    lines, formulas, width = [], set(), 0
+    rows = sheet.iter_rows(max_row=HEAD_ROWS if head else None, values_only=True)
+    for number, row in enumerate(rows, start=1):
+        cells = []
+        for place, value in enumerate(row, start=1):
+            # A range of formulas has a `ref`.
+            if (isinstance(value, str) and value.startswith("=")) or hasattr(value, "ref"):
+                formulas.add((number, place))
+            if value is None and (number, place) in saved:
+                reason = "the cell holds a formula whose value was not saved."
+                fix = "Open it in Excel and save it, or paste values over the formulas."
+                column = sheet.cell(number, place).column_letter
+                raise bad_file("formula", reason, fix, line=number, column=column)
+            cells.append(_cell(value, decimal))
         while cells and not cells[-1]:
             cells.pop()
         width = max(width, len(cells))
         lines.append("\t".join(cells + [""] * (width - len(cells))) if cells else "")
     while lines and not lines[-1]:
         lines.pop()
-    return lines
+    return lines, formulas
 
 
 def _cell(value: object, decimal: str) -> str:

@@ -206,8 +206,8 @@ def test_formulas_count_by_their_values_and_what_a_merged_cell_covers_is_empty(t
         sheet["C7"] = "=2*15"
 
     book(tmp_path / "formula.xlsx", rows, change=formula)
-    (fault,) = read(tmp_path, "formula.xlsx").faults
-    assert (fault.check, fault.line, fault.column) == ("empty_cell", 7, "force_N")
+    fault = refused(tmp_path, "formula.xlsx")
+    assert (fault.check, fault.line, fault.column) == ("formula", 7, "C")
     book(tmp_path / "merged.xlsx", rows, change=lambda sheet: sheet.merge_cells("B9:B11"))
     found = read(tmp_path, "merged.xlsx", "[quality]\nmax_bad_rows = 0.5").faults
     assert [(fault.check, fault.line, fault.column) for fault in found] == [
