@@ -27,6 +27,9 @@ MOST = 240  # files that are looked at, however many ways of naming them there a
 READ = 6  # trace files that are read whole, for how their columns behave
 WHOLE_BYTES = 8_000_000  # of larger files the first 64 kB are looked at, and their ends are not known
 ROWS = 20_000  # of a trace that are read: enough for some strokes
+FORMATS = {
+    ".xls": "Excel workbooks before 2007", ".h5": "HDF5 files", ".hdf5": "HDF5 files", ".bin": "binary files",
+}  # fmt: skip
 DOCUMENTS = {
     ".md", ".rst", ".toml", ".json", ".py", ".ipynb", ".m", ".html", ".htm", ".pdf", ".png", ".jpg", ".svg",
     ".ini", ".xml", ".yml", ".yaml", ".zip", ".gz", ".docx", ".doc", ".pptx", ".exe", ".tex",
@@ -42,7 +45,7 @@ class Found:
 
     `traces` are those that one config can read, `dialects` how some of them are written, `wider` those of
     them that have further columns; `otherwise` are traces written in another way, `others` files that are
-    none, `unreadable` files with the reason.
+    none, `unreadable` files with the reason, `formats` counts by suffix the files that sealfit cannot read.
     """
 
     folder: Path
@@ -52,6 +55,7 @@ class Found:
     otherwise: dict[str, Dialect]
     others: tuple[str, ...]
     unreadable: dict[str, str]
+    formats: Counter
 
     @property
     def sniffed(self) -> list[Dialect]:
@@ -79,17 +83,18 @@ def look(folder: Path) -> Found:
         reason = "is a file, not a folder." if folder.is_file() else "there is no such folder."
         raise RequestError(reason, file=folder, fix="Give the folder that holds the trace files.")
     files = _files(folder)
+    formats = Counter(suffix for file in files if (suffix := PurePosixPath(file).suffix.lower()) in FORMATS)
     texts = [file for file in files if _may_be_trace(file)]
     dialects, unreadable = _sniffed(folder, texts)
     tables = {file: dialect for file, dialect in dialects.items() if dialect is not None and file != RUNS_CSV}
     if not tables:
-        raise _no_traces(folder, files, unreadable)
+        raise _no_traces(folder, files, formats, unreadable)
     same, wider, otherwise = _by_form(tables)
     rest = [file for file in texts if file not in dialects and file not in unreadable]
     not_looked_at = _like({**same, **wider}, rest, dialects)
     others = [file for file, dialect in dialects.items() if dialect is None or file == RUNS_CSV]
     traces = sorted([*same, *wider, *not_looked_at], key=natural)
-    return Found(folder, tuple(traces), same, wider, otherwise, tuple(others), unreadable)
+    return Found(folder, tuple(traces), same, wider, otherwise, tuple(others), unreadable, formats)
 
 
 def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]) -> list[str]:
@@ -111,7 +116,9 @@ def _files(folder: Path) -> list[str]:
 
 def _may_be_trace(file: str) -> bool:
     path = PurePosixPath(file)
-    return path.suffix.lower() not in DOCUMENTS and not path.name.lower().startswith(NO_TRACES)
+    if path.suffix.lower() in FORMATS or path.suffix.lower() in DOCUMENTS:
+        return False
+    return not path.name.lower().startswith(NO_TRACES)
 
 
 def _kind(file: str) -> tuple:
@@ -207,14 +214,21 @@ def _holds(one: Dialect, usual: Dialect) -> bool:
 VALUES = "A table of values over aging days is fitted by: sealfit fit-aging --values TABLE --out OUT."
 
 
-def _no_traces(folder: Path, files: Sequence[str], unreadable: dict[str, str]) -> RequestError:
+def _no_traces(
+    folder: Path, files: Sequence[str], formats: Counter, unreadable: dict[str, str]
+) -> RequestError:
     fix = "Give the folder that holds the trace files, or export them as text (CSV)."
+    if not files:
+        return RequestError("the folder is empty.", file=folder, fix=fix)
     if unreadable:
-        file, why = next(iter(unreadable.items()))
-        return RequestError(f"no trace file can be read: {file} {why}", file=folder, fix=fix)
+        file, reason = next(iter(unreadable.items()))
+        return RequestError(f"no trace file can be read: {file} {reason}", file=folder, fix=fix)
+    if formats:
+        what = ", ".join(f"{count} {FORMATS[suffix]} ({suffix})" for suffix, count in formats.most_common())
+        return RequestError(f"holds {what} and no trace file that can be read.", file=folder, fix=fix)
     shown = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
     reason = f"none of {len(files)} files holds a table of numbers with two columns or more ({shown})."
-    return RequestError(reason if files else "the folder is empty.", file=folder, fix=f"{fix} {VALUES}")
+    return RequestError(reason, file=folder, fix=f"{fix} {VALUES}")
 
 
 # ---------------------------------------------------------------- numbers

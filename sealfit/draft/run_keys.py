@@ -217,6 +217,9 @@ def source_keys(
     _otherwise({f: one for f, one in found.otherwise.items() if table is None or f != table.file}, notes)
     for file, reason in list(found.unreadable.items())[:3]:
         notes.doubt("files", f"{file} {reason}", "It is in no run.")
+    for suffix, count in found.formats.items():
+        reason = f"{count} files ({suffix}) are not read."
+        notes.doubt("files", reason, "Export them as text (CSV) if they hold traces or the list of runs.")
 
 
 def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:

@@ -154,7 +154,7 @@ def tdms(folder):
 def hdf5(folder):
     folder.mkdir()
     for number in range(3):
-        (folder / f"run{number}.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+        (folder / f"run{number}.h5").write_bytes(bytes(100))
 
 
 def empty_files(folder):
@@ -182,7 +182,7 @@ def only_a_table_of_runs(folder):
         (binary, "is not text", "export them as text"),
         (packed, "a zip archive or .xlsx workbook", "export them as text"),
         (tdms, "cannot be read as ", "export them as text"),
-        (hdf5, "no trace file can be read: run0.h5 is not", "Export the trace as text"),
+        (hdf5, "3 HDF5 files (.h5) and no trace file that can be read", "export them as text"),
         (empty_files, "is empty", "export them as text"),
         (values_over_days, "but no time and no force", "sealfit fit-aging --values TABLE"),
         (only_a_table_of_runs, "none of 1 files holds a table of numbers", "export them as text"),
