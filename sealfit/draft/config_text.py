@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from sealfit.draft.dialect import When
 from sealfit.units import Unit, Units
 
 WIDTH = 110  # characters of a comment's line
@@ -60,12 +61,21 @@ class Notes:
 
 
 # ---------------------------------------------------------------- lines for a column
-# The one place where a unit that is not the default becomes part of a config.
+# The one place where a unit that is not the default, or a date that is not ISO 8601, becomes config lines.
 
 
 def file_column(name: str | int, unit: Unit | None, ours: str) -> Value:
     """Return a column of a file as a config writes it: with its unit where that is not the unit of `ours`."""
     return name if unit is None or unit.name == Units().of(ours) else {"name": name, "unit": unit.name}
+
+
+def date_lines(when: When) -> list[str]:
+    """Return the lines of config that a date needs which is not ISO 8601; those of `[files]` come last."""
+    lines = [f"started_at = {literal(when.pattern)}"]
+    if when.clock:
+        lines = [f"started_day = {literal(when.pattern)}", f"started_clock = {literal(when.clock)}"]
+        lines.append(f"started_at = {toml({'date': 'started_day', 'time': 'started_clock'})}")
+    return [*lines, f"date_format = {literal(when.format)}"]
 
 
 # ---------------------------------------------------------------- text

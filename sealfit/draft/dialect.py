@@ -12,12 +12,12 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 
 from sealfit.config import AGING_CONDITION
 from sealfit.draft.vocabulary import column_role, name_and_unit, plain, setting
 from sealfit.ingest.derived_columns import UNAGED_WORDS
 from sealfit.ingest.files import as_number, split_line
-from sealfit.ingest.runs import time_of, usual_formats
 from sealfit.units import Unit, conversion, unit_of
 
 # Lines from the top that are looked at: longer than the headers we know of, by five times.
@@ -49,8 +49,9 @@ _RATE = re.compile(rf"{_SAMPLED}.*(?:rate|freq)|(?:rate|freq).*{_SAMPLED}")  # n
 _STEP = re.compile(rf"{_SAMPLED}.*(?:interval|period)|(?:interval|period).*{_SAMPLED}|\bdt\b|\bdelta [tx]\b")
 # The header field that an expression for the rate reads; by its first letter it is no channel.
 RATE = "_rate"
-FORMAT = "files.date_format"  # key of a config for dates that are not ISO 8601
 _DATE = re.compile(r"(?<!\d)(?:20\d\d([-/])\d\d?\1\d\d?|\d\d?(?P<mark>[./])\d\d?(?P=mark)20\d\d)(?!\d)")
+_DATES = ("%d.%m.%Y", "%Y-%m-%d", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y")
+_ISO = [f"%Y-%m-%d{mark}%H:%M{seconds}" for mark in " T" for seconds in ("", ":%S")]
 CLOCK = re.compile(
     r"(?P<clock>[0-2]?\d:[0-5]\d(?P<second>:[0-5]\d)?)(?:[.,]\d+)?(?P<half>\s*[AP]M)?", re.IGNORECASE
 )
@@ -261,14 +262,16 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class When:
-    """A date in a header line of every file, and the keys of a config that read it.
+    """A date in header lines: the pattern that finds it and its format, "" for ISO 8601.
 
-    The time of day is a field of its own, and there is a format, where the date is not ISO 8601.
+    `clock` is the pattern for the time of day where that stands in a line of its own.
     """
 
-    keys: dict[str, str | dict[str, str]]
+    pattern: str
+    format: str
     line: int
     text: str
+    clock: str = ""
 
 
 def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Setting]:
@@ -334,7 +337,7 @@ def rate_in(headers: Sequence[Sequence[str]], decimal: str) -> tuple[float | str
 def started_in(headers: Sequence[Sequence[str]]) -> When | None:
     """Return the date that the header lines of every file give, ISO 8601 first; None if there is none."""
     found = [_date_in(headers, number, line) for number, line in enumerate(headers[0], start=1)]
-    return min(filter(None, found), key=lambda when: FORMAT in when.keys, default=None)
+    return min(filter(None, found), key=lambda when: when.format != "", default=None)
 
 
 def _date_in(headers: Sequence[Sequence[str]], number: int, line: str) -> When | None:
@@ -342,33 +345,35 @@ def _date_in(headers: Sequence[Sequence[str]], number: int, line: str) -> When |
     match = _DATE.search(line)
     if match is None:
         return None
-    day = _pattern(line, match.start(), match.end())
-    texts, keys = _found(day, headers), {"trace.header_fields.started_at": day}
-    following = headers[0][number] if number < len(headers[0]) else ""
-    for below, start in ((line, match.end()), (following, 0)):
-        if clock := CLOCK.search(below, start):
-            # No format has a fraction of a second.
-            end = clock.end() if clock["half"] else clock.end("clock")
-            both, time = _pattern(line, match.start(), end), _pattern(below, clock.start(), end)
-            if below is line and all(map(time_of, _found(both, headers))):
-                return When({"trace.header_fields.started_at": both}, number, line.strip())
-            texts = [" ".join(both) for both in zip(texts, _found(time, headers), strict=True)]
-            keys = {"trace.header_fields.started_day": day, "trace.header_fields.started_clock": time}
-            keys["files.started_at"] = {"date": "started_day", "time": "started_clock"}
-            break
-    if not all(map(time_of, texts)):
-        formats = usual_formats(texts)
-        if not formats:
-            return None
-        keys[FORMAT] = formats[0].strip("'")
-    return When(keys, number, line.strip())
-
-
-def _pattern(line: str, start: int, end: int) -> str:
-    """Return the pattern of a part of a line, with the digits of other files."""
+    clock, start, end = CLOCK.search(line, match.end()), match.start(), match.end()
+    if clock is not None:
+        end = clock.end() if clock["half"] else clock.end("clock")  # strptime reads no fraction of a second
     numbers = re.sub(r"\d+", r"\\d+", re.escape(line[start:end]))
     pattern = f"{_leading(line[:start])}({numbers})"
-    return re.sub(r"[AP]M\)$", "[AP]M)", pattern).replace(r"\ ", " ")
+    pattern = re.sub(r"[AP]M\)$", "[AP]M)", pattern).replace(r"\ ", " ")
+    texts = _found(pattern, headers)
+    spelled = next((one for one in _DATES if all(_is_day(text, one) for text in texts)), None)
+    if spelled is None:
+        return None
+    following = headers[0][number] if number < len(headers[0]) else ""
+    if clock is not None:
+        spelled += line[match.end() : clock.start()].replace("%", "%%") + _clock_format(clock)
+    elif clock := CLOCK.search(following):
+        own = _leading(following[: clock.start()]) + r"(\d+:\d+(?::\d+)?)"
+        return When(pattern, f"{spelled} {_clock_format(clock)}", number, line.strip(), own)
+    return When(pattern, "" if spelled in _ISO else spelled, number, line.strip())
+
+
+def _is_day(text: str, spelled: str) -> bool:
+    try:
+        return bool(datetime.strptime(_DATE.search(text)[0], spelled))
+    except (TypeError, ValueError):  # 14/03/2024 is no date where the month stands first
+        return False
+
+
+def _clock_format(clock: re.Match) -> str:
+    hours = "%I" if clock["half"] else "%H"
+    return f"{hours}:%M" + (":%S" if clock["second"] else "") + (" %p" if clock["half"] else "")
 
 
 def _leading(text: str) -> str:

@@ -17,8 +17,8 @@ from sealfit.draft.columns import (
     rises,
     stroke_count,
 )
-from sealfit.draft.config_text import Notes, file_column, toml
-from sealfit.draft.dialect import FORMAT, RATE, STRAYS, rate_in, settings_in, started_in
+from sealfit.draft.config_text import Notes, date_lines, file_column
+from sealfit.draft.dialect import RATE, STRAYS, rate_in, settings_in, started_in
 from sealfit.draft.files_found import Found
 from sealfit.draft.vocabulary import name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
@@ -360,16 +360,14 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
     given = given | ({"load_N"} if measures_load else set())
     when = started_in(headers)
     if when is not None and "started_at" not in given:
-        if FORMAT in when.keys:
+        if when.format:
             reason = f"header line {when.line} gives a date that is not ISO 8601: {_shown(when.text)}."
-            names = [key.rpartition(".")[2] for key in when.keys]
-            fix = "If day and month are in this order, uncomment its lines, and move date_format"
-            fix += (" and started_at" if "started_day" in names else "") + " to [files]."
-            lines = [f"{name} = {toml(value)}" for name, value in zip(names, when.keys.values(), strict=True)]
-            notes.doubt("trace.header_fields", reason, fix, lines)
+            of_files = "started_at and date_format" if when.clock else "date_format"
+            fix = f"If day and month are in this order, uncomment its lines, and move {of_files} to [files]."
+            notes.doubt("trace.header_fields", reason, fix, date_lines(when))
         else:
-            for key, value in when.keys.items():
-                notes.guess(key, value, f"header line {when.line}, in every file looked at: '{when.text}'")
+            evidence = f"header line {when.line}, in every file looked at: '{when.text}'"
+            notes.guess("trace.header_fields.started_at", when.pattern, evidence)
     settings = [one for one in settings_in(headers, found.dialect.decimal) if one.ours not in given]
     for one in settings:
         evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"

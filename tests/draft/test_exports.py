@@ -134,10 +134,8 @@ def test_a_german_date_in_the_header_is_a_doubt_with_the_lines_that_would_read_i
 def test_the_order_of_day_and_month_is_the_one_that_fits_all_files(dates, order):
     lines = [f"Date\t{date} 09:19:33.25" for date in dates]
     when = started_in([(line,) for line in lines])
-    assert when.keys["files.date_format"] == f"{order} %H:%M:%S"
-    for field, found in (("started_day", dates), ("started_clock", ("09:19:33", "09:19:33"))):
-        pattern = when.keys[f"trace.header_fields.{field}"]
-        assert tuple(re.search(pattern, line)[1] for line in lines) == found
+    assert when.format == f"{order} %H:%M:%S"
+    assert [re.search(when.pattern, line)[1] for line in lines] == [f"{date} 09:19:33" for date in dates]
 
 
 @pytest.mark.parametrize(
@@ -154,7 +152,7 @@ def test_the_format_of_a_date_in_the_header_is_found(name, date_format, tmp_path
     exports.EXPORTS[name](tmp_path)
     (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "ISO 8601" in doubt.reason]
     assert doubt.lines[-1] == f"date_format = '{date_format}'"
-    moved = 1 + ("date_format and started_at" in doubt.fix)  # lines that the fix moves to [files]
+    moved = 1 + ("started_at and date_format" in doubt.fix)  # lines that the fix moves to [files]
     lines = ["[trace.header_fields]", *doubt.lines[:-moved], "[files]", *doubt.lines[-moved:]]
     config = parse_config("\n".join(lines), "rig.toml")
     two = config.files.started_at
