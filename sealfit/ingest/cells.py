@@ -103,10 +103,14 @@ def _row_faults(check: str, name: str, rows: Trace, wrong: np.ndarray) -> list[F
 
 
 def _begins_anew(time_s: np.ndarray) -> int:
-    """Return the row at which time first falls back to where it began; 0 if there is none."""
+    """Return the row at which time first falls back to where it began.
+
+    It is 0 if there is none, or if few rows come before, as those before a trigger do.
+    """
     since = time_s - time_s[0]
     anew = 1 + np.flatnonzero((np.diff(since) < 0) & (since[1:] <= ANEW * since[:-1]))
-    return int(anew[0]) if anew.size and anew[0] >= RECORDING else 0
+    rows = np.diff(np.r_[0, anew, len(time_s)])
+    return int(anew[0]) if anew.size and rows[0] >= max(RECORDING, rows.max() / 2) else 0
 
 
 def _out_of_order(time_s: np.ndarray) -> np.ndarray:

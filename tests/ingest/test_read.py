@@ -200,6 +200,12 @@ def test_recordings_that_follow_each_other_in_a_file_are_said(tmp_path, times):
     assert len(read(tmp_path, csv_of(times * ROWS), "quality.max_bad_rows = 0.9").table) == 100
 
 
+def test_rows_before_a_trigger_are_left_out_and_not_the_recording(tmp_path):
+    found = read(tmp_path, csv_of(ROWS[:40] + ROWS), "quality.max_bad_rows = 0.9")
+    assert len(found.table) == 100
+    assert {fault.check for fault in found.faults} == {"time_order"}
+
+
 @pytest.mark.parametrize(
     ("content", "check", "words"),
     [
