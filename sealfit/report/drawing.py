@@ -21,7 +21,7 @@ from sealfit.report.notation import ConditionNames, given, plain
 from sealfit.report.style import Plot, compose, look
 
 PRINT = 300  # pixels of a PNG file in an inch
-NEAR = 12.0  # points: size of the place around a marker at which its text is shown
+NEAR = 8.0  # points: size of the place around a marker at which its text is shown
 MOST_BINS = 30_000  # of all runs that a page has, about 1 MB; of more, every second, third ... is left
 LARGEST_STEP = 5  # traces of which fewer than every fifth bin would be left are not in the page
 

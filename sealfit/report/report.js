@@ -104,9 +104,19 @@ function openRun(id) {
 
 // ---------------------------------------------------------------- figures
 
+// The point with a text nearest to the pointer: the places around neighbouring points overlap.
+function pointAt({ clientX, clientY }) {
+  const distance = point => {
+    const box = point.getBoundingClientRect();
+    return Math.hypot(box.x + box.width / 2 - clientX, box.y + box.height / 2 - clientY);
+  };
+  const points = document.elementsFromPoint(clientX, clientY).map(element => element.closest("use"));
+  return points.filter(point => point?.querySelector("title")).sort((one, other) => distance(one) - distance(other))[0];
+}
+
 // A point that names a run, in a line of its text, opens it.
 document.addEventListener("click", event => {
-  const text = event.target.closest("use")?.querySelector("title")?.textContent ?? "";
+  const text = pointAt(event)?.querySelector("title").textContent ?? "";
   const id = text.split("\n").find(line => Object.hasOwn(traces.runs, line));
   if (id !== undefined) openRun(id);
 });

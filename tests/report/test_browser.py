@@ -64,7 +64,11 @@ frame.onload = async () => {
   const page = frame.contentDocument, found = {};
   const text = point => point.querySelector("title").textContent;
   const click = point => {
-    point.dispatchEvent(new frame.contentWindow.MouseEvent("click", { bubbles: true }));
+    point.scrollIntoView({ block: "center", behavior: "instant" });
+    const box = point.getBoundingClientRect();
+    const at = { clientX: box.x + box.width / 2, clientY: box.y + box.height / 2, bubbles: true };
+    const top = page.elementFromPoint(at.clientX, at.clientY);
+    top.dispatchEvent(new frame.contentWindow.MouseEvent("click", at));
   };
   const dialog = page.querySelector("dialog"), titled = id => page.querySelectorAll(id + " use:has(title)");
   const mean = titled("#force-speed")[3];
@@ -75,6 +79,12 @@ frame.onload = async () => {
   const lines = [...dialog.querySelectorAll("path.measured")];
   found.points = lines.map(line => line.getAttribute("d").split("L").length);
   dialog.close();
+  found.opened = [...titled("#force-speed")].map(point => {
+    click(point);
+    const head = dialog.querySelector("h2").textContent;
+    dialog.close();
+    return [text(point).split("\\n")[2], head];
+  });
   const residual = titled("#residual")[0];
   found.residual = text(residual);
   click(residual);
@@ -144,6 +154,8 @@ def test_points_speak_runs_open_figures_zoom_and_tables_sort_and_are_saved(tmp_p
     found = json.loads(html.unescape(re.search(r"<title>driven (.*?)</title>", shown, re.S)[1]))
     assert found["mean"].splitlines()[2] in found["run"]
     assert found["wide"] > 10  # pixels at which the text is shown
+    assert len(found["opened"]) > 3
+    assert all(head.endswith(f"run {run}") for run, head in found["opened"])  # also where places overlap
     assert found["points"] == 3 * [20]  # repeats and bins of made_campaigns
     assert re.match(r"(before|after): .* N\n", found["residual"])
     assert found["residual"].splitlines()[3] in found["farthest"]
