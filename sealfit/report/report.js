@@ -44,6 +44,8 @@ function open(title, note, svg) {
   }, { passive: false });
   dialog.replaceChildren(button("Close", "Close", () => dialog.close()), head, frame, words);
   if (!dialog.open) dialog.showModal();
+  size = Math.max(1, svg.width.baseVal.value / frame.clientWidth); // at least as large as it was drawn
+  svg.style.width = `${100 * size}%`;
 }
 
 // ---------------------------------------------------------------- trace of a run
