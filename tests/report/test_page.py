@@ -10,6 +10,7 @@ from report.made_tables import empty
 
 from sealfit.config import Config
 from sealfit.report.drawing import LARGEST_STEP, MOST_BINS, run_traces
+from sealfit.report.figures.residual import effect_shapes
 from sealfit.report.page import build_report
 
 VOID = {"meta", "img", "br", "link", "path", "rect", "circle"}
@@ -157,6 +158,11 @@ def test_a_candidate_has_a_panel_that_says_so(small, unsaved):
         "warming by sliding (time)", "candidate: aging with an induction time"
     ]  # fmt: skip
     assert "candidate, not applied" in page
+    panels = effect_shapes(small.tables, small.closure, small.config).panels
+    assert [panel.title for panel in panels] == [
+        "1. Warming by sliding (time)", "2. Candidate: aging with an induction time"
+    ]  # fmt: skip
+    assert "2. Aging with an induction time <" in re.sub(r"\s+", " ", page)
 
 
 def test_effects_not_accepted_have_the_residual_along_each_of_their_variables_once(small, unsaved):

@@ -403,9 +403,12 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: 
     shapes, points = tables["shapes"], tables["shape_points"]
     if shapes.empty:
         return None
+    effects = closure["effects"]
+    place = [by_gain(effects).index(effect) for effect in effects]  # of their texts in the page
+    shapes = shapes.sort_values("effect", key=lambda index: index.map(lambda k: place[int(k)]), kind="stable")
     panels = []
     for (index, channel), rows in shapes.groupby(["effect", "channel"], sort=False):
-        effect = closure["effects"][int(index)]
+        effect = effects[int(index)]
         rows = rows.sort_values("x") if rows["x"].notna().all() else rows
         own = points[(points["effect"] == index) & (points["channel"] == channel)]
         draw = partial(draw_shape, rows=rows, effect=effect, units=config.units, points=own)
@@ -414,7 +417,8 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: 
         alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
         alt += f"{shape_label(rows, effect, config.units)} from {number(scale * rows['value'].min())} to "
         alt += f"{number(scale * rows['value'].max())}."
-        panels.append(Panel(capital(words), alt, draw))
+        number_of = f"{place[int(index)] + 1}. " if len(effects) > 1 else ""
+        panels.append(Panel(number_of + capital(words), alt, draw))
     legend = [Key("effect, 95 % band", style.AFTER)]
     if shapes["free"].notna().any():
         legend.append(Key("free shape", style.FLOOR, "dashed"))
