@@ -38,6 +38,7 @@ from sealfit.report.summary import (
     by_gain,
     level_words,
     outlier_clause,
+    quality_clause,
     residual_clause,
     split_channels,
     verdict_clauses,
@@ -57,7 +58,10 @@ def verdict(closure: Mapping, config: Config) -> Markup:
     """Return the verdict in a few sentences."""
     added = [effect for effect in by_gain(closure["effects"]) if not effect["candidate"]]
     error = error_clause(closure, config)
-    said = [in_words(clause, closure, config) for clause in verdict_clauses(closure, config.units)]
+    clauses = verdict_clauses(closure, config.units)
+    if added and not known(closure["noise_floor_N"]):  # the error says that there are no repeats
+        clauses.remove(quality_clause(closure))
+    said = [in_words(clause, closure, config) for clause in clauses]
     said.append(outlier_clause(closure))
     if not added:
         return _sentences(*said, error)
