@@ -130,9 +130,9 @@ def parameter_tables(
         earlier = identified.set_index([key, "quantity", "parameter"])["value"].to_dict()
     of_statistics = fit["quantity"] == "statistics"
     told = of_statistics & fit["parameter"].str.split(":").str[-1].isin(STATISTICS)
-    tables = []
+    tables, joint = [], ", from the joint fit" if name == "aging_fit" and before is not None else ""
     for own, title, statistics in (
-        (fit[~of_statistics], TITLES[name], False),
+        (fit[~of_statistics], TITLES[name] + joint, False),
         (fit[told], f"Goodness of fit, per {key}", True),
     ):
         rows = [_row(row, key, earlier, config) for row in own.to_dict("records")]

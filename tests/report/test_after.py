@@ -25,6 +25,8 @@ def test_values_before_stand_beside_those_after(made):
     row = fit.query("aging_days == 1 and compression_ratio_pct == 80 and parameter == 'mu_s'").iloc[0]
     shown = [found.rows[4][name] for name in ("value", "before")]
     assert shown == [f"{HIGHER * row['value']:.3f}", number(row["value"])]
+    law = parameter_tables(made.tables["aging_fit_after"], "aging_fit", made.config, made.tables["aging_fit"])
+    assert law[0].title == "Aging law per series, from the joint fit"
     assert parameter_tables(fit, "steady_fit", made.config)[0].compared is False
 
 
