@@ -221,10 +221,11 @@ def _dimension(unit: str) -> Hashable | None:
 
 def _measured(unit: str) -> str:
     """Return what a unit that pint knows measures."""
-    dimension, known = _dimension(unit), UNITS.get(unit)
-    if known is None or known.dimension == "none" or _dimension(known.name) != dimension:  # as kg, for kgf
-        return re.sub(r"[\[\]]", "", str(dimension))
-    return known.dimension
+    dimension = _dimension(unit)
+    for known in (UNITS.get(unit), *UNITS.values()):  # its own entry first: N m is a torque, not a work
+        if known is not None and known.dimension != "none" and _dimension(known.name) == dimension:
+            return known.dimension
+    return re.sub(r"[\[\]]", "", str(dimension))
 
 
 def _nearest(unit: str, dimension: Hashable) -> str:
