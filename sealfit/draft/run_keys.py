@@ -303,7 +303,7 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         reason = (
             f"files with another '{template}' are taken to be of other pieces of rubber, unaged ones, too."
         )
-        fix = "If one piece was tested, delete this line, and number its repeats through."
+        fix = "If one piece was tested, delete this line, and call the number `repeat` in name_pattern."
         notes.doubt("files.columns.specimen_id", reason, fix)
 
 
