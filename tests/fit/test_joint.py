@@ -13,6 +13,7 @@ from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
 from sealfit.fit.joint.rows import make_rows, set_speeds, thin
 from sealfit.fit.joint.search import start_model
+from sealfit.fit.joint.variance_components import curve_components
 from sealfit.ingest.strokes import speed_clusters
 
 WAVE = Effect(
@@ -31,8 +32,8 @@ WAVE = Effect(
 )
 
 
-def rows_of(**options):
-    return make_rows(bins_helpers.make_bins(**options), has_aging=True)
+def rows_of(seed=0, **options):
+    return make_rows(bins_helpers.make_bins(seed, **options), has_aging=True)
 
 
 @pytest.mark.parametrize("acts_on", TARGETS)
@@ -408,6 +409,23 @@ def test_an_effect_lowers_the_error_although_the_scatter_of_specimens_is_of_anot
     assert not after.scatter.estimates("specimen")
     assert after.rmse_N < 0.6 * before.rmse_N
     assert after.model.values[0]["A"] == pytest.approx(-2 * bins_helpers.TRUE["sigma_2"], rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 6, 7, 8, 10, 15])
+def test_a_true_scatter_of_specimens_is_kept_though_the_aging_law_could_explain_it(seed):
+    rows = rows_of(seed, bins=5, specimen=0.03, setup=0.002, gain=0.002)
+    fitted = fit_declared(rows)
+    assert fitted.scatter.estimates("specimen")
+    number = [p.quantity for p in fitted.model.declared.parameters].index("mu_0s")
+    away = fitted.model.theta[number] - bins_helpers.TRUE["mu_s0"]
+    assert abs(away) < 3 * np.sqrt(fitted.covariance[number, number])
+
+
+def test_curves_of_specimens_do_not_stand_in_for_levels_that_nothing_distinguishes():
+    few = {"temperatures": (60.0,), "days": (1.0, 4.0, 16.0)}
+    rows = rows_of(1, bins=5, specimen=0.03, setup=0.002, gain=0.002, **few)
+    assert curve_components(rows) == []
+    assert {part.level for part in fit_declared(rows).scatter.components} == {"file", "run"}
 
 
 def test_levels_are_not_given_up_where_an_effect_changes_the_curves_of_specimens():

@@ -309,9 +309,9 @@ def curve_components(rows: Rows) -> list[tuple[str, str]]:
 
 
 def _curve_components(rows: Rows) -> list[tuple[str, str]]:
+    if "specimen" not in {level for level, _ in usable_components(rows)}:
+        return []  # curves would stand in for levels
     starts = rows.groups.starts["specimen"]
-    if starts.size == rows.groups.starts["run"].size:
-        return []
     parts = np.split(np.arange(rows.force.size), starts[1:])
     speeds = np.array([tested_speeds(rows, own).size for own in parts])
     count = Counter(p.quantity for p in declare(rows).parameters)
