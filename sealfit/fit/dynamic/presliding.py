@@ -234,12 +234,13 @@ def peaks(cells: Cells, file: np.ndarray) -> pd.DataFrame:
         others = np.delete(np.arange(len(unit)), members)
         at = _highest(above[others], hits[others]) if others.size else whole
         peak, line = mean[members, at], sliding[members, at]
+        both = (peak > 0.0) & (line > 0.0)
         away = (cells.middle_mm[whole] - middle[members]) / np.maximum(extent[members], 1e-300)
         error = np.sqrt(1 / samples[members] + away**2)  # of the line, in standard deviations of a sample
         inside = np.maximum(hits[members, whole] * cells.samples / cells.count, 1.0)  # samples in the window
         row = {
             FORCE: peak[peak > 0.0],
-            RATIO: (peak / line)[(peak > 0.0) & (line > 0.0)],
+            RATIO: peak[both] / line[both],
             SLIDING: mean_N[members][mean_N[members] > 0.0],
             TOP: mean[members, whole] - sliding[members, whole],
             NOISE: np.hypot(error, 1 / np.sqrt(inside)),
