@@ -125,7 +125,7 @@ def _drawn_tables(
     selection: Selection, before: Fitted, after: Fitted, config: Config
 ) -> dict[str, pd.DataFrame]:
     """Return the tables that do not depend on the folds."""
-    searched = (("before", before, selection.first), ("after", after, selection.last))
+    searched = (("before", before, selection.first), ("after", after, selection.left_over))
     levels = [level_table(*one, selection.channels) for one in searched]
     shapes = shape_table(after, config)
     drawn = {"shapes": shapes, "shape_points": shape_points(after, shapes)}

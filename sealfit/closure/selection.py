@@ -63,6 +63,11 @@ class Selection:
     refused: tuple[RefusedEffect, ...] = ()  # significant, in no model
     worse: tuple[RefusedEffect, ...] = ()  # those of them that were removed because they lowered no error
 
+    @property
+    def left_over(self) -> tuple[Candidate, ...]:
+        """Candidates on the model after; those on the declared one if all effects were removed."""
+        return self.last if self.added else self.first
+
 
 class _SearchResult(NamedTuple):
     """The result of all searches on one model."""

@@ -167,16 +167,16 @@ class _Search:
     """
 
     def __init__(self, selection: Selection, alpha: float) -> None:
-        self.fitted, self.channels, self.candidates = selection.after, selection.channels, selection.last
+        self.fitted, self.channels, self.candidates = selection.after, selection.channels, selection.left_over
         self.level, self.tests = alpha / criteria.SEARCHES, ScoreTests(selection.after)
-        results = [c.test_result for c in selection.last]
+        results = [c.test_result for c in self.candidates]
         slopes = [j.slopes for j in results if j.slopes]
-        small_sample = [test for c in selection.last if (test := self._retested(c)) is not None]
+        small_sample = [test for c in self.candidates if (test := self._retested(c)) is not None]
         many = [j for j in results if j.small_sample is None and not j.slopes]
         self.contrasts = N_VARIANCES * sum(own[0].slope.size for own in slopes)
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
-        lines = [c for c in selection.last if c.test_result.slopes and c.key[1:] == FRICTION and not c.pair]
+        lines = [c for c in self.candidates if c.test_result.slopes and c.key[1:] == FRICTION and not c.pair]
         self.lines = np.column_stack(
             [c.columns[:, 0] for c in lines] or [np.ones(selection.after.force.size)]
         )
