@@ -269,11 +269,15 @@ def _local(w: World, rng) -> Effect:
 
 
 def _gain(w: World, rng) -> Effect:
-    return Effect("gain", ("levels", "step"), (), "mu", "multiply", "constant", amplitude=_sign(rng))
+    return Effect(
+        "gain", ("levels", "step", "temporary_change"), (), "mu", "multiply", "constant", amplitude=_sign(rng)
+    )
 
 
 def _offset(w: World, rng) -> Effect:
-    return Effect("offset", ("levels", "step"), (), "force", "add", "constant", amplitude=_sign(rng))
+    return Effect(
+        "offset", ("levels", "step", "temporary_change"), (), "force", "add", "constant", amplitude=_sign(rng)
+    )
 
 
 def smooth_random(w: World, rng) -> Effect:

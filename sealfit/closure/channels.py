@@ -310,15 +310,29 @@ def steps(channel: Channel, rows: Rows) -> np.ndarray:
 
     A free shape of four columns does not follow a step, and what it leaves hides it in a few files.
     """
+    columns = (channel.values[:, None] > _jumps(channel, rows, criteria.MOST_STEPS)).astype(float)
+    return columns - columns.mean(axis=0)
+
+
+def intervals(channel: Channel, rows: Rows) -> np.ndarray:
+    """Return centred columns that are 1 between two places along a channel and 0 elsewhere, shape (n, k)."""
+    ends = _jumps(channel, rows, criteria.MOST_ENDS)
+    first, last = np.triu_indices(ends.size, 1)
+    columns = (channel.values[:, None] > ends[first]) & (channel.values[:, None] < ends[last])
     start = rows.groups.starts[flip_level(channel.unit, rows)]
-    values = np.sort(channel.values[start])
+    columns = columns[:, columns[start].sum(axis=0) >= criteria.LEAST_BESIDE_STEP].astype(float)
+    return columns - columns.mean(axis=0)
+
+
+def _jumps(channel: Channel, rows: Rows, most: int) -> np.ndarray:
+    """Return up to `most` places between the units of a channel, with enough of them on either side."""
+    values = np.sort(channel.values[rows.groups.starts[flip_level(channel.unit, rows)]])
     inner = slice(criteria.LEAST_BESIDE_STEP - 1, max(values.size - criteria.LEAST_BESIDE_STEP, 0))
     before, after = values[:-1][inner], values[1:][inner]
     places = ((before + after) / 2)[after > before]
-    if places.size > criteria.MOST_STEPS:
-        places = places[np.linspace(0, places.size - 1, criteria.MOST_STEPS).round().astype(int)]
-    columns = (channel.values[:, None] > places).astype(float)
-    return columns - columns.mean(axis=0)
+    if places.size > most:
+        places = places[np.linspace(0, places.size - 1, most).round().astype(int)]
+    return places
 
 
 def evenly(values: np.ndarray) -> np.ndarray:

@@ -19,6 +19,8 @@ FINE_UNITS = 50
 LEAST_BESIDE_STEP = 4
 # Largest number of places at which a step is tested.
 MOST_STEPS = 40
+# Largest number of places at which a change that lasts for a while may begin or end.
+MOST_ENDS = 20
 # Share of strokes that end before the friction is steady from which effects along strokes are not searched.
 # In 68 worlds drawn at random with strokes of three to five bristle lengths no effect along the strokes was
 # found except ripples, and in eight one was invented or the verdict was `unexplained`.
@@ -45,8 +47,10 @@ TESTED_AGAINST_RUNS = 0.05
 CONSTANT_IN_RUNS = 0.9
 # An amplitude is identifiable if the model leaves at least this share of the column's variance.
 IDENTIFIABLE = 0.01
-# Number of searches that share the family-wise error rate: single channels, and pairs of channels.
-SEARCHES = 2
+# Factors on p-values of the searches that share the family-wise error rate: single channels and pairs of
+# channels have 1 / 2.2 of it each, and changes that last for a while the rest, 1 / 11.
+SEARCHES = 2.2
+TEMPORARY_FACTOR = 5.0
 # Ratio of the largest to the smallest value of a positive channel from which pairs use its logarithm too.
 LOGARITHMIC_SPAN = 5.0
 # Factor on p-values of pairs. They are many and seldom true, and get half their share of the error rate.
@@ -170,7 +174,7 @@ RIPPLE_CONFIRMED_P = 0.005
 # Number of rivals, best first, whose held-out error is computed too.
 MOST_RIVALS = 4
 # Number of proposals of a round tested on held-out data before the residual counts as unexplained.
-MOST_PROPOSALS = 3
+MOST_PROPOSALS = 4
 # The gain is about group means if at least this share of the effect's variance lies within the groups.
 MOST_WITHIN = 0.5
 # The same share for the comparison of errors at the end of the loop. Frictional heating along a stroke has a

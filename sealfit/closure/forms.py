@@ -29,7 +29,7 @@ from sealfit.tables import CALENDAR
 
 ADDED = ("force", "add")
 
-MOST_PLACES = 60  # Largest number of places of a jump on a grid.
+MOST_PLACES = 60  # Largest number of places of a jump on a grid, or of pairs of two jumps.
 
 NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1}
 """Number of mu_s, mu_c, v_s and sigma_2 that the speeds of a series determine, by the form of its curve."""
@@ -310,8 +310,9 @@ def grid_of(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
         if p.search == "inside":
             grid = np.quantile(np.unique(values), np.linspace(0.05, 0.95, 13))
         elif p.search == "between":
-            middle = middles(values)
-            grid = middle[np.unique(np.linspace(0, middle.size - 1, MOST_PLACES).astype(int))]
+            middle, jumps = middles(values), sum(other.search == "between" for other in effect.nonlinear)
+            most = round(MOST_PLACES ** (1 / jumps))
+            grid = middle[np.unique(np.linspace(0, middle.size - 1, most).astype(int))]
         elif p.search == "span":
             grid = np.geomspace(span / 100, span * 2, 13)
         elif p.search == "ratio":

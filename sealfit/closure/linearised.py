@@ -93,9 +93,9 @@ def linearised(
     at = (effect.id, term.channels, points, term.fixed)
     coarse = shapes.once("of a grid", lambda: _shapes(term, points, rows), at=at)
     point, most, shape = _best(fitted, term, points, coarse)
-    finer = _between(term, point, search, rows)
-    if finer:
-        point, most, shape = _best(fitted, term, finer, _shapes(term, finer, rows))
+    for jump in (p.name for p in effect.nonlinear if p.search == "between"):
+        if finer := _between(term, point, jump, search[jump], rows):
+            point, most, shape = _best(fitted, term, finer, _shapes(term, finer, rows))
     if not most > 0:
         return []
     left = project(fitted, fitted.slope(*term.target)[:, None] * shape)
@@ -134,13 +134,10 @@ def _best(
 
 
 def _between(
-    term: Term, point: Mapping[str, float], search: Mapping[str, tuple], rows: Rows
+    term: Term, point: Mapping[str, float], jump: str, searched: tuple[float, ...], rows: Rows
 ) -> list[dict[str, float]]:
     """Return the places of a jump between the best grid point's neighbours that the grid left out."""
-    jump = next((p.name for p in term.effect.nonlinear if p.search == "between"), None)
-    if jump is None:
-        return []
-    grid = np.array(search[jump])
+    grid = np.array(searched)
     at = int(np.searchsorted(grid, point[jump]))
     places = middles(term.inputs(rows)[term.effect.reads[0]])
     near = places[(places >= grid[max(at - 1, 0)]) & (places <= grid[min(at + 1, grid.size - 1)])]

@@ -78,6 +78,7 @@ class Candidate:
     p_value: float = 1.0  # adjusted over the search
     pair: bool = False  # whether it is an interaction of two channels
     place: bool = False  # whether it is a step or a kink at one of many places along its channel
+    temporary: bool = False  # whether it begins at one time and ends at another; searched by themselves
 
     @property
     def target(self) -> tuple[str, str]:
@@ -201,7 +202,7 @@ class ScoreTests:
         tests = tuple(contrast_test(self.fitted, left, between) for left in variants)
         if any(test is None for test in tests):
             return None
-        constant = self._test_of_constants(variants, target) if between in ("file", "run") else None
+        constant = self._test_of_constants(variants, target, between) if between in ("file", "run") else None
         return weakest._replace(slopes=tests, small_sample=constant)
 
     def _specimens_agree(self, left: np.ndarray) -> bool:
@@ -214,14 +215,14 @@ class ScoreTests:
         return not along_strokes(fitted, explained)[0] or bool(specimens_agree(fitted, explained)[0])
 
     def _test_of_constants(
-        self, variants: Sequence[np.ndarray], target: tuple[str, str]
+        self, variants: Sequence[np.ndarray], target: tuple[str, str], coarsest: str
     ) -> SmallSampleTest | None:
         """Return the weakest F test of all variants of columns that are constant in each run, or each file.
 
-        None if they are not. It is exact; the variance of a slope from half a dozen runs has two or three
-        degrees of freedom.
+        Between specimens, of columns that are constant in each specimen. None if they are not. It is exact;
+        the variance of a slope from half a dozen runs has two or three degrees of freedom.
         """
-        for level in ("run", "file"):
+        for level in ("specimen",) if coarsest == "specimen" else ("run", "file"):
             tests = [self.cluster_tests[level].test(left, target) for left in variants]
             if all(test is not None and test.share > criteria.CONSTANT_IN_RUNS for test in tests):
                 return max(tests, key=lambda test: test.log_p)
@@ -243,8 +244,8 @@ class ScoreTests:
         jackknife = 0.0
         if units >= criteria.JACKKNIFE_UNITS:
             explained, against_units = _log(chdtrc(left.shape[1], total @ total)), 0.0
-            if level in ("file", "run") and explained < np.log(criteria.TESTED_AGAINST_RUNS):
-                test = self._test_of_constants([left], target)
+            if level != "stroke" and explained < np.log(criteria.TESTED_AGAINST_RUNS):
+                test = self._test_of_constants([left], target, level)
                 if test is not None:
                     against_units = test.log_p
                     explained = min(explained, against_units)

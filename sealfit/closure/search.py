@@ -15,6 +15,7 @@ from sealfit.closure.channels import (
     evenly,
     flip_level,
     free_columns,
+    intervals,
     kinks,
     run_means,
     scatter_level,
@@ -37,6 +38,7 @@ from sealfit.closure.criteria import (
     MOST_PAIRED,
     PAIR_FACTOR,
     SEARCHES,
+    TEMPORARY_FACTOR,
 )
 from sealfit.closure.multiplicity import adjust_all
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
@@ -61,7 +63,12 @@ NOT_TESTED = ScoreTestResult(0.0, 0, 0, 0.0)
 def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
     """Return every candidate with its adjusted p-value, strongest evidence first."""
     candidates = [c for channel in channels for c in channel_candidates(tests, channel)]
-    return adjust_all(tests, candidates, rng) if candidates else []
+    temporary = [c for c in candidates if c.temporary]
+    lasting = [c for c in candidates if not c.temporary]
+    found = adjust_all(tests, lasting, rng) if lasting else []
+    for c in adjust_all(tests, temporary, rng) if temporary else []:
+        found.append(replace(c, p_value=min(1.0, TEMPORARY_FACTOR * c.p_value)))
+    return sorted(found, key=lambda c: -c.evidence)
 
 
 def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidate]:
@@ -81,6 +88,8 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
         yield from _each_column(tests, channel, kinks(channel))
     if channel.name == "elapsed_h":
         yield from _each_column(tests, channel, steps(channel, rows))
+        for candidate in _each_column(tests, channel, intervals(channel, rows)):
+            yield replace(candidate, temporary=True)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
     if channel.numeric and units >= FINE_UNITS and np.unique(channel.values).size > 2 * FINE_DF:
         yield from _shape_candidates(tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
@@ -185,6 +194,7 @@ def search_pairs(
     found = [c for pair in itertools.combinations(usable, 2) for c in _pair_candidates(tests, *pair)]
     if not found:
         return []
+    singles = [c for c in singles if not c.temporary]
     pairs = [c for c in adjust_all(tests, [*found, *singles], rng) if c.pair]
     return [replace(c, p_value=min(1.0, PAIR_FACTOR * c.p_value)) for c in pairs]
 

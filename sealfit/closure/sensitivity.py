@@ -74,7 +74,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     entries = []
     for name, channel in selection.channels.items():
         target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
-        own = [c for c in selection.last if (c.channels[-1], c.target) == (name, target) and not c.pair]
+        own = [c for c in search.candidates if (c.channels[-1], c.target) == (name, target) and not c.pair]
         own = sorted(own, key=lambda c: c.columns.shape[1])[:1]  # a straight line
         for level, part in _parts(selection, channel, own):
             smallest = None
@@ -167,7 +167,8 @@ class _Search:
     """
 
     def __init__(self, selection: Selection, alpha: float) -> None:
-        self.fitted, self.channels, self.candidates = selection.after, selection.channels, selection.left_over
+        self.fitted, self.channels = selection.after, selection.channels
+        self.candidates = [c for c in selection.left_over if not c.temporary]
         self.level, self.tests = alpha / criteria.SEARCHES, ScoreTests(selection.after)
         results = [c.test_result for c in self.candidates]
         slopes = [j.slopes for j in results if j.slopes]

@@ -169,6 +169,36 @@ def campaign_drift(inputs, *, A):
     return A * np.asarray(inputs["elapsed_h"], dtype=float)
 
 
+def _dated(hours: np.ndarray) -> bool:
+    return bool(np.isfinite(hours).all())  # NaN where the start of a file is not known
+
+
+@effect(
+    label="change that lasts for a while",
+    equation="h = A if t_1 <= t < t_2, else 0",
+    reference="before {t_1} and from {t_2} on",
+    reads=("elapsed_h",),
+    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
+    parameters=(
+        amplitude("A", "{y}", 0.02, "size of the change"),
+        Parameter("t_1", "{x}", 0.0, (-1e6, 1e6), "when it begins", search="between"),
+        Parameter("t_2", "{x}", 1.0, (-1e6, 1e6), "when it ends", search="between"),
+    ),
+    source="Form: ours. Two steps of equal height.",
+    # By hand: at its begin it has its full size.
+    worked=({"elapsed_h": 3.0}, {"A": 0.04, "t_1": 3.0, "t_2": 5.0}, 0.04),
+    shown_by=_dated,
+)
+def temporary_change(inputs, *, A, t_1, t_2):
+    r"""Change that lasts for a while: another operator, fixture or bottle of oil in some week.
+
+    t is the time since the campaign's first file. Only the interval between two neighbouring files is
+    determined for t_1 and for t_2. A change that lasts to the end of the campaign is a `step`.
+    """
+    hours = np.asarray(inputs["elapsed_h"], dtype=float)
+    return A * np.where(np.isnan(hours), np.nan, (hours >= t_1) & (hours < t_2))
+
+
 # Period of day and night, in h.
 DAY_H = 24.0
 # Days of tests, and the part of each that its tests must span, from which a daily change is looked for.
@@ -176,7 +206,7 @@ LEAST_DAYS, LEAST_PART = 2, 0.25
 
 
 def _shows_days(hours: np.ndarray) -> bool:
-    if not np.isfinite(hours).all():  # the start of a file is not known
+    if not _dated(hours):
         return False
     day = np.floor((hours - hours.min()) / DAY_H).astype(int)
     spans = [np.ptp(hours[day == k]) for k in np.unique(day)]

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
+from sealfit.closure.criteria import SEARCHES
 from sealfit.closure.multiplicity import (
     FLIPS,
     MOST_FLIPS,
@@ -205,14 +206,14 @@ def test_two_ways_to_test_have_half_of_the_error_each():
         [candidate("a", strong)],
         np.random.default_rng(0),
     )
-    assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-20.0))
+    assert found[0].p_value == pytest.approx(SEARCHES * 2 * np.exp(-20.0))
     both = ScoreTestResult(1.0, 1, 8, NOWHERE, small_sample=along(-30.0, 0), slopes=(slopes_of(0.1),))
     found = adjust_all(
         SimpleNamespace(cluster_tests={"specimen": FourNumbers}),
         [candidate("a", both)],
         np.random.default_rng(0),
     )
-    assert found[0].p_value == pytest.approx(2 * 2 * np.exp(-30.0))
+    assert found[0].p_value == pytest.approx(SEARCHES * 2 * np.exp(-30.0))
 
 
 def test_a_claim_needs_enough_specimens_and_that_they_agree():

@@ -45,13 +45,13 @@ def test_product_of_two_columns_is_found_and_predicted():
 def test_slope_in_one_batch_only_is_found():
     def in_b(table, force):
         return (
-            force * (1 + 0.006 * (table["oil_ppm"] - 50) * np.where(table["batch"] == "B", 1, -1)).to_numpy()
+            force * (1 + 0.008 * (table["oil_ppm"] - 50) * np.where(table["batch"] == "B", 1, -1)).to_numpy()
         )
 
     effects = close(in_b, Config())[1].document["effects"]
     assert [(e["id"], set(e["channels"])) for e in effects] == [("slopes", {"oil_ppm", "batch"})]
     low, high = sorted(p["value"] for p in effects[0]["parameters"])
-    assert (low, high) == (pytest.approx(-0.006, rel=0.2), pytest.approx(0.006, rel=0.2))
+    assert (low, high) == (pytest.approx(-0.008, rel=0.2), pytest.approx(0.008, rel=0.2))
 
 
 def test_mixed_columns_hold_nothing_of_either_channel_alone():

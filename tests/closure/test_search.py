@@ -328,7 +328,35 @@ def test_a_short_part_of_the_campaign_is_found_by_the_finer_shape():
     finer = next(c for c in found if c.columns.shape[1] > 6)
     assert finer.channels == ("elapsed_h",)
     assert finer.p_value < 0.001
-    assert finer.chi2 > 1.5 * max(c.chi2 for c in found if c.columns.shape[1] == 1)
+    assert finer.chi2 > 1.5 * max(c.chi2 for c in found if c.columns.shape[1] == 1 and not c.temporary)
+
+
+@pytest.mark.parametrize("more", [0.0, 0.04])
+def test_a_change_of_one_week_is_found_where_each_file_is_a_piece_of_its_own(more):
+    rng = np.random.default_rng(3)
+    bins = make_bins(3, temperatures=(), days=(), speeds=tuple(np.geomspace(1, 100, 11)), bins=4, gain=0.0)
+    files = bins["file"].unique()
+    hours, scatter = (
+        dict(zip(files, x, strict=True)) for x in (rng.uniform(0, 840, 33), rng.normal(0, 0.008, 33))
+    )
+    bins = bins.assign(
+        elapsed_h=bins["file"].map(hours), specimen_id=bins["file"], run_id=bins["file"], repeat=1
+    )
+    week = bins["elapsed_h"].between(168.0, 336.0)
+    force = bins["force_N"] * (1 + bins["file"].map(scatter)) * (1 + more * week)
+    fitted = fit_declared(make_rows(bins.assign(force_N=force), has_aging=False))
+    channels = {c.name: c for c in find_channels(fitted.rows)}
+    found = search(ScoreTests(fitted), list(channels.values()), np.random.default_rng(0))
+    significant = [c for c in found if c.p_value < 0.005]
+    if not more:
+        assert significant == []
+        return
+    named = propose(fitted, significant, channels, EFFECTS)[0]
+    assert named.term.effect.id == "temporary_change"
+    values, hours = named.fitted.model.values[-1], bins["elapsed_h"]
+    assert values["A"] == pytest.approx(more, rel=0.25)
+    assert hours[hours < 168].max() < values["t_1"] < hours[week].min()
+    assert hours[week].max() < values["t_2"] < hours[hours > 336].min()
 
 
 def test_a_step_in_time_is_found_in_a_few_files_that_repeat_well():

@@ -126,6 +126,8 @@ def test_every_parameter_changes_the_shape(effect):
     inputs, values = inputs_of(effect), nonzero(effect)
     if effect.id == "step":
         values["x_0"] = 4.0
+    if effect.id == "temporary_change":
+        values |= {"t_1": 150.0, "t_2": 400.0}
     before = effect.shape(inputs, **values)
     for p in effect.parameters:
         moved = {**values, p.name: values[p.name] * 1.5 + 0.3}
