@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import accumulate
 
 import numpy as np
 
@@ -312,12 +311,8 @@ def _stepped(time: np.ndarray, speed: np.ndarray, limit: np.ndarray, start: np.n
     """Return every element's deflection, shape (n, elements), exact for a speed constant between times."""
     slid = np.abs(speed) * np.diff(time, prepend=time[0])
     kept, end = np.exp(-slid[:, None] / limit), np.sign(speed)[:, None] * limit
-    paths = []
-    for ends, shares, begin in zip(end.T.tolist(), kept.T.tolist(), start.tolist(), strict=True):
-        steps = accumulate(
-            zip(ends, shares, strict=True),
-            lambda now, step: step[0] + (now - step[0]) * step[1],
-            initial=begin,
-        )
-        paths.append(list(steps)[1:])
-    return np.array(paths).T
+    z, path = start, np.empty_like(kept)
+    for k in range(len(time)):
+        z = end[k] + (z - end[k]) * kept[k]
+        path[k] = z
+    return path
