@@ -15,9 +15,8 @@ Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,74 +28,44 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
 # ---------------------------------------------------------------- pressure
+# Load per unit width in the contact, F_n / L s(x) at x = zeta / L from 0 to 1 (Eqs. 8 to 11). Each function
+# returns s, the load relative to its mean, shape (n,).
 
 
-def load_per_width(zeta_mm, load_N, *, width_mm, shape="uniform", decay=None):
-    r"""Return the load per unit width at places in the contact (Eqs. 8 to 11), shape (n,), in N/mm.
+def sine(x):
+    r"""Return s of the sine distribution, :math:`\pi / 2 \sin \pi x`."""
+    return np.pi / 2 * np.sin(np.pi * x)
 
-    .. math::
-        f_n = \frac{F_n}{L} s(\zeta / L), \quad s(x) = 1, \quad \frac{\pi}{2} \sin \pi x, \quad
-        \frac{\lambda e^{-\lambda x}}{1 - e^{-\lambda}} \quad \text{or} \quad 6 x (1 - x)
 
-    Parameters
-    ----------
-    zeta_mm : float or ndarray, shape (n,)
-        Position in the contact, 0 <= zeta <= L, in mm.
-    load_N : float
-        Total load F_n in N.
-    width_mm : float
-        Contact width L in mm.
-    shape : str
-        "uniform", "sine", "exponential" or "parabolic".
-    decay : float, optional
-        lambda of the exponential shape, dimensionless; default 1. At 0 it is uniform; below 0 it increases.
+def exponential(x, decay=1.0):
+    r"""Return s of the exponential distribution, :math:`\lambda e^{-\lambda x} / (1 - e^{-\lambda})`.
 
-    Raises
-    ------
-    ParameterError
-        If the width is not positive, zeta lies outside the contact, or the shape is unknown or has no decay.
-
-    Examples
-    --------
-    >>> [round(float(load_per_width(1.0, 50.0, width_mm=2.0, shape=shape)), 4) for shape in PRESSURES]
-    [25.0, 39.2699, 23.9879, 37.5]
+    `decay` is lambda, dimensionless. At 0 the distribution is uniform; below 0 it increases.
     """
-    zeta = np.asarray(zeta_mm, float)
-    if not width_mm > 0:
-        raise ParameterError(f"width_mm = {width_mm:g}: the contact width must be positive.")
-    if np.any((zeta < 0) | (zeta > width_mm)):
-        raise ParameterError(f"zeta_mm must lie in the contact, from 0 to {width_mm:g} mm.")
-    if shape not in PRESSURES or not (decay is None or shape == "exponential"):
-        shapes = f"the shapes are {', '.join(PRESSURES)}; only exponential has a decay"
-        raise ParameterError(f"shape = {shape!r}, decay = {decay}: {shapes}.")
-    x, decay = zeta / width_mm, 1.0 if decay is None else decay
-    if shape == "sine":
-        relative = np.pi / 2 * np.sin(np.pi * x)
-    elif shape == "parabolic":
-        relative = 6 * x * (1 - x)
-    elif shape == "exponential" and decay != 0:
-        relative = decay * np.exp(-decay * x) / -np.expm1(-decay)
-    else:
-        relative = np.ones_like(x)
-    return load_N / width_mm * relative
+    if decay == 0:
+        return np.ones_like(x)
+    return decay * np.exp(-decay * x) / -np.expm1(-decay)
 
 
-# The distributions by name, functions of zeta_mm, load_N and width_mm.
-PRESSURES = {
-    shape: partial(load_per_width, shape=shape) for shape in ("uniform", "sine", "exponential", "parabolic")
-}
+def parabolic(x):
+    """Return s of the parabolic distribution, 6 x (1 - x)."""
+    return 6 * x * (1 - x)
+
+
+# The distributions by name.
+PRESSURES = {"uniform": np.ones_like, "sine": sine, "exponential": exponential, "parabolic": parabolic}
 
 
 @dataclass(frozen=True)
 class Contact:
     r"""A contact whose friction depends on the local pressure, :math:`\mu \propto p^{n-1}`."""
 
-    pressure: Callable = load_per_width  # one of `PRESSURES`, or a function with the same arguments
+    # One of `PRESSURES`, or another function of x: `partial(exponential, decay=2.0)`.
+    pressure: Callable = np.ones_like
     width_mm: float = 1.0  # contact width L
     exponent: float = 1.0  # n; 1 for friction independent of the pressure, 2/3 to 1 for rubber
     # Load per width at which mu_s and mu_c are defined; default the mean of the present load.
     reference_N_mm: float | None = None
-    shape: Mapping[str, float] = field(default_factory=dict)  # further arguments of `pressure`: `decay`
 
     def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
         """Return each element's share of the load and mu relative to the reference, shape (elements,) each.
@@ -112,12 +81,15 @@ class Contact:
         >>> round(float(share.sum()), 12), round(float(share @ factor), 3)
         (1.0, 0.975)
         """
-        reference = load_N / self.width_mm if self.reference_N_mm is None else self.reference_N_mm
+        if not self.width_mm > 0:
+            raise ParameterError(f"width_mm = {self.width_mm:g}: the contact width must be positive.")
+        mean = load_N / self.width_mm
+        reference = mean if self.reference_N_mm is None else self.reference_N_mm
         if not (load_N > 0 and reference > 0):
             raise ParameterError(f"load_N = {load_N:g}, reference {reference:g} N/mm: both must be positive.")
-        local = self.pressure(self.width_mm / 2 * (1 + _NODES), load_N, width_mm=self.width_mm, **self.shape)
-        share = _WEIGHTS * local
-        return share / share.sum(), (local / reference) ** (self.exponent - 1)
+        relative = self.pressure((1 + _NODES) / 2)
+        share = _WEIGHTS * relative
+        return share / share.sum(), (mean * relative / reference) ** (self.exponent - 1)
 
 
 # ---------------------------------------------------------------- steady sliding

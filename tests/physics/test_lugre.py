@@ -117,7 +117,7 @@ def test_local_pressure_ends_in_the_steady_force_summed_over_the_contact(pressur
     found = lugre_force([0.0, 100.0], [3.0, 3.0], LOAD, LuGre(**MODEL, contact=contact))
     # mu p integrated over the contact by another quadrature, for mu in proportion to (p / reference)^(n - 1)
     scaled, _ = quad(
-        lambda zeta: float(pressure(zeta, LOAD, width_mm=3.0)) ** exponent * reference ** (1 - exponent),
+        lambda zeta: (LOAD / 3.0 * float(pressure(zeta / 3.0))) ** exponent * reference ** (1 - exponent),
         0,
         3.0,
     )
