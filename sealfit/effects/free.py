@@ -125,7 +125,7 @@ def listed(values: Sequence[object]) -> str:
 #
 # .. math:: h = \sum_j c_j B_j(x)
 #
-# B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the reference knot has none.
+# B_j are the natural cubic splines that are 1 at knot j and 0 at the others; the first knot has none.
 # Beyond the outer knots the shape is constant, as nothing was measured there. If its mean over the campaign
 # is given it is subtracted, as the declared model has a constant already.
 
@@ -135,31 +135,26 @@ SMOOTH, SURFACE = "smooth", "surface"
 WIDE = 20.0
 
 
-def smooth_effect(
-    knots: Sequence[float], x_ref: float | None = None, means: Sequence[float] | None = None
-) -> Effect:
+def smooth_effect(knots: Sequence[float], means: Sequence[float] | None = None) -> Effect:
     """Return a natural cubic spline of the channel, with its values at the knots as amplitudes.
 
-    Its amplitudes are `c_j`, j the number of the knot from 1. The shape is zero at the knot nearest to
-    `x_ref`, by default the first, which has no amplitude; with `means`, the mean of each B_j over the
-    campaign, its mean is zero.
+    Its amplitudes are `c_2`, `c_3`, ... for the knots after the first, at which the shape is zero. With
+    `means`, the mean of each B_j over the campaign, its mean is zero.
 
     ParameterError if there are fewer than two knots, or they do not rise.
     """
     places = _rising(SMOOTH, knots)
-    zero = 0 if x_ref is None else int(np.argmin(np.abs(np.array(places) - x_ref)))
-    at_zero = f"{places[zero]:.6g}"
+    first = f"{places[0]:.6g}"
     spline = closed_form(
         id=SMOOTH,
         label="smooth in {x}",
-        equation=f"h = natural cubic spline through (x_j, c_j), knots {listed(places)}, zero at {at_zero}",
-        reference=f"{{x}} = {at_zero}",
+        equation=f"h = natural cubic spline through (x_j, c_j), knots {listed(places)}, zero at {first}",
+        reference=f"{{x}} = {first}",
         parameters=tuple(
-            amplitude(f"c_{j + 1}", "{y}", 0.0, f"value at {place:.6g} less that at {at_zero}")
-            for j, place in enumerate(places)
-            if j != zero
+            amplitude(f"c_{j}", "{y}", 0.0, f"value at {place:.6g} less that at {first}")
+            for j, place in enumerate(places[1:], start=2)
         ),
-        shape=partial(_spline, places, zero, shares(means, len(places))),
+        shape=partial(_spline, places, shares(means, len(places))),
         source="Form: ours. de Boor 2001, A Practical Guide to Splines, Springer; natural end conditions.",
     )
     return _centred(spline, means)
@@ -173,11 +168,9 @@ def _rising(id: str, knots: Sequence[float]) -> tuple[float, ...]:
     return places
 
 
-def _spline(
-    places: tuple[float, ...], zero: int, means: tuple[float, ...], inputs: Mapping, **values
-) -> np.ndarray:
+def _spline(places: tuple[float, ...], means: tuple[float, ...], inputs: Mapping, **values) -> np.ndarray:
     basis = natural(places, np.asarray(inputs[CHANNEL], dtype=float)) - means
-    amplitude = np.array([0.0 if j == zero else values[f"c_{j + 1}"] for j in range(len(places))])
+    amplitude = np.array([0.0, *(values[f"c_{j}"] for j in range(2, len(places) + 1))])
     return basis @ amplitude
 
 
@@ -284,7 +277,7 @@ def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:
 
     Examples
     --------
-    >>> effect = free_effect("smooth", {"knots": [0.0, 1.0, 2.0], "x_ref": 0.0})
+    >>> effect = free_effect("smooth", {"knots": [0.0, 1.0, 2.0]})
     >>> effect.linear, [float(h) for h in effect.shape({"x": [0.0, 2.0, 3.0]}, c_2=1.0, c_3=2.0)]
     (('c_2', 'c_3'), [0.0, 2.0, 2.0])
     """

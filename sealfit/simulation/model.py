@@ -184,7 +184,7 @@ def _resolve(entry: EffectEntry, place: str) -> BoundEffect:
 def _catalogued(entry: EffectEntry, place: str) -> Effect:
     if entry.id == SMOOTH:
         try:
-            return smooth_effect(entry.knots, entry.reference.get("x_ref"))
+            return smooth_effect(entry.knots)
         except ParameterError as error:
             raise ConfigError(f"{place}: {error}", fix="Give knots = [...].") from error
     if entry.id not in EFFECTS:

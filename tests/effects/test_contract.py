@@ -18,9 +18,9 @@ from sealfit.effects.free import levels_effect, smooth_effect
 from sealfit.errors import ParameterError
 
 FREE = {
-    "smooth": smooth_effect([0.0, 1.0, 3.0, 10.0], x_ref=1.2),
+    "smooth": smooth_effect([0.0, 1.0, 3.0, 10.0]),
     "smooth of two knots": smooth_effect([2.0, 5.0]),
-    "smooth about its mean": smooth_effect([0.0, 1.0, 3.0, 10.0], 0.0, (0.4, 0.3, 0.2, 0.1)),
+    "smooth about its mean": smooth_effect([0.0, 1.0, 3.0, 10.0], (0.4, 0.3, 0.2, 0.1)),
     "levels about their mean": levels_effect(["batch A", "batch B", "batch C"], (0.5, 0.25, 0.25)),
     "levels": levels_effect(["batch A", "batch B", "batch C"]),
 }

@@ -24,15 +24,15 @@ from sealfit.errors import ParameterError
     knots=st.lists(st.integers(-50, 50), min_size=3, max_size=6, unique=True).map(sorted),
     amplitudes=st.lists(st.floats(-5, 5), min_size=6, max_size=6),
 )
-def test_smooth_goes_through_its_knots_and_is_zero_at_the_reference(knots, amplitudes):
-    effect = smooth_effect(knots, x_ref=knots[1])
+def test_smooth_goes_through_its_knots_and_is_zero_at_the_first(knots, amplitudes):
+    effect = smooth_effect(knots)
     values = dict(zip(effect.linear, amplitudes, strict=False))
     wanted = [values.get(f"c_{j + 1}", 0.0) for j in range(len(knots))]
     npt.assert_allclose(effect.shape({"x": np.array(knots, float)}, **values), wanted, atol=1e-10)
 
 
 def test_smooth_holds_straight_lines_inside_its_knots_and_its_last_values_beyond():
-    effect = smooth_effect([0.0, 1.0, 4.0, 10.0], x_ref=0.0)
+    effect = smooth_effect([0.0, 1.0, 4.0, 10.0])
     x = np.array([-5.0, 0.0, 0.3, 2.0, 7.7, 10.0, 25.0])
     wanted = 0.5 * np.clip(x, 0.0, 10.0)
     npt.assert_allclose(effect.shape({"x": x}, c_2=0.5, c_3=2.0, c_4=5.0), wanted, atol=1e-13)
@@ -69,14 +69,10 @@ def test_a_category_that_was_not_fitted_gets_no_value():
 
 @pytest.mark.parametrize(
     ("id_", "fixed"),
-    [("smooth", {"knots": [0.0, 2.0, 5.0], "x_ref": 2.1}), ("levels", {"categories": ["A", "B", "C"]})],
+    [("smooth", {"knots": [0.0, 2.0, 5.0]}), ("levels", {"categories": ["A", "B", "C"]})],
 )
 def test_free_shapes_are_rebuilt_from_plain_data(id_, fixed):
-    direct = (
-        smooth_effect(fixed["knots"], fixed["x_ref"])
-        if id_ == "smooth"
-        else levels_effect(fixed["categories"])
-    )
+    direct = smooth_effect(fixed["knots"]) if id_ == "smooth" else levels_effect(fixed["categories"])
     rebuilt = free_effect(id_, json.loads(json.dumps(fixed)))
     assert rebuilt.parameters == direct.parameters
     assert (rebuilt.id, rebuilt.form) == (id_, direct.form)
@@ -106,10 +102,10 @@ def test_refuses_what_makes_no_effect(call, words):
     ("effect", "inputs", "values", "expected"),
     [
         # At a knot the spline is that knot's amplitude, whatever the others are.
-        (smooth_effect([0, 1, 3, 10], 1.2), {"x": 10.0}, {"c_1": 1.0, "c_3": 3.0, "c_4": 4.0}, 4.0),
+        (smooth_effect([0, 1, 3, 10]), {"x": 10.0}, {"c_2": 1.0, "c_3": 3.0, "c_4": 4.0}, 4.0),
         # The mean is 2 * 0.3 + 3 * 0.2 + 4 * 0.1.
         (
-            smooth_effect([0, 1, 3, 10], 0.0, (0.4, 0.3, 0.2, 0.1)),
+            smooth_effect([0, 1, 3, 10], (0.4, 0.3, 0.2, 0.1)),
             {"x": 10.0},
             {"c_2": 2.0, "c_3": 3.0, "c_4": 4.0},
             4.0 - 1.6,
