@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.engine.run_map import on_cluster
-from sealfit.errors import CampaignError, Fault, OutError, ParameterError, RequestError, StaleError
+from sealfit.errors import CampaignError, Fault, OutError, ParameterError, RequestError, StaleError, disk
 from sealfit.pipeline import FITS
 from sealfit.progress import Silent
 from sealfit.store import Store, paths
@@ -41,11 +41,8 @@ def init(folder: Path, output: Path, *, force: bool = False) -> dict:
         fix = "Choose another --output, or replace it with --force."
         raise OutError("is there already.", file=output, fix=fix)
     made = draft(folder)
-    try:
+    with disk(output, "--output"):
         output.write_text(made.text, "utf-8")
-    except OSError as error:
-        fix = "Choose another --output."
-        raise OutError(f"cannot be written ({error.strerror}).", file=output, fix=fix) from error
     return {
         "config": str(output),
         "folder": str(folder),
@@ -97,8 +94,8 @@ def predict(
     `effects_folder` is run: it holds the user's own effects, which the model may need.
 
     StaleError if the loop has not been closed on the campaign as it stands, or with other effects of the
-    user's own. RequestError if the points cannot be read, lack a column that the model needs, the answers
-    cannot be written, or the model needs the user's own effects and no folder of them is given.
+    user's own. RequestError if the points cannot be read, lack a column that the model needs, or the model
+    needs the user's own effects and no folder of them is given. OutError if the answers cannot be written.
     """
     from sealfit.closure.prediction_csv import points_of, read_points, write_answers
 

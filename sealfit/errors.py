@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import errno
 import re
 import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -300,6 +301,19 @@ class FitError(SealfitError):
 
 class WorkerError(SealfitError):
     """A worker process died (killed, or out of memory) before it had answered."""
+
+
+@contextlib.contextmanager
+def disk(path: Path, option: str = "--out") -> Iterator[None]:
+    """Turn an error of the file system into an OutError of `path`, for which the `option` stands."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        fix = f"Choose another {option}, or fix the rights of the folder."
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            fix = "Free some space and run the command again."
+        raise OutError(f"cannot be written ({reason}).", file=path, fix=fix) from error
 
 
 # ---------------------------------------------------------------- memory

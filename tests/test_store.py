@@ -872,7 +872,10 @@ def test_a_file_in_the_way_of_the_staging_is_one_line(out, campaign, monkeypatch
 
     do_all(out, campaign)
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(OutError, match=r"Permission denied\)\. Fix the rights"), Store.writing(out) as store:
+    with (
+        pytest.raises(OutError, match=r"Permission denied\)\. Choose another --out, or fix the rights"),
+        Store.writing(out) as store,
+    ):
         do(store, "report")
 
 

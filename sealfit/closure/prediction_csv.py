@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from sealfit.errors import RequestError
+from sealfit.errors import RequestError, disk
 from sealfit.store.paths import existing_file
 from sealfit.store.staged_writes import sync, taken
 
@@ -128,7 +128,9 @@ def write_answers(points: pd.DataFrame, answers: pd.DataFrame, output: Path, *, 
     Raises
     ------
     RequestError
-        If `output` cannot be written or is the table of points itself.
+        If `output` is the table of points itself, or no name for a CSV.
+    OutError
+        If it cannot be written.
     """
     if output.exists() and output.resolve() == given.resolve():
         raise RequestError(f"--output {output} is the table of points.", fix="Give another name.")
@@ -145,12 +147,8 @@ def write_answers(points: pd.DataFrame, answers: pd.DataFrame, output: Path, *, 
     # `answers` has the same rows in the same order.
     table = pd.concat([points.map(_no_formula), answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     table.columns = [_no_formula(name) for name in table.columns]
-    try:
+    with disk(output, "--output"):
         _replace(output, table.to_csv(index=False, lineterminator="\n").encode("utf-8"))
-    except OSError as error:
-        raise RequestError(
-            f"{output} cannot be written ({error.strerror}).", fix="Choose another --output."
-        ) from error
     answered = answers["force_after_N"].notna()
     extrapolated = answers["extrapolated"].fillna(False).astype(bool) & answered
     return {"rows": len(answers), "answered": int(answered.sum()), "extrapolated": int(extrapolated.sum())}

@@ -16,11 +16,11 @@ import pyarrow as pa
 
 from sealfit import __version__
 from sealfit.config import Config
-from sealfit.errors import Fault
+from sealfit.errors import Fault, disk
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, Asked, Columns, Part, read_part
 from sealfit.store import parquet
-from sealfit.store.staged_writes import PARQUET, disk, sync
+from sealfit.store.staged_writes import PARQUET, sync
 
 # ---------------------------------------------------------------- trace access
 

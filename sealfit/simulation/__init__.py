@@ -16,7 +16,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
 
-from sealfit.errors import ConfigError, OutError, RequestError
+from sealfit.errors import ConfigError, OutError, RequestError, disk
 from sealfit.simulation import noise
 from sealfit.simulation.model import CONDITIONS
 from sealfit.simulation.motion import (
@@ -123,17 +123,15 @@ def simulate(spec: Spec, out: Path) -> None:
     _refuse_foreign(out)
     part = out.with_name(f".{out.name}.part-{os.getpid()}")
     try:
-        (part / "new" / "traces").mkdir(parents=True)
-        document = _write(spec, part / "new")
-        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-        (part / "truth.json").write_bytes(text.encode("utf-8"))
-        if out.exists():
-            os.replace(out, part / "old")
-        os.replace(part / "new", out)
-        os.replace(part / "truth.json", truth_path(out))
-    except OSError as error:
-        fix = "Check the disk and the folder's permissions."
-        raise OutError(f"cannot be written ({error.strerror}).", file=out, fix=fix) from error
+        with disk(out):
+            (part / "new" / "traces").mkdir(parents=True)
+            document = _write(spec, part / "new")
+            text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+            (part / "truth.json").write_bytes(text.encode("utf-8"))
+            if out.exists():
+                os.replace(out, part / "old")
+            os.replace(part / "new", out)
+            os.replace(part / "truth.json", truth_path(out))
     finally:
         if (part / "old").exists() and not out.exists():
             os.replace(part / "old", out)  # restore the last campaign after any interruption

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 from sealfit import __version__
 from sealfit.config import Config, Files
 from sealfit.engine import undisturbed
-from sealfit.errors import ConfigError, OutError, RequestError, StaleError, did_you_mean, quoted
+from sealfit.errors import ConfigError, OutError, RequestError, StaleError, did_you_mean, disk, quoted
 from sealfit.store import manifest
 from sealfit.store.manifest import STATE, ConfigCopy, Fingerprint, Properties, State, fingerprint, to_json
 from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
-from sealfit.store.staged_writes import COMPLETE, PARQUET, PROVENANCE, Staged, disk, file_size, held
+from sealfit.store.staged_writes import COMPLETE, PARQUET, PROVENANCE, Staged, file_size, held
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import json
 import os
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.engine import undisturbed
-from sealfit.errors import OutError
+from sealfit.errors import OutError, disk
 from sealfit.store.manifest import STAGING, STATE, Fingerprints, State, fingerprint, to_json
 from sealfit.tables import SCHEMAS
 from sealfit.units import Units
@@ -155,19 +154,6 @@ def refuse_links(folder: Path) -> None:
             raise OutError(f"'{path.name}' is a link to a folder.", file=folder, fix="Delete the link.")
 
 
-@contextlib.contextmanager
-def disk(out: Path) -> Iterator[None]:
-    """Turn an error of the file system into an OutError."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or str(error)
-        fix = "Fix the rights of the folder, or choose another --out."
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            fix = "Free some space and run the command again."
-        raise OutError(f"cannot be written ({reason}).", file=out, fix=fix) from error
-
-
 def file_size(path: str) -> int | None:
     """Return the size of a file in bytes; None where there is no file."""
     try:
@@ -212,13 +198,10 @@ def taken(path: Path, option: str = "--out") -> Iterator[int]:
 
 def _take(path: Path, option: str) -> int:
     while True:
-        try:
+        with disk(path.parent, option):
             if path.is_symlink():  # what it leads to would be written
                 path.unlink()
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-        except OSError as error:
-            fix = f"Choose another {option}, or fix its rights."
-            raise OutError(f"cannot be written ({error.strerror}).", file=path.parent, fix=fix) from error
         try:
             locked = _locked(handle)
             if _same_file(handle, path):  # otherwise its owner has just removed it: try again
@@ -290,13 +273,10 @@ def _runs(pid: object) -> bool:
 
 def _sign(handle: int, path: Path) -> None:
     owner = json.dumps({"host": socket.gethostname(), "pid": os.getpid()}).encode()
-    try:
+    with disk(path.parent):
         os.ftruncate(handle, 0)
         os.pwrite(handle, owner, 0)
         os.fsync(handle)
-    except OSError as error:
-        what = f"cannot be written ({error.strerror})."
-        raise OutError(what, file=path.parent, fix="Free some space.") from error
 
 
 # ---------------------------------------------------------------- own folder
