@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sealfit.engine.run_map import on_cluster
-from sealfit.errors import CampaignError, Fault, OutError, ParameterError, RequestError, StaleError, disk
+from sealfit.errors import CampaignError, Fault, OutError, ParameterError, RequestError, StaleError
 from sealfit.pipeline import FITS
 from sealfit.progress import Silent
 from sealfit.store import Store, paths
 from sealfit.store.manifest import ConfigCopy
 from sealfit.store.paths import OPTION, own_effects_folder, what_differs
+from sealfit.store.staged_writes import replace_file
 from sealfit.units import Units
 
 if TYPE_CHECKING:
@@ -41,8 +42,7 @@ def init(folder: Path, output: Path, *, force: bool = False) -> dict:
         fix = "Choose another --output, or replace it with --force."
         raise OutError("is there already.", file=output, fix=fix)
     made = draft(folder)
-    with disk(output, "--output"):
-        output.write_text(made.text, "utf-8")
+    replace_file(output, made.text)
     return {
         "config": str(output),
         "folder": str(folder),

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from pathlib import Path
 
 import pandas as pd
 
-from sealfit.errors import RequestError, disk
+from sealfit.errors import RequestError
 from sealfit.store.paths import existing_file
-from sealfit.store.staged_writes import sync, taken
+from sealfit.store.staged_writes import replace_file
 
 MISSING = ("", "nan", "NaN", "NA", "null")
 FORMULA = tuple("=+-@＝＋－＠")  # what a formula of a spreadsheet begins with
@@ -147,24 +146,7 @@ def write_answers(points: pd.DataFrame, answers: pd.DataFrame, output: Path, *, 
     # `answers` has the same rows in the same order.
     table = pd.concat([points.map(_no_formula), answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     table.columns = [_no_formula(name) for name in table.columns]
-    with disk(output, "--output"):
-        _replace(output, table.to_csv(index=False, lineterminator="\n").encode("utf-8"))
+    replace_file(output, table.to_csv(index=False, lineterminator="\n"))
     answered = answers["force_after_N"].notna()
     extrapolated = answers["extrapolated"].fillna(False).astype(bool) & answered
     return {"rows": len(answers), "answered": int(answered.sum()), "extrapolated": int(extrapolated.sum())}
-
-
-def _replace(output: Path, content: bytes) -> None:
-    """Write a file completely or not at all; what a killed process left of an earlier one is replaced."""
-    staged = output.with_name(f".{output.name}.part")
-    with taken(staged, "--output") as handle:
-        try:
-            with open(handle, "wb", closefd=False) as file:
-                file.truncate(0)
-                file.write(content)
-            os.fsync(handle)
-            os.replace(staged, output)
-        except OSError:
-            staged.unlink(missing_ok=True)
-            raise
-        sync(output.absolute().parent)

@@ -279,6 +279,25 @@ def _sign(handle: int, path: Path) -> None:
         os.fsync(handle)
 
 
+def replace_file(output: Path, text: str) -> None:
+    """Write the file that --output names completely or not at all.
+
+    What a killed process left of an earlier one is replaced. OutError if it cannot be written.
+    """
+    staged = output.with_name(f".{output.name}.part")
+    with taken(staged, "--output") as handle, disk(output, "--output"):
+        try:
+            with open(handle, "wb", closefd=False) as file:
+                file.truncate(0)
+                file.write(text.encode("utf-8"))
+            os.fsync(handle)
+            os.replace(staged, output)
+        except OSError:
+            staged.unlink(missing_ok=True)
+            raise
+        sync(output.absolute().parent)
+
+
 # ---------------------------------------------------------------- own folder
 # Ownership of the output folder: create it, or refuse one made by another program; one writer holds it.
 

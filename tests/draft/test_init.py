@@ -1,5 +1,6 @@
 """The command `sealfit init`: what it writes, prints and refuses."""
 
+import errno
 import json
 import os
 import re
@@ -114,6 +115,20 @@ def test_a_folder_that_cannot_be_written_is_said(sealfit, campaign):
     code, _, err = sealfit("init", campaign, "--output", "nowhere/rig.toml")
     assert code == 1
     assert "cannot be written" in err
+
+
+def test_a_full_disk_leaves_the_config_that_was_there(sealfit, campaign, monkeypatch):
+    Path("rig.toml").write_text("mine")
+
+    def full(_handle):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    code, _, err = sealfit("init", campaign, "--force")
+    assert code == 1
+    assert "rig.toml: cannot be written (No space left on device). Free some space" in err
+    assert Path("rig.toml").read_text() == "mine"
+    assert not Path(".rig.toml.part").exists()
 
 
 # ---------------------------------------------------------------- folders that it cannot draft from
