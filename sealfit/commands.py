@@ -117,9 +117,10 @@ def predict(
 def answers_to(points: pd.DataFrame, store: Store) -> pd.DataFrame:
     """Return points with their answers, by the model that `store`'s loop recorded; errors as `predict`."""
     from sealfit.closure.predict import predict as answer
+    from sealfit.effects.user import load_user_effects
 
     try:
-        return answer(store.read_json("model"), points, _own_effects(store.effects))
+        return answer(store.read_json("model"), points, load_user_effects(store.effects))
     except ParameterError as error:  # of a model that no loop writes
         raise store.not_ours("model") from error
 
@@ -210,15 +211,6 @@ def _conditions_of(store: Store, suffix: str) -> tuple[pd.DataFrame, SteadyFit]:
     return store.read(f"steady{suffix}"), fit
 
 
-def _own_effects(folder: Path | None) -> dict:
-    """Return the user's own effects, whose files are run, by id; none without a folder."""
-    if folder is None:
-        return {}
-    from sealfit.effects.user import load_user_effects
-
-    return load_user_effects(folder)
-
-
 def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict:
     """Return the catalogue; with OUT, in its units and with those that its loop added.
 
@@ -226,13 +218,14 @@ def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict
     some and none are given.
     """
     from sealfit.effects import EFFECTS
+    from sealfit.effects.user import load_user_effects
     from sealfit.report import summary
 
     if out is None:
-        known = EFFECTS | _own_effects(own_effects_folder(effects_folder, None))
+        known = EFFECTS | load_user_effects(own_effects_folder(effects_folder, None))
         return {"effects": summary.of_effects(known.values(), Units())}
     store = Store.open(out, effects_folder)
-    known = EFFECTS | _own_effects(store.effects)
+    known = EFFECTS | load_user_effects(store.effects)
     closed = not store.why_stale("close-loop")
     added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
     listed = {"effects": summary.of_effects(known.values(), store.config.units), "added": added}

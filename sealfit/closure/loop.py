@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -29,6 +28,7 @@ from sealfit.closure.selection import Selection, Start, select_effects
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
+from sealfit.effects.user import load_user_effects
 from sealfit.engine.run_map import run_map
 from sealfit.fit.joint import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate, shape_of
@@ -61,11 +61,7 @@ def close_loop(
     `on_progress` is called with a line on what is being done.
     """
     say = on_progress or Silent().say
-    effects = dict(EFFECTS)
-    if config.loop.effects_folder is not None:
-        from sealfit.effects.user import load_user_effects
-
-        effects |= load_user_effects(Path(config.loop.effects_folder))
+    effects = EFFECTS | load_user_effects(config.loop.effects_folder)
     context = Context(config, effects, say, workers=workers)
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins

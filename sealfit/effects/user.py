@@ -29,8 +29,8 @@ EXAMPLE = "See sealfit/effects/sensors.py for an example."
 TOLERANCE = 1e-9
 
 
-def load_user_effects(folder: Path) -> dict[str, Effect]:
-    """Return the effects of every .py file in `folder`, by id, in the order of the file names.
+def load_user_effects(folder: Path | str | None) -> dict[str, Effect]:
+    """Return the effects of every .py file in `folder`, by id, in the order of the file names; none for None.
 
     Raises
     ------
@@ -39,6 +39,8 @@ def load_user_effects(folder: Path) -> dict[str, Effect]:
         exists already or is no identifier, or an effect violates the contract (worked value, linearity,
         shape).
     """
+    if folder is None:
+        return {}
     folder = Path(folder)
     if not folder.is_dir():
         raise ConfigError(
