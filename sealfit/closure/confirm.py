@@ -218,11 +218,6 @@ class AcceptedEffect:
     rivals: tuple[tuple[Proposal, float], ...]
     round: int
 
-    @property
-    def weak(self) -> bool:
-        """Whether its evidence is weak."""
-        return self.proposal.p_value > criteria.WEAK_P
-
 
 @dataclass(frozen=True)
 class RefusedEffect:
@@ -230,11 +225,6 @@ class RefusedEffect:
 
     proposal: Proposal
     reason: str
-
-    @property
-    def weak(self) -> bool:
-        """Whether its evidence is too weak for the verdict `unexplained`."""
-        return self.proposal.p_value > criteria.WEAK_P
 
     @property
     def negligible(self) -> bool:
@@ -306,7 +296,7 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     if p_value > criteria.WITHIN_P and not halved and _shape_along_strokes(proposal.term, fitted.rows):
         above = f"its p-value is above {criteria.WITHIN_P:g}"
         return f"{above}, and it is a shape along strokes without a mechanism"
-    if p_value > criteria.WEAK_P and gain.share < criteria.LEAST_FALL:
+    if proposal.weak and gain.share < criteria.LEAST_FALL:
         above = f"its p-value is above {criteria.WEAK_P:g}"
         return f"{above}, and it lowers the held-out error by less than {criteria.LEAST_FALL:.0%}"
     if not all(g.real for g in gain_between_settings(fitted, proposal)):

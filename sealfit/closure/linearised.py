@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.closure.criteria import IDENTIFIABLE, PAIR_PENALTY
+from sealfit.closure.criteria import IDENTIFIABLE, PAIR_PENALTY, WEAK_P
 from sealfit.closure.score_test import Candidate, project
 from sealfit.effects.contract import SECOND
 from sealfit.effects.free import SMOOTH, SURFACE
@@ -66,6 +66,11 @@ class Proposal:
     def named(self) -> bool:
         """Whether the form has a name."""
         return self.term.effect.id not in UNNAMED
+
+    @property
+    def weak(self) -> bool:
+        """Whether its evidence is weak: too weak for the verdict `unexplained`."""
+        return self.p_value > WEAK_P
 
     @property
     def rank(self) -> tuple:

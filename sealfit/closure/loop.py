@@ -250,7 +250,7 @@ def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
 
     A fold that finds nothing predicts as the declared model does, so its error is no evidence for an effect.
     """
-    if not all(item.weak for item in selection.added):
+    if not all(item.proposal.weak for item in selection.added):
         return True
     rows = selection.after.rows
     known = [pair for model in found for pair in zip(model.terms, model.values, strict=True)]
@@ -292,7 +292,7 @@ def _only_gains(
     refused = []
     while selection.added:
         negative = turns_negative(models.after)
-        weak = selection.added[-1].weak
+        weak = selection.added[-1].proposal.weak
         if not negative and models.gains(_level_of(selection.added), weak=weak):
             break
         last = selection.added[-1].proposal
@@ -318,7 +318,7 @@ def _only_gains(
                 covered=heldout.covered(own.model),
                 determined=models.determined & determined,
             )
-    strong = tuple(r for r in refused if not r.weak)
+    strong = tuple(r for r in refused if not r.proposal.weak)
     return replace(selection, refused=(*selection.refused, *refused), worse=strong), models
 
 

@@ -178,7 +178,7 @@ def _refused(item: RefusedEffect, rows: Rows) -> dict:
         "label": describe(term, rows),
         "p_value": item.proposal.p_value,
         "reason": item.reason,
-        "weak": item.weak,
+        "weak": item.proposal.weak,
     }
 
 

@@ -20,6 +20,7 @@ from sealfit.closure.confirm import (
     varies_within,
 )
 from sealfit.closure.left_out import between_speeds, blocks
+from sealfit.closure.linearised import Proposal
 from sealfit.config import Config, Loop
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit, fit_declared, fitted_at
@@ -140,7 +141,7 @@ def test_a_free_shape_of_few_speeds_beside_the_stribeck_curve_leaves_the_force_b
 def proposal(effect="smooth", channels=("run_order",), acts_on="mu", p_value=1e-9, physical=False):
     own = SimpleNamespace(id=effect, physical=physical, label=effect, periodic=False)
     term = SimpleNamespace(effect=own, channels=channels, acts_on=acts_on, operation="multiply")
-    return SimpleNamespace(term=term, p_value=p_value, unit="run", fitted=None)
+    return Proposal(term, {}, "run", 1, 0.0, p_value, np.zeros(0), ())
 
 
 @pytest.fixture
@@ -307,7 +308,7 @@ def test_a_free_shape_that_bends_the_curve_wants_more_evidence(
     made = proposal(effect, channels, acts_on, p_value, physical=effect in ("asymmetry", "warming_distance"))
     found, refused, _ = decide([made], [Gain(share, 1 - share, 10.0)])
     assert (found is not None) == claimed
-    assert [item.weak for item in refused] == ([] if claimed else [True])
+    assert [item.proposal.weak for item in refused] == ([] if claimed else [True])
 
 
 @pytest.mark.parametrize(
@@ -327,7 +328,7 @@ def test_a_shape_along_strokes_without_a_mechanism_wants_more_evidence(
     gain = Gain(share, 1 - share, 10.0)
     found, refused, _ = decide([proposal("step", channels, "mu", p_value, physical)], [gain])
     assert (found is not None) == claimed
-    assert [item.weak for item in refused] == ([] if claimed else [True])
+    assert [item.proposal.weak for item in refused] == ([] if claimed else [True])
 
 
 # ---------------------------------------------------------------- what a recorder resolves

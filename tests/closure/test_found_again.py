@@ -64,7 +64,7 @@ def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selec
     assert own.after is selection.before
     assert own.left_over is own.first  # the candidates of the last search are on another model
     assert [r.proposal.term.channels[0] for r in own.refused] == list(OIL)
-    assert all(r.weak and "no fold" in r.reason for r in own.refused)
+    assert all(r.proposal.weak and "no fold" in r.reason for r in own.refused)
     assert own.worse == ()
 
 

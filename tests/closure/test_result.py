@@ -111,7 +111,7 @@ def document(selection, after=None):
 def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted, monkeypatch):
     item, after = accepted(fitted)
     weak, strong = (
-        RefusedEffect(SimpleNamespace(term=WARMING, p_value=p), "it does not lower the error")
+        RefusedEffect(Proposal(WARMING, {}, "run", 1, 0.0, p, np.zeros(0), ()), "it does not lower the error")
         for p in (1e-4, 1e-7)
     )
     small = RefusedEffect(strong.proposal, NO_GAIN)
@@ -217,7 +217,7 @@ def test_what_is_still_significant_is_named_at_its_level(selection):
 
 
 def test_an_effect_that_lowered_no_error_is_left(selection):
-    worse = RefusedEffect(SimpleNamespace(term=WARMING, p_value=1e-7), "it lowers no error")
+    worse = RefusedEffect(Proposal(WARMING, {}, "run", 1, 0.0, 1e-7, np.zeros(0), ()), "it lowers no error")
     entry = left_entry(replace(selection, worse=(worse,)), 0.5, 0.3)
     assert (entry["level"], entry["channel"], entry["p_value"]) == ("trace", "distance_mm", 1e-7)
 
