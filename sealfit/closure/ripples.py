@@ -51,7 +51,6 @@ class Peak:
     common_phase: bool
     statistic: float
     p_value: float  # adjusted over frequencies, axes and modes
-    amplitude: float  # in force units, mean over units
     energy: float  # sum of squared amplitudes over passes, of the largest significant wave along the axis
 
 
@@ -162,11 +161,8 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
         p = float(betaincc(1, max(units - 1, 1), min(statistic[k] / units, 1.0)))
         p = p * spectrum.frequency.size * modes
         wavelength = _refined(total, spectrum.frequency, k)
-        amplitude = float(np.abs(spectrum.mean[mode, k]))
-        energy = amplitude**2 * float(spectrum.count[k])
-        peaks.append(
-            Peak(spectrum.axis, wavelength, mode == 0, True, float(statistic[k]), p, amplitude, energy)
-        )
+        energy = float(np.abs(spectrum.mean[mode, k])) ** 2 * float(spectrum.count[k])
+        peaks.append(Peak(spectrum.axis, wavelength, mode == 0, True, float(statistic[k]), p, energy))
     return peaks
 
 
@@ -212,11 +208,10 @@ def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
             continue
         amplitudes = np.linalg.pinv(own_square[:, best]) @ product[:, mode, pairs[best], None]
         statistic, p = _mean_of_zero(amplitudes[:, :, 0])
-        amplitude = float(np.linalg.norm(amplitudes.mean(axis=0)))
         length = span / _summit(waves, by_wave, best)
         p *= 2 * waves.size  # wavelengths and modes
-        energy = amplitude**2 * unit.size
-        peaks.append(Peak("displacement_mm", length, mode == 0, True, statistic, p, amplitude, energy))
+        energy = float(np.linalg.norm(amplitudes.mean(axis=0))) ** 2 * unit.size
+        peaks.append(Peak("displacement_mm", length, mode == 0, True, statistic, p, energy))
     return peaks
 
 
@@ -252,8 +247,8 @@ def _incoherent(spectrum: Spectrum) -> Peak:
     energy = spectrum.amplitude**2 * spectrum.count * (1 - 1 / np.maximum(ratio, 1.0))
     significant = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
     significant[k] = True
-    amplitude, most = float(spectrum.amplitude[k]), float(energy[significant].max())
-    return Peak(spectrum.axis, wavelength, True, False, float(ratio[k]), p, amplitude, most)
+    most = float(energy[significant].max())
+    return Peak(spectrum.axis, wavelength, True, False, float(ratio[k]), p, most)
 
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
@@ -299,13 +294,6 @@ class Waves:
     def amplitudes(self) -> np.ndarray:
         """Amplitudes of sine and cosine, shape (p, m, 2)."""
         return np.einsum("pmij,pmj->pmi", np.linalg.pinv(self.square, hermitian=True), self.product)
-
-    @property
-    def share(self) -> np.ndarray:
-        """Share of the sum of squares that the wave explains, shape (p, m)."""
-        return (
-            np.einsum("pmi,pmi->pm", self.amplitudes, self.product) / np.maximum(self.total, 1e-300)[:, None]
-        )
 
 
 def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
@@ -365,8 +353,9 @@ def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tu
     lengths = 1 / (1 / wavelength + AROUND / np.median(Strokes.of(samples, axis).span))
     waves = waves_of(samples, lengths, axis)
     files, file = np.unique(waves.unit, return_inverse=True)
-    share = np.zeros((len(files), lengths.size))
-    np.add.at(share, file, waves.share)
+    explained = np.einsum("pmi,pmi->pm", waves.amplitudes, waves.product)
+    share = np.zeros((len(files), lengths.size))  # of the sum of squares
+    np.add.at(share, file, explained / np.maximum(waves.total, 1e-300)[:, None])
     without = np.array([_top(lengths, share.sum(axis=0) - own) for own in share])
     spread = (len(files) - 1) / len(files) * ((without - without.mean()) ** 2).sum()
     return _top(lengths, share.sum(axis=0)), float(np.sqrt(spread))

@@ -231,7 +231,7 @@ def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
     start = np.random.default_rng(1).uniform(0.0, 8.0, bins["file"].nunique())
     place = bins["displacement_mm"] + start[bins["file"].factorize()[0]]
     bins = bins.assign(displacement_mm=place, force_N=bins["force_N"] + np.sin(2 * np.pi * place / 8.0))
-    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0, 1.0)
+    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0)
     fitted = fit_declared(make_rows(bins, has_aging=True))
     first, second = naming.propose_ripples(fitted, peak, bins.iloc[:0], EFFECTS)[:2]
     assert (first.term.acts_on, first.term.operation) == ("force", "add")
@@ -246,7 +246,7 @@ def test_a_ripple_of_one_direction_has_an_amplitude_that_changes_with_the_direct
     wave = np.sin(2 * np.pi * bins["displacement_mm"] / 8.0)
     strength = np.where(bins["direction"] > 0, 0.3, back * 0.3)
     rows = make_rows(bins.assign(force_N=bins["force_N"] + strength * wave), has_aging=True)
-    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0, 1.0)
+    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0)
     first, *others = naming.propose_ripples(fit_declared(rows), peak, bins.iloc[:0], EFFECTS)
     assert (first.term.effect.id == "sinusoid_changing") == changes
     assert first.term.channels == ("displacement_mm", "direction")[: 1 + changes]
@@ -259,7 +259,7 @@ def test_a_ripple_of_one_direction_has_an_amplitude_that_changes_with_the_direct
 def test_a_ripple_far_from_position_0_has_its_phase_near_the_positions():
     bins = numbered(make_bins(days=(), repeats=2, noise_N=0.05))
     bins["force_N"] += 0.3 * np.sin(2 * np.pi * bins["displacement_mm"] / 8.0)
-    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0, 1.0)
+    peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0)
     near, far = (
         naming.propose_ripples(fit_declared(make_rows(moved, has_aging=True)), peak, bins.iloc[:0], EFFECTS)[
             0

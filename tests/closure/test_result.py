@@ -37,7 +37,7 @@ TORQUE = Units(
     {"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")}
 )
 WARMING = Term(EFFECTS["warming_distance"], ("distance_mm",), "mu", "multiply")
-PEAK = Peak("time_s", 0.3, True, True, 9.0, 1e-4, 0.1, 1.0)
+PEAK = Peak("time_s", 0.3, True, True, 9.0, 1e-4, 1.0)
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,7 @@ def test_a_backlash_between_the_directions_leaves_no_common_phase():
     place, back = samples["displacement_mm"], samples["direction"] < 0
     moved = np.sin(2 * np.pi * (place - 0.75) / 3.0 + 0.4) - np.sin(2 * np.pi * place / 3.0 + 0.4)
     shifted = samples.assign(residual_N=samples["residual_N"] + 0.4 * moved.where(back, 0.0))
-    peak = Peak("displacement_mm", 3.0, True, False, 9.0, 1e-9, 0.4, 1.0)  # of the mean power
+    peak = Peak("displacement_mm", 3.0, True, False, 9.0, 1e-9, 1.0)  # of the mean power
     assert _with_shared_phase(peak, samples).common_phase
     assert not _with_shared_phase(peak, shifted).common_phase
 
