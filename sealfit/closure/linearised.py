@@ -16,7 +16,7 @@ from sealfit.effects.free import SMOOTH, SURFACE
 from sealfit.fit.joint import Fitted, effective_df
 from sealfit.fit.joint.model import Term, mean_derivatives
 from sealfit.fit.joint.prior import penalised, reml_smoothness, roughness_of
-from sealfit.fit.joint.rows import Cache, Rows
+from sealfit.fit.joint.rows import Rows
 
 PART = 32  # Grid points that are whitened at once.
 UNNAMED = (SMOOTH, SURFACE)
@@ -86,21 +86,18 @@ class Proposal:
 
 
 def linearised(
-    fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate, shapes: Cache
+    fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate
 ) -> list[Proposal]:
     """Return a term fitted to the residual in the tangent space of a model, at the best point of its grid.
 
-    The list is empty if none of the grid is identifiable. Amplitudes are fitted exactly. `shapes` keeps the
-    shapes of the last grid, which are the same for every target.
+    The list is empty if none of the grid is identifiable. Amplitudes are fitted exactly.
     """
     effect, rows = term.effect, fitted.rows
     points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
-    at = (effect.id, term.channels, points, term.fixed)
-    coarse = shapes.once("of a grid", lambda: _shapes(term, points, rows), at=at)
-    point, most, shape = _best(fitted, term, points, coarse)
+    point, most, shape = _best(fitted, term, points)
     for jump in (p.name for p in effect.nonlinear if p.search == "between"):
         if finer := _between(term, point, jump, search[jump], rows):
-            point, most, shape = _best(fitted, term, finer, _shapes(term, finer, rows))
+            point, most, shape = _best(fitted, term, finer)
     if not most > 0:
         return []
     left = project(fitted, fitted.slope(*term.target)[:, None] * shape)
@@ -126,10 +123,11 @@ def _shapes(term: Term, points: list[dict[str, float]], rows: Rows) -> np.ndarra
 
 
 def _best(
-    fitted: Fitted, term: Term, points: list[dict[str, float]], shapes: np.ndarray
+    fitted: Fitted, term: Term, points: list[dict[str, float]]
 ) -> tuple[dict[str, float], float, np.ndarray]:
     """Return the best point of a grid, the sum of squares it explains and its shapes, (n, amplitudes)."""
     slope, count = fitted.slope(*term.target), len(term.effect.linear)
+    shapes = _shapes(term, points, fitted.rows)
     parts = range(0, shapes.shape[1], PART * count)
     chi2 = np.concatenate(
         [_explained(fitted, slope[:, None] * shapes[:, k : k + PART * count], count) for k in parts]

@@ -37,7 +37,6 @@ from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Model
-from sealfit.fit.joint.rows import Cache
 from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening
 from sealfit.tables import CALENDAR
@@ -65,9 +64,8 @@ def propose(
         for c in _contenders(significant)
         for t, search in terms_of(c, channels, fitted, effects)
     ]
-    forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # all quantities share a shape
-    shapes = Cache()
-    found = [*also, *(p for form in forms for p in linearised(fitted, *form, shapes))]
+    forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # the order of exact equals
+    found = [*also, *(p for form in forms for p in linearised(fitted, *form))]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
     others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
     if not (
@@ -99,8 +97,8 @@ def propose_ripples(
 
     Changes of its amplitude that are not the best are no rivals: none of them was found.
     """
-    forms, shapes = periodic_terms(fitted, peak, samples, effects), Cache()
-    found = [p for form in forms for p in linearised(fitted, *form, shapes)]
+    forms = periodic_terms(fitted, peak, samples, effects)
+    found = [p for form in forms for p in linearised(fitted, *form)]
     refitted = _refitted(fitted, _best_few(found), found)
     best, *others = _ordered(fitted, [p for p in refitted if len(p.term.channels) == 1 or _changes(p)])
     return [best, *(p for p in others if len(p.term.channels) == 1)]

@@ -23,7 +23,7 @@ from sealfit.closure.naming import deviance_under, named_among, propose
 from sealfit.closure.score_test import Candidate, ScoreTests
 from sealfit.closure.search import MAIN_TARGETS, candidate_of, channel_candidates, search_pairs
 from sealfit.fit.joint import Fitted, fit
-from sealfit.fit.joint.rows import ALONG, Cache
+from sealfit.fit.joint.rows import ALONG
 
 
 @dataclass(frozen=True)
@@ -152,13 +152,13 @@ class Renaming:
             if names <= {one.name, other.name} | (along if along & {one.name, other.name} else set())
         ]
         p_value = min(p.p_value for p in parts)
-        found, shapes = [], Cache()
+        found = []
         for pair in pairs:
             if main_effects_identifiable(pair, without):
                 for target in dict.fromkeys((*MAIN_TARGETS, *(p.term.target for p in parts))):
                     term = surface_term(*pair, *target)
                     candidate = candidate_of(term, pair, without.rows, p_value)
-                    found += linearised(without, term, {}, candidate, shapes)
+                    found += linearised(without, term, {}, candidate)
         return sorted(found, key=lambda p: p.bic)[:MOST_PROPOSALS]
 
     def _proposals_on(
@@ -176,7 +176,7 @@ class Renaming:
         same_target = next((c for c in found if c.target == own.target), None)
         own_form = ()
         if same_target is not None:
-            own_form = linearised(without, own, at_own_values, same_target, Cache())
+            own_form = linearised(without, own, at_own_values, same_target)
         return propose(without, found, self.channels, self.context.effects, own_form)
 
     def _gain_N(self, without: Fitted, proposal: Proposal) -> float:

@@ -11,7 +11,7 @@ from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.model import Term
-from sealfit.fit.joint.rows import Cache, make_rows
+from sealfit.fit.joint.rows import make_rows
 
 
 @pytest.mark.parametrize("place", [20, 47.3])
@@ -29,7 +29,7 @@ def test_a_jump_is_placed_between_the_right_neighbours_though_the_grid_leaves_pl
     term = Term(EFFECTS["step"], ("oil_ppm",), "force", "add", fixed={"x_ref": 50.0})
     test_result = ScoreTestResult(0.0, 1, np.unique(oil).size, 0.0)
     candidate = Candidate(("oil_ppm",), "force", "add", "run", np.empty((0, 0)), test_result, p_value=0.0)
-    (found,) = linearised(fit_declared(rows), term, grid_of(EFFECTS["step"], oil), candidate, Cache())
+    (found,) = linearised(fit_declared(rows), term, grid_of(EFFECTS["step"], oil), candidate)
     x_0 = found.values["x_0"]
     assert oil[oil < place].max() < x_0 < oil[oil >= place].min()
     assert found.values["A"] == pytest.approx(2.0, abs=0.2)

@@ -17,7 +17,7 @@ from sealfit.effects import EFFECTS
 from sealfit.effects.free import free_effect
 from sealfit.fit.joint import fit, fit_declared
 from sealfit.fit.joint.model import Term
-from sealfit.fit.joint.rows import Cache, make_rows
+from sealfit.fit.joint.rows import make_rows
 
 OIL = {"oil_ppm": lambda rng: rng.normal(50, 10)}
 
@@ -75,7 +75,7 @@ def test_two_channels_together_pay_for_being_one_of_many():
     for names, pair in ((("oil_ppm",), False), (("oil_ppm", "time_s"), True)):
         candidate = Candidate(names, "mu", "multiply", "run", np.empty((0, 1)), test_result, pair=pair)
         for term, searched in terms_of(candidate, channels, fitted, EFFECTS):
-            for proposal in linearised(fitted, term, searched, candidate, Cache()):
+            for proposal in linearised(fitted, term, searched, candidate):
                 bic_penalty[term.effect.id] = proposal.bic_penalty
     assert bic_penalty["product"] - bic_penalty["linear"] == pytest.approx(PAIR_PENALTY)
 
