@@ -197,10 +197,8 @@ def _first_half(table: pd.DataFrame, in_turn: bool) -> np.ndarray:
     """Return which rows or samples (ordered by stroke) belong to the first half, shape (n,)."""
     if in_turn:
         return ((table["stroke"].to_numpy() - 1) // 2 % 2) == 0
-    stroke = table["stroke_id"].to_numpy()
-    start = np.flatnonzero(np.r_[True, stroke[1:] != stroke[:-1]])
-    count = np.diff(np.r_[start, stroke.size])
-    return np.arange(stroke.size) - np.repeat(start, count) < np.repeat(count, count) / 2
+    strokes = table.groupby("stroke_id")["stroke_id"]
+    return (strokes.cumcount() < strokes.transform("size") / 2).to_numpy()
 
 
 @dataclass(frozen=True)
