@@ -211,6 +211,12 @@ def test_a_master_curve_is_called_by_its_quantity(made):
     assert titles == ["Static friction coefficient", "Coulomb friction coefficient"]
 
 
+def test_a_master_curve_without_unaged_rubber_is_as_wide_as_its_figure(made):
+    curve = made.tables["master_curve"]
+    tables = {**made.tables, "master_curve": curve[(curve["kind"] == "law") | (curve["scaled_days"] > 0)]}
+    draw(draw_all(tables, made.closure, made.config)["master_curve"])  # a collapsed layout is a warning
+
+
 # ---------------------------------------------------------------- the loop
 def test_errors_stand_beside_the_noise_floor(ax, made):
     draw_errors(ax, made.closure, TORQUE)

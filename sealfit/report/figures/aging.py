@@ -267,6 +267,7 @@ def draw_master_curve(
     values, law = rows[rows["kind"] == "value"], rows[rows["kind"] == "law"].sort_values("scaled_days")
     aged = values[values["scaled_days"] > 0]
     ax.set_xscale("symlog", linthresh=float(aged["scaled_days"].min()), linscale=0.7)
+    ax.xaxis.get_major_locator().set_params(numticks=6)  # where factors of temperature differ by many decades
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     style.draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], style.FLOOR)
     ax.plot(law["scaled_days"], law["value"], color=style.FLOOR)
@@ -274,7 +275,10 @@ def draw_master_curve(
         earlier = before[before["kind"] == "law"].sort_values("scaled_days")
         ax.plot(earlier["scaled_days"], earlier["value"], color=style.FLOOR, linestyle=":")
     fresh = values[values["scaled_days"] == 0]
-    ax.plot(fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=style.BLACK, clip_on=False)
+    if not fresh.empty:  # an unclipped line without points has its place at the corner of the figure
+        ax.plot(
+            fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=style.BLACK, clip_on=False
+        )
     percents = np.sort(aged["compression_ratio_pct"].dropna().unique())
     for (celsius, percent), own in aged.groupby(["temperature_C", "compression_ratio_pct"], dropna=False):
         rank = int(np.searchsorted(percents, percent)) if np.isfinite(percent) else 0
