@@ -317,17 +317,22 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
     """Return {parameter: (value, lo95, hi95)} of one effect.
 
     The larger of two standard errors is used: by the variance components, and by the sandwich of the units of
-    the effect's level. An effect that scatters between units would otherwise get too short an interval.
+    the effect's level. An effect that scatters between units would otherwise get too short an interval. The
+    place of a jump is only known to lie between two neighbouring values of the channel.
     """
     term = fitted.model.terms[number]
-    held = term.fixed.get("held", {})
+    held = dict(term.fixed.get("held", {}))
     place = fitted.model.term_slice(number)
     variance = np.diag(robust_covariance(fitted, level))[place]
-    if not held:  # the variance components describe coarser shapes than a wave
+    if "held" not in term.fixed:  # the variance components describe coarser shapes than a wave
         variance = np.maximum(variance, np.diag(fitted.covariance)[place])
     units = fitted.rows.groups.starts[level].size
     reach = t_quantile(max(units - variance.size - 1, 2)) * np.sqrt(variance)
     values = fitted.model.values[number]
+    for name in (p.name for p in term.effect.nonlinear if p.search == "between"):
+        along = np.unique(term.inputs(fitted.rows)[term.effect.reads[0]])
+        after = int(np.clip(along.searchsorted(values[name]), 1, along.size - 1))
+        held[name] = along[after - 1], along[after]
     result = {}
     for p, r in zip(term.effect.parameters, reach, strict=True):
         low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))

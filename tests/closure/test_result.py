@@ -153,6 +153,16 @@ def test_without_a_load_a_label_names_what_is_fitted(acts_on, operation, words, 
     assert describe(term, replace(fitted.rows, has_load=False)) == f"warming by sliding (distance), {words}"
 
 
+def test_the_place_of_a_jump_lies_between_two_neighbouring_values(selection, fitted):
+    item, after = accepted(fitted, Term(EFFECTS["step"], ("distance_mm",), "mu", "multiply"))
+    (entry,) = document(replace(selection, added=(item,)), after)["effects"]
+    (place,) = [p for p in entry["parameters"] if p["name"] == "x_0"]
+    values = np.unique(fitted.rows.values("distance_mm"))
+    low, high = place["ci95"]
+    assert low <= place["value"] <= high
+    assert values.searchsorted(high) == values.searchsorted(low) + 1
+
+
 def test_an_effect_is_written_with_its_intervals_and_rivals(selection, fitted):
     rivals = tuple(
         (accepted(fitted, replace(WARMING, acts_on=name))[0].proposal, rmse)
