@@ -218,11 +218,11 @@ def test_the_first_that_gains_is_accepted_with_its_rivals_and_what_they_leave(de
     assert np.isnan([rmse for _, rmse in found.rivals]).all()  # not asked for
 
 
-def test_after_three_that_gain_nothing_none_is_tried_and_these_are_refused(decide):
-    found, refused, said = decide([proposal(f"form {k}") for k in range(4)], [Gain(-1, 2, -1)] * 3 + [GOOD])
+def test_after_four_that_gain_nothing_none_is_tried_and_these_are_refused(decide):
+    found, refused, said = decide([proposal(f"form {k}") for k in range(5)], [Gain(-1, 2, -1)] * 4 + [GOOD])
     assert found is None
-    assert [item.proposal.term.effect.id for item in refused] == ["form 0", "form 1", "form 2"]
-    assert len(said) == 3
+    assert [item.proposal.term.effect.id for item in refused] == [f"form {k}" for k in range(4)]
+    assert len(said) == 4
 
 
 def test_what_is_not_significant_is_not_said_to_be_refused(decide):
