@@ -308,7 +308,8 @@ def _rows_with(rows: Rows, changes: Mapping[str, object]) -> Rows:
         load = np.full_like(rows.load, float(changes["load_N"]))
     if POWER in table and POWER not in changes:
         table[POWER] = sliding_power(load, speed)
-    return replace(rows, table=table, speed=speed, pace=speed, days=days, load=load)
+    filled = {name: values for name, values in rows.filled.items() if name not in changes}
+    return replace(rows, table=table, filled=filled, speed=speed, pace=speed, days=days, load=load)
 
 
 def _settings(row: Mapping[str, object], names: Sequence[str]) -> dict[str, object]:

@@ -30,9 +30,11 @@ def between(chosen, rival):
     return largest_difference(chosen.fitted.model, rival.fitted.model, chosen.fitted.rows, channels, Config())
 
 
-def test_channels_that_always_went_together_are_taken_apart():
+@pytest.mark.parametrize("unknown", [None, "f0003.csv"])  # a file without the channel
+def test_channels_that_always_went_together_are_taken_apart(unknown):
     bins = make_bins(bins=4, repeats=1)
     bins["humidity_pct"] = 30.0 + 2.0 * bins["elapsed_h"]  # rose with the calendar
+    bins.loc[bins["file"] == unknown, "humidity_pct"] = np.nan
     fitted = fit_declared(make_rows(bins, has_aging=True))
     chosen = bound(fitted, "linear", "humidity_pct", A=0.01)
     rival = bound(fitted, "linear", "elapsed_h", A=0.02)
