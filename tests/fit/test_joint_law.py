@@ -384,6 +384,23 @@ def test_strength_by_temperature(table, loss, energy):
     assert laws[0] not in rivals_of(laws)
 
 
+@pytest.mark.parametrize("size", [1.0, 1e7])
+@pytest.mark.parametrize("kind", ["none", "one of zero", "of rank one"])
+def test_values_whose_variance_is_zero_or_singular_have_the_law(kind, size):
+    exact = campaign(scatter=0.0)
+    n, own = exact.value.size, (0.01 * size) ** 2
+    variance = {"none": None, "one of zero": np.full(n, own), "of rank one": np.full((n, n), own)}[kind]
+    if kind == "one of zero":
+        variance[5] = 0.0
+    law = fit_joint_law(
+        replace(exact, value=size * exact.value, variance=variance, replicates_df=40.0), "log", "rate"
+    )
+    found = {name: value for name, value, *_ in law.parameters()}
+    assert found["E"] == pytest.approx(80.0, rel=1e-3)
+    assert found["a"] == pytest.approx(0.05 * size, rel=1e-3)
+    assert kind == "none" or law.lack_of_fit_p() > 0.5
+
+
 def test_an_interval_without_a_bound_has_none():
     law = fit_joint_law(campaign(), "log")
     unknown = law.covariance + 1e5 * np.diag([float(name == "b") for name in law.names])

@@ -20,8 +20,10 @@ from sealfit.physics.aging_laws import LOSSES, Loss
 
 # Gas constant in kJ/(mol K).
 GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000
-# Smallest variance of a value. It keeps the weights of values without scatter finite.
-TINY = 1e-300
+# Smallest variance of a value. It keeps the weights of values without scatter, and their squares, finite.
+TINY = 1e-280
+# The same as a share of the largest variance: less is rounding.
+ROUNDING = 1e-12
 # Largest number of series that are left out in turn for held-out errors. The root mean square of their errors
 # is then known to a tenth.
 MOST_LEFT_OUT = 50
@@ -74,8 +76,10 @@ class Aged:
         """
         measured = np.zeros(self.value.size) if self.variance is None else self.variance
         about = self.value if about is None else about
-        own = (scatter * (about if self.size is None else self.size)) ** 2 + TINY
-        return csr_array(diags_array(measured) if measured.ndim == 1 else measured) + diags_array(own)
+        measured = csr_array(diags_array(measured) if measured.ndim == 1 else measured)
+        least = max(ROUNDING * measured.diagonal().max(), TINY)
+        own = (scatter * (about if self.size is None else self.size)) ** 2 + least
+        return measured + diags_array(own)
 
     def whitening(self, scatter: float) -> csr_array:
         """Return W with W C W' = 1 for the covariance C at a scatter, shape (n, n)."""
