@@ -291,10 +291,11 @@ class _Loop:
         tested = (*self.last, *(c for c, _ in laws))
         unclaimable = [c for c in tested if c.p_value <= self.alpha and not c.claimable]
         if left is None and unclaimable:
-            proposals = self.propose(self.fitted, unclaimable, [p for _, p in laws])
-            others = tuple((rival, np.nan) for rival in rivals(proposals[0], proposals))
-            left = unclaimable[0]
-            inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, len(added) + 1)
+            # No form can be fitted along three days beside the aging law.
+            if proposals := self.propose(self.fitted, unclaimable, [p for _, p in laws]):
+                left = unclaimable[0]
+                others = tuple((rival, np.nan) for rival in rivals(proposals[0], proposals))
+                inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, len(added) + 1)
         return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
 
 

@@ -202,6 +202,17 @@ def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():
     assert any(form["channels"][0] in ("displacement_mm", "distance_mm") for form in forms)
 
 
+def test_what_no_form_can_describe_is_no_candidate(monkeypatch):
+    """Three days leave no form beside the aging law that has a and b of its own."""
+    monkeypatch.setattr("sealfit.closure.selection._Loop.propose", lambda *given: [])
+
+    def slope(table, force):
+        return force * (1 + 0.03 * (table["displacement_mm"].to_numpy() - 20) / 40)
+
+    bins = make_bins(3, days=(1.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, repeats=5, bins=8, effect=slope)
+    assert close_loop(bins, make_traces(bins), TWO_FOLDS).document["effects"] == []
+
+
 def test_what_one_specimen_of_two_holds_alone_is_not_said_to_differ_between_them():
     rows = make_rows(
         make_bins(2, days=(4.0,), temperatures=(60.0,), speeds=FEW_SPEEDS, bins=8), has_aging=True
