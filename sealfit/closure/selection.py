@@ -290,12 +290,12 @@ class _Loop:
         laws = self.found.laws
         tested = (*self.last, *(c for c, _ in laws))
         unclaimable = [c for c in tested if c.p_value <= self.alpha and not c.claimable]
-        if left is None and unclaimable:
-            # No form can be fitted along three days beside the aging law.
-            if proposals := self.propose(self.fitted, unclaimable, [p for _, p in laws]):
-                left = unclaimable[0]
-                others = tuple((rival, np.nan) for rival in rivals(proposals[0], proposals))
-                inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, len(added) + 1)
+        # No form can be fitted along three days beside the aging law, for example.
+        own = [p for _, p in laws]
+        if left is None and unclaimable and (proposals := self.propose(self.fitted, unclaimable, own)):
+            left = unclaimable[0]
+            others = tuple((rival, np.nan) for rival in rivals(proposals[0], proposals))
+            inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, len(added) + 1)
         return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
 
 

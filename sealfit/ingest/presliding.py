@@ -33,6 +33,8 @@ HIGH = 1.0 / 3.0
 # Share of the whole change of the force since rest from which a rise or fall on the plateau of the speed is
 # large: damping explains it, and nothing that changes slowly along a stroke.
 LARGE = 0.25
+# The same from which the law of the bristles is asked on the plateau. It must explain the rise there.
+PART = 0.1
 # Share of the variance of the force on the plateau that the law of the bristles must explain there, and the
 # number of means of which that variance is taken.
 EXPLAINED = 0.9
@@ -197,9 +199,13 @@ def _rise(start: Start) -> Rise:
     that rest is large, the rise is that on the plateau of the speed: if it is longer than the one found from
     rest, or if it alone follows the law of the bristles.
     """
-    rise, ramp, plateau = _rise_from_rest(start), start.plateau_mm, _on_plateau(start)
+    rise = _rise_from_rest(start)
+    moving = start._replace(
+        ramp_end=max(start.ramp_end, 1)
+    )  # the first row is of rest, or of the motion before
+    ramp, plateau = moving.plateau_mm, _on_plateau(moving)
     level = _level_N(plateau) if rise.length_mm > 0.0 else None
-    if level is None or level - plateau.force_N[0] < LARGE * (level - start.force_N[0]):
+    if level is None or level - plateau.force_N[0] < PART * (level - start.force_N[0]):
         return rise
     later = _rise_from_rest(plateau)
     better = later.length_mm > LONGER * rise.length_mm or (later.left_N != 0.0 and rise.left_N == 0.0)

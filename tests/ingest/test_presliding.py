@@ -164,6 +164,19 @@ def test_damping_that_jumps_at_a_reversal_hides_no_rise(ratio, damping):
     assert steady.mean() == pytest.approx(LEVEL, abs=0.05)
 
 
+@pytest.mark.parametrize("share", [0.15, 0.2])
+def test_a_rise_of_which_damping_brings_up_most_within_a_sample_is_that_of_the_bristles(share):
+    """At a reversal the first row still has the force of the motion before."""
+    x = np.linspace(0.0, 2.14, 435)
+    force = 12.5 - share * 25.0 * np.exp(-x / 0.0857)
+    force[0] = -12.5
+    noisy = force + np.random.default_rng(1).normal(0.0, 0.02, x.size)
+    rise = rise_of(Start(x, noisy, 0))
+    assert rise.length_mm == pytest.approx(0.0857, rel=0.05)
+    assert rise.end_mm > 5 * 0.0857
+    assert np.abs(force - 12.5 - rise.at(x))[x > rise.end_mm].max() < 0.02
+
+
 def test_noise_does_not_hide_the_rise_after_a_jump():
     """The force jumps to 25 N, and follows the bristles from there under correlated noise of 2 N."""
     _, steady = steady_forces(4.0, damping=25.0, ramp=0.02, hertz=400.0, drift=2.0)
