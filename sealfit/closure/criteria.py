@@ -47,9 +47,10 @@ TESTED_AGAINST_RUNS = 0.05
 CONSTANT_IN_RUNS = 0.9
 # An amplitude is identifiable if the model leaves at least this share of the column's variance.
 IDENTIFIABLE = 0.01
-# Factors on p-values of the searches that share the family-wise error rate: single channels and pairs of
-# channels have 1 / 2.2 of it each, and changes that last for a while the rest, 1 / 11.
+# Factor on p-values of single channels, and of pairs of channels: each search has 1 / 2.2 of the family-wise
+# error rate.
 SEARCHES = 2.2
+# Further factor on p-values of changes that last for a while: their search has the rest of it, 1 / 11.
 TEMPORARY_FACTOR = 5.0
 # Ratio of the largest to the smallest value of a positive channel from which pairs use its logarithm too.
 LOGARITHMIC_SPAN = 5.0

@@ -185,7 +185,7 @@ def _dated(hours: np.ndarray) -> bool:
         Parameter("t_2", "{x}", 1.0, (-1e6, 1e6), "when it ends", search="between"),
     ),
     source="Form: ours. Two steps of equal height.",
-    # By hand: at its begin it has its full size.
+    # By hand: at t_1 it has its full size.
     worked=({"elapsed_h": 3.0}, {"A": 0.04, "t_1": 3.0, "t_2": 5.0}, 0.04),
     shown_by=_dated,
 )

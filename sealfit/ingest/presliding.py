@@ -196,8 +196,8 @@ def _rise(start: Start) -> Rise:
     """Return the rise of a start whose force comes up, and none of any other.
 
     Where a fast stroke starts, damping brings up a part of the force at once, and the bristles the rest. If
-    that rest is large, the rise is that on the plateau of the speed: if it is longer than the one found from
-    rest, or if it alone follows the law of the bristles.
+    that rest is at least a tenth of the whole, the rise is that on the plateau of the speed: if it is longer
+    than the one found from rest, or if it alone follows the law of the bristles.
     """
     rise = _rise_from_rest(start)
     moving = start._replace(
