@@ -98,10 +98,10 @@ def close_loop(
         )
         with timed("held out", rows=len(heldout.masks), of="folds"):
             held_before, held_after, determined, found = heldout.forces(selection, say)
-            if found is not None and not _found_in_folds(selection, found):
-                selection, after, held_after = _all_refused(selection, say), before, held_before
             within = heldout.covered(after.model)
             models = BeforeAfter(before, after, held_before, held_after, within, determined)
+            if found is not None and not _found_in_folds(selection, found):
+                selection, models = _only_halved(selection, models, heldout, say)
             selection, models = _only_gains(selection, models, heldout, say)
         break
     before, after = models.before, models.after
@@ -260,6 +260,24 @@ def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
         shape_of(term, values, rows) for term, values in zip(terms, selection.after.model.values, strict=True)
     ]
     return any(_same_shape(one, other) for one in own for other in shapes)
+
+
+def _only_halved(
+    selection: Selection, models: BeforeAfter, heldout: _HeldOut, say: Callable[[str], None]
+) -> tuple[Selection, BeforeAfter]:
+    """Return the result where no fold found the effects: without them, unless they halve the held-out error.
+
+    They are refitted in each fold. A strong effect is part of the scatter of the runs that it is tested
+    against, and a fold has fewer runs.
+    """
+    held, determined = heldout.refitted(selection.after)
+    refitted = replace(models, held_after=held, determined=models.determined & determined)
+    if refitted.halved:
+        return selection, refitted
+    declared = models.before
+    covered = heldout.covered(declared.model)
+    models = replace(models, after=declared, held_after=models.held_before, covered=covered)
+    return _all_refused(selection, say), models
 
 
 def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:

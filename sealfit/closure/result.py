@@ -76,6 +76,11 @@ class BeforeAfter:
         strong = not weak or inside[1] < criteria.HALVED
         return max(whole) <= (criteria.HARMLESS if strong else criteria.SAME_ERROR)
 
+    @property
+    def halved(self) -> bool:
+        """Whether the held-out error after is less than half of that before."""
+        return self._ratios(None)[1] < criteria.HALVED
+
     def _ratios(self, around: str | None) -> tuple[float, float]:
         """Return the ratio of errors after and before, in sample and held out (1 if nothing was held out).
 

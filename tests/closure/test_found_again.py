@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -6,7 +7,8 @@ from bins_helpers import make_bins
 
 from sealfit.closure.confirm import AcceptedEffect
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.loop import _all_refused, _found_in_folds, _only_gains
+from sealfit.closure.loop import _all_refused, _found_in_folds, _only_gains, _only_halved
+from sealfit.closure.result import BeforeAfter
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit, fit_declared
@@ -66,6 +68,19 @@ def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selec
     assert [r.proposal.term.channels[0] for r in own.refused] == list(OIL)
     assert all(r.proposal.weak and "no fold" in r.reason for r in own.refused)
     assert own.worse == ()
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.4, True), (0.6, False)])
+def test_what_no_fold_found_again_stays_only_if_it_halves_the_held_out_error(selection, share, kept):
+    rows, before = selection.before.rows, selection.before
+    every = np.ones(rows.force.size, dtype=bool)
+    refitted = rows.force - share * before.residual
+    heldout = SimpleNamespace(refitted=lambda fitted: (refitted, every), covered=lambda model: every)
+    models = BeforeAfter(before, selection.after, before.force, before.force, every, every)
+    own, models = _only_halved(selection, models, heldout, Silent().say)
+    assert own.added == (selection.added if kept else ())
+    assert models.after is (selection.after if kept else before)
+    assert models.held_after is (refitted if kept else before.force)
 
 
 @pytest.mark.parametrize("strong", [0, 1])
