@@ -32,6 +32,7 @@ LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 TOO_FINE = "it is smaller than the resolution of the recorded force"
 TOO_SMALL = f"it is less than {criteria.LEAST_SIZE:.2%} of the force"
 NO_GAIN = f"it lowers the error on held-out data by less than {criteria.LEAST_GAIN:.2%} of the force"
+NOT_HELD_OUT = "no rows can be held out to confirm it: repeat the runs"
 NEGLIGIBLE = (TOO_FINE, TOO_SMALL, NO_GAIN)
 """Reasons of a refusal after which nothing is left to explain: the effect is too small to matter."""
 
@@ -49,6 +50,7 @@ class Gain:
     left_N: float  # RMSE with it
     deviance: float  # fall of the whitened sum of squares
     error: float = 0.0  # standard error of that fall, from the groups held out
+    known: bool = True  # whether any rows could be held out that the others cover
 
     @property
     def real(self) -> bool:
@@ -91,10 +93,10 @@ def gain_between_settings(before: Fitted, proposal: Proposal) -> Iterator[Gain]:
     if len(proposal.term.effect.parameters) == 1:
         return
     for name in proposal.term.channels:
-        values = rows.values(name)
+        values = rows.unsigned(name)
         if name in CALENDAR or values.dtype.kind != "f" or not varies(values):
             continue
-        values = settings(level_values(np.abs(values) if name == "speed_mm_s" else values, rows))
+        values = settings(level_values(values, rows))
         if LEAST_SETTINGS <= np.unique(values).size <= MOST_SETTINGS:
             yield _gain(before, proposal, whole_settings(rows, values), None, ("setting", name))
 
@@ -122,7 +124,7 @@ def _gain(
         left[1, inside] = _heldout_residual(before, after.model, out, held)[inside[out]]
     scored = np.isfinite(left[0])
     if not scored.any():
-        return Gain(0.0, 0.0, 0.0, 0.0)
+        return Gain(0.0, 0.0, 0.0, known=False)
     test, weight = rows.subset(scored), rows.weight[scored]
     whitening = Whitening(after.scatter, before.loads[scored], test.groups)
     about = [about_means(own, test, around) for own in left[:, scored]]
@@ -283,7 +285,7 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
         return TOO_SMALL
     if not gain.real:
         small = size <= criteria.SMALL_SIZE * force and not proposal.term.effect.periodic
-        return NO_GAIN if small else "it does not lower the error on held-out data"
+        return _reason_without_gain(gain, small=small)
     if gain.rmse_N < criteria.LEAST_GAIN * force and not proposal.term.effect.periodic:
         return NO_GAIN
     halved, p_value = gain.share > 1 - criteria.HALVED, proposal.p_value
@@ -302,6 +304,13 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     if not proposal.term.effect.periodic and vague_between_speeds(fitted, proposal):
         return "with it the force between the tested speeds is less certain than the error that it removes"
     return None
+
+
+def _reason_without_gain(gain: Gain, *, small: bool) -> str:
+    """Return the reason why a proposal is refused that lowers no held-out error."""
+    if not gain.known:
+        return NOT_HELD_OUT
+    return NO_GAIN if small else "it does not lower the error on held-out data"
 
 
 def turns_negative(fitted: Fitted) -> bool:

@@ -16,6 +16,7 @@ from sealfit.closure.channels import FINER, Channel
 from sealfit.closure.criteria import FEW_UNITS, LARGEST_LEVERAGE, LEAST_SPARE_RUNS
 from sealfit.closure.score_test import Candidate
 from sealfit.closure.small_sample_test import satterthwaite_df
+from sealfit.effects.sensors import DAY_H
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
@@ -28,8 +29,8 @@ RANK = 1e-9  # Relative singular value below which a direction of a tangent is z
 
 # Value and both ends of its 95 % interval.
 Interval = tuple[float, float, float]
-# Amplitudes of sines, and the phase of each.
-PHASES = {"A": "phi", "B": "phi_2"}
+# Phases of waves: the amplitude of each, its period, and the largest value that is written.
+PHASES = {"phi": ("A", 2 * np.pi, np.pi), "phi_2": ("B", 2 * np.pi, np.pi), "t_max": ("A", DAY_H, DAY_H)}
 
 
 # ---------------------------------------------------------------- errors
@@ -187,12 +188,25 @@ def _residual_of_model(
     return basis.project_out(own.project_out(size)), basis.shape[1] + own.count
 
 
+def explained_variance(fitted: Fitted, candidate: Candidate) -> float:
+    """Return the variance of the residual that a candidate's columns explain by weighted least squares."""
+    root = np.sqrt(fitted.rows.weight)
+    columns = candidate.columns * (fitted.slope(*candidate.target) * root)[:, None]
+    found, *_ = np.linalg.lstsq(columns, fitted.residual * root, rcond=1e-10)
+    return float(((columns @ found) ** 2).sum())
+
+
 def level_table(
-    stage: str, fitted: Fitted, candidates: Sequence[Candidate], channels: Mapping[str, Channel]
+    stage: str,
+    fitted: Fitted,
+    searched: Fitted,
+    candidates: Sequence[Candidate],
+    channels: Mapping[str, Channel],
 ) -> pd.DataFrame:
     """Return the residual's variance by level and, within the levels, by channel (table `levels`).
 
-    The level of a candidate is the finest at which one of its `channels` varies, as that of an effect.
+    The level of a candidate is the finest at which one of its `channels` varies, as that of an effect. The
+    rows of the candidates are those of the fit that was `searched`, a part of all or means of them.
     """
     rows, force = fitted.rows, fitted.force
     noise = float(rows.weight @ fitted.scatter.noise_sd(force) ** 2)
@@ -207,11 +221,10 @@ def level_table(
         name = " ".join(candidate.channels)
         if name not in best or candidate.test_result.log_p < best[name].test_result.log_p:
             best[name] = candidate
-    sd = float(np.sqrt(rows.weight @ fitted.residual**2))
-    white = float(fitted.white_residual @ fitted.white_residual)
     for name, candidate in best.items():
-        share = candidate.chi2 / max(white, 1e-300)
-        found = (sd * np.sqrt(share), share, float(candidate.test_result.df), candidate.p_value)
+        variance = explained_variance(searched, candidate)
+        share = variance / max(searched.rmse_N**2, 1e-300)
+        found = (np.sqrt(variance), share, float(candidate.test_result.df), candidate.p_value)
         units = [channels[own].unit for own in candidate.channels if own in channels] or [candidate.unit]
         records.append((stage, min(units, key=FINER.get), name, *found))
     return pd.DataFrame(records, columns=TABLE_OF_LEVELS.names())
@@ -341,21 +354,24 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
 
 
 def normalised_waves(intervals: dict[str, Interval]) -> dict[str, Interval]:
-    """Return intervals with the amplitude of every sine positive and its phase in (-pi, pi].
+    """Return intervals with the amplitude of every wave positive and its phase within one period.
 
-    An amplitude -A is the same as A with the phase shifted by pi.
+    An amplitude -A is the same as A half a period later, and B, by which an amplitude A changes, as -B.
     """
     made = dict(intervals)
-    for amplitude, phase in PHASES.items():
+    changing = "B" in made and "phi_2" not in made
+    for phase, (amplitude, period, last) in PHASES.items():
         if amplitude not in made or phase not in made:
             continue
-        value, low, high = made[amplitude]
-        turn = np.pi if value < 0 else 0.0
-        if value < 0:
-            made[amplitude] = (-value, -high, -low)
+        shift = 0.0
+        if made[amplitude][0] < 0:
+            shift = period / 2
+            for name in (amplitude, "B") if changing else (amplitude,):
+                value, low, high = made[name]
+                made[name] = (-value, -high, -low)
         value, low, high = made[phase]
-        turn += 2 * np.pi * np.floor((np.pi - value - turn) / (2 * np.pi))
-        made[phase] = (value + turn, low + turn, high + turn)
+        shift += period * np.floor((last - value - shift) / period)
+        made[phase] = (value + shift, low + shift, high + shift)
     return made
 
 

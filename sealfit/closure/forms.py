@@ -27,7 +27,7 @@ from sealfit.tables import CALENDAR
 # ---------------------------------------------------------------- forms
 # The forms that are fitted for a candidate, and the grids of their nonlinear parameters.
 
-ADDED = ("force", "add")
+ADDED, MU = ("force", "add"), ("mu", "multiply")
 
 MOST_PLACES = 60  # Largest number of places of a jump on a grid, or of pairs of two jumps.
 
@@ -60,7 +60,7 @@ def terms_of(
     channel = channels[name]
     knots = min(criteria.MOST_KNOTS, candidate.test_result.units // criteria.UNITS_PER_KNOT)
     for term, grid in _terms_of_single(channel, target, channels, fitted, effects, knots):
-        fits = len(term.effect.parameters) <= room_along(channel, fitted)
+        fits = len(term.effect.parameters) <= room_along(channel, fitted, term.target)
         # a smoothing spline has fewer effective degrees of freedom
         if fits or len(term.channels) > 1 or term.smoothness is not None:
             yield term, grid
@@ -68,23 +68,23 @@ def terms_of(
 
 def main_effects_identifiable(channels: Sequence[Channel], fitted: Fitted) -> bool:
     """Whether the rows distinguish shapes of some channels from specimens' scatter and the declared model."""
-    known = fitted.scatter.estimates("specimen") or all(c.unit != "specimen" for c in channels)
+    known = fitted.knows_specimens or all(c.unit != "specimen" for c in channels)
     return known and all(room_along(c, fitted) > 0 for c in channels)
 
 
-def room_along(channel: Channel, fitted: Fitted) -> int:
+def room_along(channel: Channel, fitted: Fitted, target: tuple[str, str] = MU) -> int:
     """Return how many parameters of an effect a channel's settings determine beside the declared model's.
 
     Eq. 14 has up to four parameters along speed, one less where sigma_2 is at its limit, and Eq. 15 three
-    along days; along other channels there is a constant.
+    along days. Along other channels there is a constant, and along days for v_s, sigma_2 or an added force.
     """
     declared = fitted.model.declared
     own = 1
     if channel.name == "speed_mm_s":
         held = {p.owner for p, at in zip(declared.parameters, fitted.at_limit, strict=False) if at}
         own = max(NUMBERS_ALONG_SPEED[form] - (owner in held) for owner, form in declared.stribeck.items())
-    elif channel.name == "aging_days" and any(declared.law.values()):
-        own = 3
+    elif channel.name == AGING and any(declared.law.values()):
+        own = 1 if target == ADDED or target[0] in ("v_s", "sigma_2") else 3
     return np.unique(channel.values).size - own
 
 
@@ -112,11 +112,11 @@ def _terms_of_single(
             held = _within_reach(effect, channel.values)
             yield Term(held, (name, *effect.reads[1:]), *target, fixed=fixed), grid_of(held, channel.values)
         elif name in effect.reads:
-            fixed = {f"{c}_ref": reference(np.abs(fitted.rows.values(c))) for c in effect.reads}
-            grids = grid_of(effect, np.abs(channel.values))
+            fixed = {f"{c}_ref": reference(fitted.rows.unsigned(c)) for c in effect.reads}
+            grids = grid_of(effect, channel.values)
             yield Term(effect, effect.reads, *own, fixed=fixed), grids
             # the search tests the factor only
-            if target == ("mu", "multiply") and ("mu", "add") in effect.acts_on:
+            if target == MU and ("mu", "add") in effect.acts_on:
                 yield Term(effect, effect.reads, "mu", "add", fixed=fixed), grids
     if name != "direction":
         yield free_term(channel, *target, knots=knots), {}
@@ -175,8 +175,8 @@ def _terms_of_pair(
                 yield Term(effect, (x.name, z.name), *target, fixed=fixed), {}
     for effect in effects.values():
         if set(effect.reads) == {one.name, other.name} and target in effect.acts_on:
-            fixed = {f"{c.name}_ref": reference(np.abs(c.values)) for c in (one, other)}
-            yield Term(effect, effect.reads, *target, fixed=fixed), grid_of(effect, np.abs(one.values))
+            fixed = {f"{c.name}_ref": reference(c.values) for c in (one, other)}
+            yield Term(effect, effect.reads, *target, fixed=fixed), grid_of(effect, one.values)
 
 
 def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = criteria.FREE_DF + 1) -> Term:
@@ -254,7 +254,7 @@ def periodic_terms(
             )
             yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
             for name in (name for name in CHANGES_A_WAVE if name in rows.table):
-                values = np.abs(rows.values(name)) if name == "speed_mm_s" else rows.values(name)
+                values = rows.unsigned(name)
                 if np.ptp(values) > 0:
                     own = {**fixed, "z_ref": reference(values)}
                     yield Term(changing, (peak.axis, name), *target, fixed=own), names, candidate
@@ -351,7 +351,6 @@ def describe(term: Term, rows: Rows) -> str:
 # or, if that is smaller, F = t^2 / q of its amplitude: near a bound either alone may be too large.
 
 AGING = "aging_days"
-TARGET = ("mu", "multiply")
 FEWEST = 2  # Additional parameters of a richer law: an amplitude and a day.
 ROWS = 2  # Rows per stroke: aging changes strokes as a whole.
 STARTS = 4  # Start values of a law's nonlinear parameter, in days.
@@ -369,7 +368,7 @@ def richer_laws(
     if not lawful or specimens >= criteria.JACKKNIFE_UNITS or spare <= FEWEST or not before_last.size:
         return []
     known = {t.effect.id for t in fitted.model.terms}
-    laws = [e for e in effects.values() if e.physical and e.reads == (AGING,) and TARGET in e.acts_on]
+    laws = [e for e in effects.values() if e.physical and e.reads == (AGING,) and MU in e.acts_on]
     laws = [e for e in laws if e.id not in known and len(e.linear) == 1 and e.nonlinear]
     rows = fitted.rows.sparse(ROWS)
     before = reestimated(fit(fitted.model, rows, fitted.scatter, turns=1))
@@ -378,7 +377,7 @@ def richer_laws(
 
 
 def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tuple[Candidate, Proposal] | None:
-    term = Term(effect, effect.reads, *TARGET, fixed={})
+    term = Term(effect, effect.reads, *MU, fixed={})
     after = _best(before, term)
     place = len(after.model.terms) - 1
     without = reestimated(before.refitted(after.model.without_term(place)))
@@ -396,13 +395,11 @@ def _law_test(fitted: Fitted, before: Fitted, effect: Effect, laws: int) -> tupl
     p_value = fdtrc(q, error, f)
     values = after.model.values[place]
     shape = shape_of(term, values, fitted.rows)
-    column = project(fitted, (fitted.slope(*TARGET) * shape)[:, None])[:, 0]
+    column = project(fitted, (fitted.slope(*MU) * shape)[:, None])[:, 0]
     adjusted = float(min(1.0, (criteria.SEARCHES + 1) * laws * p_value))
-    test = SmallSampleTest(
-        TARGET, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error
-    )
+    test = SmallSampleTest(MU, np.empty((0, q)), 0.0, gain, float(np.log(max(p_value, 1e-300))), 1.0, error)
     test_result = ScoreTestResult(gain, q, units, test.log_p, small_sample=test)
-    candidate = Candidate((AGING,), *TARGET, "specimen", shape[:, None], test_result, adjusted)
+    candidate = Candidate((AGING,), *MU, "specimen", shape[:, None], test_result, adjusted)
     return candidate, Proposal(term, values, "specimen", units, gain, adjusted, column, candidate.key)
 
 
@@ -414,7 +411,7 @@ def _best(before: Fitted, term: Term) -> Fitted:
     found: list[Fitted] = []
     for day in days[np.unique(np.linspace(0, days.size - 1, STARTS).round().astype(int))].tolist():
         (shape,) = mean_derivatives(term, {**effect.start(), number: day}, rows, only_linear=True)
-        left = project(before, (before.slope(*TARGET) * shape)[:, None])[:, 0]
+        left = project(before, (before.slope(*MU) * shape)[:, None])[:, 0]
         size = float(left @ left)
         start = {
             **effect.start(),

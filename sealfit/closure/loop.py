@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
+from sealfit.closure.channels import searched
 from sealfit.closure.confirm import (
     NEGATIVE,
     AcceptedEffect,
@@ -24,6 +25,8 @@ from sealfit.closure.left_out import covered, folds, heldout_level, outlier_file
 from sealfit.closure.output import channel_table, curve_table, shape_points, shape_table, to_record
 from sealfit.closure.result import BeforeAfter, closure_document, effect_table
 from sealfit.closure.ripple_selection import numbered, steady_samples
+from sealfit.closure.score_test import ScoreTests
+from sealfit.closure.search import search
 from sealfit.closure.selection import Selection, Start, select_effects
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
@@ -121,8 +124,11 @@ def _drawn_tables(
     selection: Selection, before: Fitted, after: Fitted, config: Config
 ) -> dict[str, pd.DataFrame]:
     """Return the tables that do not depend on the folds."""
-    searched = (("before", before, selection.first), ("after", after, selection.left_over))
-    levels = [level_table(*one, selection.channels) for one in searched]
+    stages = (
+        ("before", before, selection.before, selection.first),
+        ("after", after, selection.after, selection.left_over),
+    )
+    levels = [level_table(*stage, selection.channels) for stage in stages]
     shapes = shape_table(after, config)
     drawn = {"shapes": shapes, "shape_points": shape_points(after, shapes)}
     if selection.inconclusive is not None:  # the last effect of a fit of its own
@@ -294,8 +300,8 @@ def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
 def _same_shape(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two shapes are correlated, or the same constant."""
     one, other = one - one.mean(), other - other.mean()
-    size = np.linalg.norm(one) * np.linalg.norm(other)
-    return size == 0 or abs(one @ other) > RIVAL_CORRELATION * size
+    sizes = np.linalg.norm(one), np.linalg.norm(other)
+    return not any(sizes) or abs(one @ other) > RIVAL_CORRELATION * sizes[0] * sizes[1]
 
 
 def _only_gains(
@@ -337,6 +343,10 @@ def _only_gains(
                 determined=models.determined & determined,
             )
     strong = tuple(r for r in refused if not r.proposal.weak)
+    if refused and selection.added:
+        channels = searched(selection.channels.values(), selection.after.rows)
+        last = search(ScoreTests(selection.after), channels, np.random.default_rng(0))
+        selection = replace(selection, last=tuple(last))
     return replace(selection, refused=(*selection.refused, *refused), worse=strong), models
 
 

@@ -99,8 +99,10 @@ def propose_ripples(
     """
     forms = periodic_terms(fitted, peak, samples, effects)
     found = [p for form in forms for p in linearised(fitted, *form)]
+    constant = [p for p in found if len(p.term.channels) == 1]
     refitted = _refitted(fitted, _best_few(found), found)
-    best, *others = _ordered(fitted, [p for p in refitted if len(p.term.channels) == 1 or _changes(p)])
+    refitted = [p for p in refitted if len(p.term.channels) == 1 or _changes(p)]
+    best, *others = _ordered(fitted, refitted or _refitted(fitted, constant))
     return [best, *(p for p in others if len(p.term.channels) == 1)]
 
 
@@ -222,8 +224,9 @@ def determined(proposal: Proposal) -> bool:
     for k, parameter in enumerate(effect.parameters):
         if parameter.linear or parameter.name == "phi":
             continue
-        error = float(np.sqrt(covariance[first + k, first + k]))
-        if error > MOST_RELATIVE_ERROR * abs(fitted.model.values[-1][parameter.name]):
+        error, value = np.sqrt(covariance[first + k, first + k]), fitted.model.values[-1][parameter.name]
+        place = CHANNEL in effect.reads and parameter.search in ("inside", "between")  # it may be near 0
+        if error > MOST_RELATIVE_ERROR * (np.ptp(parameter.bounds) if place else abs(value)):
             return False
     return True
 

@@ -67,17 +67,17 @@ def _at_grid(
 ) -> Iterator[tuple[Term, dict[str, float], np.ndarray, float]]:
     """Yield a form at each grid point of its nonlinear parameters: term, values, column and share left."""
     rows = fitted.rows
-    values = {name: rows.values(name) for name in effect.reads}
-    if any(v.dtype.kind != "f" or (np.ptp(v) == 0 and name != "direction") for name, v in values.items()):
+    values = {name: rows.unsigned(name) for name in effect.reads if name != "direction"}
+    if any(v.dtype.kind != "f" or np.ptp(v) == 0 for v in values.values()):
         return  # a constant has no effect here
-    if effect.shown_by and not effect.shown_by(values[effect.reads[0]]):
+    if effect.shown_by and not effect.shown_by(rows.values(effect.reads[0])):
         return
     slope = fitted.slope(*target)
     if np.abs(slope).max() <= 0:
         return
-    fixed = {f"{name}_ref": reference(np.abs(v)) for name, v in values.items()}
+    fixed = {f"{name}_ref": reference(v) for name, v in values.items()}
     term = Term(effect, effect.reads, *target, fixed=fixed)
-    searched = grid_of(effect, np.abs(values[effect.reads[0]]))
+    searched = grid_of(effect, rows.unsigned(effect.reads[0]))
     for point in itertools.product(*searched.values()):
         at = {**effect.start(), **dict(zip(searched, point, strict=True))}
         for name, shape in zip(
@@ -151,7 +151,7 @@ def next_runs(
     if selection.inconclusive is not None:
         wanted.append(_replicate_of(selection.inconclusive, config))
     rows = selection.after.rows
-    if rows.has_aging and not selection.after.scatter.estimates("specimen"):
+    if rows.has_aging and not selection.after.knows_specimens:
         last = rows.table.iloc[int(np.argmax(rows.days))]
         wanted.append({"why": SECOND_SPECIMEN, "conditions": _settings(last, condition_columns(config))})
     if too_short(rows):
@@ -166,7 +166,9 @@ def _is_tested(conditions: Mapping[str, object], rows: Rows) -> bool:
     for name, value in conditions.items():
         own = rows.table[name].to_numpy()
         if name in ALONG:
-            same &= value <= 1.001 * np.max(own)  # another place of a stroke is not another run
+            same &= value <= np.max(own) + 1e-3 * abs(
+                np.max(own)
+            )  # another place of a stroke is not another run
         elif isinstance(value, float) and name != "direction":
             same &= np.isclose(np.abs(own.astype(float)), abs(value), rtol=1e-3)
         else:
@@ -268,9 +270,10 @@ def largest_difference(
 def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterator[dict[str, object]]:
     """Yield combinations of values of the channels; days are kept without an aging law."""
     values: dict[str, list] = {}
+    aged = rows.conditions["series"][rows.conditions["aging_days"] > 0]
+    law = bool(len(aged)) and all(model.declared.law[series] for series in aged)
     for name in channels:
-        own = rows.values(name)
-        law = bool(model.declared.law) and all(model.declared.law.values())
+        own = rows.unsigned(name)
         if name == "direction":
             values[name] = [-1.0, 1.0]
             continue
@@ -279,7 +282,6 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
         if own.dtype.kind != "f":
             values[name] = list(np.unique(own))
             continue
-        own = np.abs(own)
         low, high = float(own.min()), float(own.max())
         beyond = high if name == "repeat" else high + BEYOND * (high - low)
         values[name] = [low, float(np.median(own)), high, beyond]

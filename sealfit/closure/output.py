@@ -70,6 +70,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
             "g": float(after.scatter.g),
             "alike": float(after.scatter.design_effect),
             "shape": float(after.scatter.shape),
+            "of_specimens": after.knows_specimens,
             "components": [
                 {"level": c.level, "kind": c.kind, "variance": float(c.variance)}
                 for c in after.scatter.components
@@ -102,7 +103,7 @@ def _ranges(rows: Rows) -> dict:
     """Return the tested range of each numeric channel and the tested values of each category."""
     ranges: dict = {}
     for name in rows.channels:
-        values = np.abs(rows.values(name)) if name == "speed_mm_s" else rows.values(name)
+        values = rows.unsigned(name)
         if values.dtype.kind == "f":
             known = values[np.isfinite(values)]
             if known.size:
@@ -287,11 +288,10 @@ def _along(
     term: Term, parameters: Mapping[str, float], rows: Rows, first: str
 ) -> tuple[dict, np.ndarray, list | None]:
     """Return inputs along one of a term's channels, others at their means, and its values or categories."""
-    values = rows.values(first)
+    values = rows.unsigned(first)
     if values.dtype.kind != "f":
         labels = [str(c) for c in np.unique(values)]
         return {term.effect.reads[0]: np.array(labels), **term.fixed}, np.full(len(labels), np.nan), labels
-    values = np.abs(values) if first == "speed_mm_s" else values
     low, high = float(values.min()), float(values.max())
     if "lambda_" in parameters:
         high = min(high, low + PERIODS * parameters["lambda_"])

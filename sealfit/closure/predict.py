@@ -19,11 +19,11 @@ from sealfit.closure.errors_and_intervals import Sandwich, mean_half_width, t_qu
 from sealfit.closure.output import from_record
 from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.config import Config
-from sealfit.effects.contract import Effect
+from sealfit.effects.contract import SECOND, Effect, deviation
 from sealfit.errors import RequestError
 from sealfit.fit.joint.declared import SPEEDS_BETWEEN
 from sealfit.fit.joint.model import Model, evaluate, loads_of
-from sealfit.fit.joint.rows import LEVELS, POWER, point_rows, sliding_power
+from sealfit.fit.joint.rows import LEVELS, POWER, Rows, point_rows, sliding_power
 from sealfit.fit.joint.whitening import GAIN, Component, Scatter
 from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.columns import add_keys, condition_columns
@@ -64,7 +64,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     code = np.where([bool(note) for note in notes], -1, code)
     good = code >= 0
     answer = np.full((len(table), len(FORCES)), np.nan)
-    if not any(c["level"] == "specimen" for c in model["scatter"]["components"]):
+    if not model["scatter"]["of_specimens"]:
         _note(notes, good, TESTED_ONLY)
     if model["df"] == 0:
         _note(notes, good, NO_INTERVAL)
@@ -79,7 +79,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
             information = [(np.array(k), np.array(block)) for k, block in own["information"]]
             others.append(Sandwich(np.array(own["covariance"]), information))
         half = mean_half_width(tangent, np.array(model["covariance"]), model["df"], others)
-        half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, mean))
+        half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, at, mean))
         spread = reach * np.sqrt(
             (half / reach) ** 2 + _one_measurement(model["scatter"], loads_of(after, at))
         )
@@ -254,12 +254,15 @@ def _outside(
     return outside
 
 
-def _of_unknown_phase(after: Model, force: np.ndarray) -> np.ndarray:
+def _of_unknown_phase(after: Model, at: Rows, force: np.ndarray) -> np.ndarray:
     """Return the variance of ripples with a phase per pass, which is unknown for a new one, shape (n,)."""
     total = np.zeros_like(force)
     for term, values in zip(after.terms, after.values, strict=True):
         if "shift" in term.fixed:
-            total += (values["A"] * (1.0 if term.operation == "add" else force)) ** 2 / 2
+            inputs, amplitude = term.inputs(at), values["A"]
+            if SECOND in inputs:
+                amplitude = amplitude + values["B"] * deviation(inputs, SECOND)
+            total += (amplitude * (1.0 if term.operation == "add" else force)) ** 2 / 2
     return total
 
 

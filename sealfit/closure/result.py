@@ -15,6 +15,7 @@ from sealfit.closure.confirm import AcceptedEffect, RefusedEffect, about_means
 from sealfit.closure.errors_and_intervals import (
     effect_intervals,
     errors,
+    explained_variance,
     lack_of_fit,
     noise_floor,
     scatter_list,
@@ -130,15 +131,16 @@ def closure_document(
     quality = fit_quality(numbers["after"], floor)
     seen = sensitivity(selection, config.loop.family_error)
     undetectable = set(undetectable_variables(selection, seen, scatter))
-    only_inconclusive = selection.inconclusive is not None and not selection.added
-    significant = bool(selection.worse) or (selection.left is not None and not only_inconclusive)
+    unclaimable = isinstance(selection.left, Candidate) and not selection.left.claimable
+    only_unclaimable = unclaimable and not selection.added
+    significant = bool(selection.worse) or (selection.left is not None and not only_unclaimable)
     # What remains beside effects that were found may be less than repeats scatter by.
     small = bool(selection.added) and not selection.worse and (quality["ratio"] or np.inf) <= 1.0
     if significant and not small:
         verdict = "unexplained"
     elif selection.added:
         verdict = "closed"
-    elif only_inconclusive:
+    elif only_unclaimable:
         verdict = "cannot_tell"
     else:
         undecided = any(not item.negligible for item in selection.refused)
@@ -323,14 +325,14 @@ def _left(selection: Selection) -> tuple[str | None, str | None, float | None]:
     if left is None and selection.added:
         last = [
             c
-            for c in selection.last
+            for c in selection.left_over
             if c.test_result.log_p <= np.log(criteria.NOT_ADJUSTED) and c.p_value < criteria.CHANCE_P
         ]
         left = _unsteady_offset(selection) or _largest(selection.after, last)
     if isinstance(left, Peak):
         return "trace", left.axis, left.p_value
     if left is None:
-        return None, None, min((c.p_value for c in selection.last), default=None)
+        return None, None, min((c.p_value for c in selection.left_over), default=None)
     names = [selection.channels[n].unit for n in left.channels if n in selection.channels]
     level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
     if left.channels[0] == "direction" and len(left.channels) > 1:
@@ -361,14 +363,6 @@ def _unsteady_offset(selection: Selection) -> Candidate | None:
 
 
 def _largest(fitted: Fitted, candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the candidate with the largest explained sum of squares."""
-    best, most = None, 0.0
-    root = np.sqrt(fitted.rows.weight)
-    for candidate in candidates:
-        slope = fitted.slope(*candidate.target)
-        columns = candidate.columns * (slope * root)[:, None]
-        found, *_ = np.linalg.lstsq(columns, fitted.residual * root, rcond=1e-10)
-        explained = float(((columns @ found) ** 2).sum())
-        if explained > most:
-            best, most = candidate, explained
-    return best
+    """Return the candidate that explains the largest variance of the residual, if any explains some."""
+    explained = [explained_variance(fitted, c) for c in candidates]
+    return candidates[int(np.argmax(explained))] if max(explained, default=0.0) > 0 else None

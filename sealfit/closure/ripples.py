@@ -100,7 +100,7 @@ def find_ripple(
             peaks += _coherent(spectrum)
         elif axis == "time_s":  # a wave may be locked to the start of the strokes
             locked = _coherent(spectrum)
-        peaks.append(_incoherent(spectrum))
+        peaks += _incoherent(spectrum)
     if not peaks:
         return None
     # A wave in time is also seen along displacement, at each speed, and vice versa. If both are significant,
@@ -153,10 +153,11 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
         total = np.abs(spectrum.total[mode]) ** 2
         statistic = total / np.maximum(spectrum.square[mode], 1e-300)
         sharp = total / background(np.where(spectrum.taken, np.nan, total)) > ABOVE_BACKGROUND
+        found = sharp & tops(total) & ~spectrum.taken
         units = int(spectrum.units[mode])
-        if units < 4 or not sharp.any():
+        if units < 4 or not found.any():
             continue
-        k = int(np.argmax(np.where(sharp & tops(total) & ~spectrum.taken, statistic, 0)))
+        k = int(np.argmax(np.where(found, statistic, 0)))
         # With random phases R/n is Beta(1, n - 1) for equal amplitudes of n units.
         p = float(betaincc(1, max(units - 1, 1), min(statistic[k] / units, 1.0)))
         p = p * spectrum.frequency.size * modes
@@ -229,8 +230,8 @@ def _mean_of_zero(numbers: np.ndarray) -> tuple[float, float]:
     return statistic, float(fdtrc(k, n - k, statistic))
 
 
-def _incoherent(spectrum: Spectrum) -> Peak:
-    """Return the best peak of the mean power of all units, whatever their phases.
+def _incoherent(spectrum: Spectrum) -> list[Peak]:
+    """Return the best peak of the mean power of all units, whatever their phases; none without a peak.
 
     The mean of U units' powers, each on its own scale, is Gamma(U) about the background. If units share a
     texture of the track, their effective number is smaller.
@@ -241,6 +242,8 @@ def _incoherent(spectrum: Spectrum) -> Peak:
     with np.errstate(divide="ignore"):  # -inf for a p-value of 0
         own = np.log(gammaincc(count, ratio * count))
     peaks = tops(spectrum.power) & ~spectrum.taken
+    if not peaks.any():
+        return []
     k = int(np.argmin(np.where(peaks, own, 1.0)))
     p = float(np.exp(own[k])) * spectrum.frequency.size
     wavelength = _refined(spectrum.power, spectrum.frequency, k)
@@ -248,7 +251,7 @@ def _incoherent(spectrum: Spectrum) -> Peak:
     significant = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
     significant[k] = True
     most = float(energy[significant].max())
-    return Peak(spectrum.axis, wavelength, True, False, float(ratio[k]), p, most)
+    return [Peak(spectrum.axis, wavelength, True, False, float(ratio[k]), p, most)]
 
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:

@@ -176,7 +176,7 @@ class _Loop:
                 if one.negligible:
                     self.negligible |= _no_stronger(open_, one.proposal) | {one.proposal.source}
             if failed and failed[0].negligible:
-                keys |= _no_stronger(open_, proposals[0])
+                keys |= _no_stronger(open_, failed[0].proposal)
                 self.negligible |= keys
             self.refused |= keys
             self.masked = []
@@ -290,12 +290,12 @@ class _Loop:
         laws = self.found.laws
         tested = (*self.last, *(c for c, _ in laws))
         unclaimable = [c for c in tested if c.p_value <= self.alpha and not c.claimable]
-        # No form can be fitted along three days beside the aging law, for example.
-        own = [p for _, p in laws]
-        if left is None and unclaimable and (proposals := self.propose(self.fitted, unclaimable, own)):
+        if left is None and unclaimable:
             left = unclaimable[0]
-            others = tuple((rival, np.nan) for rival in rivals(proposals[0], proposals))
-            inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, len(added) + 1)
+            # No form can be fitted along three days beside the aging law, for example.
+            if proposals := self.propose(self.fitted, unclaimable, [p for _, p in laws]):
+                others = tuple((rival, np.nan) for rival in rivals(proposals[0], proposals))
+                inconclusive = AcceptedEffect(proposals[0], np.nan, np.nan, others, len(added) + 1)
         return replace(found, left=left, inconclusive=inconclusive, refused=tuple(self.unconfirmed))
 
 

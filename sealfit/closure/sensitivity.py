@@ -73,7 +73,9 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     in_model = _channels_in_model(selection)
     entries = []
     for name, channel in selection.channels.items():
-        target = ("force", "add") if name == "direction" or channel.grouping else FRICTION
+        tested = {c.target for c in search.candidates if c.channels[-1] == name}
+        added = name == "direction" or channel.grouping or (tested and FRICTION not in tested)
+        target = ("force", "add") if added else FRICTION
         own = [c for c in search.candidates if (c.channels[-1], c.target) == (name, target) and not c.pair]
         own = sorted(own, key=lambda c: c.columns.shape[1])[:1]  # a straight line
         for level, part in _parts(selection, channel, own):

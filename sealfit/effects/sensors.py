@@ -215,14 +215,14 @@ def _shows_days(hours: np.ndarray) -> bool:
 
 @effect(
     label="change with the time of day",
-    equation="h = A cos(2 pi (t - t_0) / 24 h)",
+    equation="h = A cos(2 pi (t - t_max) / 24 h)",
     reference="mean over a day",
     reads=("elapsed_h",),
     acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
     parameters=(
         amplitude("A", "{y}", 0.02, "amplitude"),
         Parameter(
-            "t_0",
+            "t_max",
             "{x}",
             6.0,
             (-DAY_H, 2 * DAY_H),
@@ -232,14 +232,14 @@ def _shows_days(hours: np.ndarray) -> bool:
     ),
     source="Form: ours. The first Fourier term of anything that repeats every day.",
     # By hand: 4 h from the largest value is a sixth of a day, and cos 60 degrees = 1/2.
-    worked=({"elapsed_h": 58.0}, {"A": 0.04, "t_0": 6.0}, 0.02),
+    worked=({"elapsed_h": 58.0}, {"A": 0.04, "t_max": 6.0}, 0.02),
     shown_by=_shows_days,
 )
-def day_and_night(inputs, *, A, t_0):
+def day_and_night(inputs, *, A, t_max):
     r"""Change with the time of day: laboratory, drive and oil are warmer in the afternoon than at night.
 
     t is the time since the campaign's first file. With files in working hours only it describes the change
     within them and must not be used for the night.
     """
-    hours = np.asarray(inputs["elapsed_h"], dtype=float) - t_0
+    hours = np.asarray(inputs["elapsed_h"], dtype=float) - t_max
     return A * np.cos(2 * np.pi * hours / DAY_H)

@@ -211,7 +211,7 @@ MODEL = record(
     covariance=Matrix,
     sandwiches=list[GROUPED],
     df=Annotated[Number, Field(ge=0)],
-    scatter=record(s0=Number, g=Number, components=list[COMPONENT]),
+    scatter=record(s0=Number, g=Number, of_specimens=StrictBool, components=list[COMPONENT]),
     ranges=dict[Text, Names | tuple[Number, Number]],
     speeds_mm_s=dict[Text, list[Annotated[Number, Field(gt=0)]]],
     first_started_at=Text | None,

@@ -238,6 +238,7 @@ STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id":
     ("given", "reason"),
     [
         ({"gains": [Gain(0.5, 0.5, 1.0, 2.0)]}, "does not lower the error on held-out data"),
+        ({"gains": [Gain(0.0, 0.0, 0.0, known=False)], "added": 0.009}, "no rows can be held out"),
         (
             {"gains": [Gain(-0.5, 0.5, 1.0)], "added": 0.009},
             "lowers the error on held-out data by less than 0.01% of the force",

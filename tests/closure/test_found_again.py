@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from bins_helpers import make_bins
 
+from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import AcceptedEffect
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.loop import _all_refused, _found_in_folds, _only_gains, _only_halved
+from sealfit.closure.loop import _all_refused, _found_in_folds, _only_gains, _only_halved, _same_shape
 from sealfit.closure.result import BeforeAfter
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
@@ -100,3 +101,25 @@ def test_the_evidence_for_the_last_effect_says_what_is_asked_of_the_error(select
     kept, models = _only_gains(replace(selection, added=tuple(added)), Models(), None, Silent().say)
     assert kept.added == tuple(added)
     assert models.weak == (strong == 0)
+
+
+def test_a_constant_is_the_shape_of_no_other():
+    constant, line = np.full(5, 2.0), np.arange(5.0)
+    assert _same_shape(constant, 3 * constant)
+    assert _same_shape(line, 1 - 2 * line)
+    assert not _same_shape(constant, line)
+
+
+def test_the_candidates_are_those_of_the_model_that_is_left(selection, monkeypatch):
+    monkeypatch.setattr("sealfit.closure.loop._level_of", lambda added: "run")
+    monkeypatch.setattr("sealfit.closure.loop.turns_negative", lambda fitted: False)
+    answers = iter([False, True])
+    monkeypatch.setattr(BeforeAfter, "gains", lambda self, around, *, weak: next(answers))
+    rows, every = selection.before.rows, np.ones(selection.before.force.size, dtype=bool)
+    heldout = SimpleNamespace(refitted=lambda f: (f.force, every), covered=lambda model: every)
+    channels = {c.name: c for c in find_channels(rows)}
+    before, after = selection.before, selection.after
+    models = BeforeAfter(before, after, before.force, after.force, every, every)
+    kept, _ = _only_gains(replace(selection, channels=channels), models, heldout, Silent().say)
+    assert [a.proposal.term.channels for a in kept.added] == [("oil_ppm",)]
+    assert {c.channels[-1] for c in kept.last} >= set(OIL)

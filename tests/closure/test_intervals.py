@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from bins_helpers import TWO_FOLDS, make_bins, make_traces
 
 from sealfit.closure.criteria import FEW_UNITS
@@ -6,6 +7,7 @@ from sealfit.closure.errors_and_intervals import (
     Sandwich,
     degrees_of_freedom,
     mean_half_width,
+    normalised_waves,
     sandwiches,
     t_quantile,
 )
@@ -85,3 +87,29 @@ def test_an_effect_within_strokes_takes_no_degree_of_freedom_of_the_runs():
     assert (
         degrees_of_freedom(declared) == degrees_of_freedom(with_effect) == rows.groups.starts["run"].size - 4
     )
+
+
+@pytest.mark.parametrize(
+    ("effect", "inputs", "values"),
+    [
+        (
+            "sinusoid_changing",
+            {"x": np.linspace(0, 8, 7), "z": np.linspace(10, 20, 7), "z_ref": 10.0},
+            {"A": -2.0, "B": -0.5, "lambda_": 4.0, "phi": 3.0},
+        ),
+        ("day_and_night", {"elapsed_h": np.linspace(0, 60, 7)}, {"A": -0.02, "t_max": 20.0}),
+        (
+            "sinusoid_harmonics",
+            {"x": np.linspace(0, 8, 7)},
+            {"A": -2.0, "B": 0.5, "lambda_": 4.0, "phi": 0.3, "phi_2": 9.0},
+        ),
+    ],
+)
+def test_a_wave_of_positive_amplitude_is_the_same_wave(effect, inputs, values):
+    intervals = {name: (value, value - 0.1, value + 0.2) for name, value in values.items()}
+    made = normalised_waves(intervals)
+    shape = EFFECTS[effect].shape
+    before, after = shape(inputs, **values), shape(inputs, **{name: made[name][0] for name in made})
+    np.testing.assert_allclose(after, before, atol=1e-12)
+    assert made["A"][0] > 0
+    assert all(low < value < high for value, low, high in made.values())

@@ -137,6 +137,15 @@ def test_a_time_constant_is_determined_where_its_error_is_less_than_half_of_it(e
     assert determined(proposal("warming_time", error=error, left=left)) == known
 
 
+@pytest.mark.parametrize(("error", "known"), [(0.4, True), (0.6, False)])
+def test_a_place_near_0_is_determined_where_its_error_is_less_than_half_of_the_range(error, known):
+    made = proposal("step", channels=("displacement_mm",), error=error)
+    at_0 = [replace(p, bounds=(-0.5, 0.5)) if p.name == "x_0" else p for p in made.term.effect.parameters]
+    made = replace(made, term=replace(made.term, effect=replace(made.term.effect, parameters=tuple(at_0))))
+    made.fitted.model.values[-1]["x_0"] = 1e-6
+    assert determined(made) == known
+
+
 def test_amplitudes_and_phases_need_not_be_determined():
     assert determined(proposal("linear", error=3.0))
     ripple = proposal("ripple", "force", "add", channels=("displacement_mm",))

@@ -7,7 +7,14 @@ from bins_helpers import make_bins
 
 from sealfit.closure.left_out import OutlierFile
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.next_runs import LONGER_STROKES, _is_tested, find_aliases, largest_difference, next_runs
+from sealfit.closure.next_runs import (
+    LONGER_STROKES,
+    _combinations,
+    _is_tested,
+    find_aliases,
+    largest_difference,
+    next_runs,
+)
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import AMPLITUDE, Parameter
@@ -165,3 +172,27 @@ def test_longer_strokes_are_wanted_where_the_friction_is_not_steady_at_their_end
         added=(), inconclusive=None, after=fit_declared(make_rows(bins, has_aging=True))
     )
     assert {"why": LONGER_STROKES, "conditions": {}} in next_runs(selection, Config(), {})
+
+
+@pytest.mark.parametrize("temperatures", [(60.0,), (60.0, 80.0)])
+def test_days_are_varied_where_each_aged_series_has_a_law(temperatures):
+    bins = make_bins(2, temperatures=temperatures, days=(2.0, 4.0, 16.0), bins=2, repeats=1)
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    found = _combinations(fitted.model, fitted.rows, ("aging_days",))
+    assert [point["aging_days"] for point in found][-2:] == [16.0, 24.0]
+
+
+def test_a_place_between_tested_ones_is_tested_on_either_side_of_0():
+    bins = make_bins(2, temperatures=(60.0,), days=(4.0,), bins=4, repeats=1)
+    rows = make_rows(bins.assign(displacement_mm=bins["displacement_mm"] - 100.0), has_aging=True)
+    assert _is_tested({"displacement_mm": float(rows.values("displacement_mm").max())}, rows)
+    assert not _is_tested({"displacement_mm": -1.0}, rows)
+
+
+def test_files_with_a_specimen_each_show_the_scatter_of_specimens():
+    bins = make_bins(2, temperatures=(60.0,), days=(1.0, 4.0, 16.0), bins=4, repeats=1, specimen=0.03)
+    fitted = fit_declared(make_rows(bins.assign(specimen_id=bins["file"]), has_aging=True))
+    assert not fitted.scatter.estimates("specimen")
+    assert fitted.knows_specimens
+    selection = SimpleNamespace(added=(), inconclusive=None, after=fitted)
+    assert not any("scatter of specimens" in run["why"] for run in next_runs(selection, Config(), {}))

@@ -1,4 +1,4 @@
-from types import SimpleNamespace
+from dataclasses import replace
 
 import bins_helpers
 import numpy as np
@@ -9,6 +9,7 @@ from sealfit.closure.channels import Channel, find_channels
 from sealfit.closure.errors_and_intervals import level_table
 from sealfit.closure.forms import free_term, surface_term
 from sealfit.closure.output import GROUPS, POINTS, channel_table, curve_table, shape_points, shape_table
+from sealfit.closure.score_test import Candidate, ScoreTestResult
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -121,9 +122,23 @@ def test_a_variable_has_the_level_at_which_it_varies():
     rows = make_rows(bins_helpers.make_bins(repeats=2, bins=4, temperatures=(60.0,)), has_aging=True)
     fitted = fit(start_model(rows), rows, turns=1)
     channels = {one.name: one for one in find_channels(rows)}
-    found = {"unit": "run", "chi2": 1.0, "p_value": 1.0, "test_result": SimpleNamespace(log_p=0.0, df=1)}
-    candidates = [SimpleNamespace(channels=(name,), **found) for name in ("displacement_mm", "speed_mm_s")]
-    levels = level_table("after", fitted, candidates, channels).dropna(subset="channel")
+    result = ScoreTestResult(1.0, 1, 10, 0.0)
+    candidates = [
+        Candidate((name,), "mu", "multiply", "run", channels[name].values[:, None], result)
+        for name in ("displacement_mm", "speed_mm_s")
+    ]
+    levels = level_table("after", fitted, fitted, candidates, channels).dropna(subset="channel")
     assert dict(zip(levels["channel"], levels["level"], strict=True)) == {
         "displacement_mm": "sample", "speed_mm_s": "run",
     }  # fmt: skip
+
+
+def test_the_part_of_a_variable_is_what_it_explains_of_the_residual():
+    rows = make_rows(bins_helpers.make_bins(repeats=3, bins=4, temperatures=(60.0,)), has_aging=True)
+    fitted = fit(start_model(rows), rows, turns=1)
+    shape = (rows.values("repeat") - 2.0)[:, None]
+    exact = replace(fitted, force=rows.force - 0.3 * fitted.slope("mu", "multiply") * shape[:, 0])
+    candidate = Candidate(("repeat",), "mu", "multiply", "file", shape, ScoreTestResult(1.0, 1, 10, -9.0))
+    table = level_table("before", exact, exact, [candidate], {}).set_index("channel")
+    assert table.loc["repeat", "share"] == pytest.approx(1.0)
+    assert table.loc["repeat", "sd_N"] == pytest.approx(exact.rmse_N)

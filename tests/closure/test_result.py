@@ -116,10 +116,11 @@ def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted, mon
     )
     small = RefusedEffect(strong.proposal, NO_GAIN)
     left = candidate("oil_ppm")
+    unclaimable = replace(left, test_result=left.test_result._replace(consistent=False))
     verdicts = {
         "closed": document(replace(selection, added=(item,)), after),
         "unexplained": document(replace(selection, left=left)),
-        "cannot_tell": document(replace(selection, inconclusive=item)),
+        "cannot_tell": document(replace(selection, left=unclaimable, inconclusive=item)),
         "nothing_missing": document(replace(selection, refused=(small,))),
     }
     assert {name: found["verdict"] for name, found in verdicts.items()} == {name: name for name in verdicts}
@@ -128,9 +129,7 @@ def test_the_verdict_says_what_was_found_and_what_is_left(selection, fitted, mon
     within = document(replace(selection, added=(item,), left=left), after)
     assert (within["verdict"], within["left"]["significant"]) == ("closed", True)
     monkeypatch.undo()
-    assert (
-        document(replace(selection, left=left, inconclusive=item))["verdict"] == "cannot_tell"
-    )  # too few specimens show it
+    assert document(replace(selection, left=unclaimable))["verdict"] == "cannot_tell"  # no form describes it
     assert document(replace(selection, refused=(strong,)))["verdict"] == "cannot_tell"
     assert document(replace(selection, worse=(strong,), refused=(strong,)))["verdict"] == "unexplained"
     refused = document(replace(selection, refused=(weak, strong)))
@@ -219,11 +218,8 @@ def test_what_is_still_significant_is_named_at_its_level(selection):
     assert left(candidate("direction", "oil_ppm")) == ("run", "direction oil_ppm", 1e-3)
     assert left(candidate("condition", unit="specimen")) == ("condition", "condition", 1e-3)
     assert left(None) == (None, None, None)
-    assert left(None, last=(candidate("oil_ppm", p_value=0.3), candidate("time_s", p_value=0.9))) == (
-        None,
-        None,
-        0.3,
-    )
+    not_significant = candidate("oil_ppm", p_value=0.3), candidate("time_s", p_value=0.9)
+    assert left(None, first=not_significant) == (None, None, 0.3)
 
 
 def test_an_effect_that_lowered_no_error_is_left(selection):

@@ -7,7 +7,8 @@ import pytest
 from sealfit.closure import ripple_selection
 from sealfit.closure.confirm import Context
 from sealfit.closure.ripple_selection import turns_joined
-from sealfit.closure.ripples import Peak, _with_shared_phase, find_ripple
+from sealfit.closure.ripples import Peak, _coherent, _incoherent, _with_shared_phase, find_ripple
+from sealfit.closure.spectrum import Spectrum
 from sealfit.config import Config
 
 
@@ -264,3 +265,15 @@ def test_a_round_that_tries_a_ripple_says_so_first(monkeypatch):
     ripples = ripple_selection.Ripples(pd.DataFrame({"force_N": [1.0]}), Context(Config(), {}, said.append))
     ripples.added_to(SimpleNamespace(), None)
     assert said == ["round 1: a significant ripple in the samples, before all other effects", "tried"]
+
+
+def test_a_spectrum_that_only_falls_has_no_peak():
+    """Its low end has the smooth shapes of strokes."""
+    frequency = np.linspace(0.1, 3.0, 30)
+    falling, ones = 1 / frequency**2, np.ones(30)
+    spectrum = Spectrum(
+        "displacement_mm", frequency, ones > 1, 12 * ones, falling, falling, (12 * falling)[None] + 0j,
+        falling[None], falling[None] + 0j, np.array([12]),
+    )  # fmt: skip
+    assert _coherent(spectrum) == []
+    assert _incoherent(spectrum) == []

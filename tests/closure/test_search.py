@@ -13,9 +13,9 @@ from sealfit.closure.channels import (
     unit_of,
     without_trends,
 )
-from sealfit.closure.forms import terms_of
+from sealfit.closure.forms import room_along, terms_of
 from sealfit.closure.naming import propose
-from sealfit.closure.score_test import ScoreTests, log_p_of
+from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of
 from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -437,3 +437,28 @@ def test_specimens_that_differ_in_dry_friction_alone_are_no_change_with_the_cale
     channels = [c for c in searched(channels_of(rows, Config()), rows) if c.name in CALENDAR]
     found = search(ScoreTests(fitted), channels, np.random.default_rng(0))
     assert min(c.p_value for c in found) > 0.05
+
+
+@pytest.mark.parametrize(("offset", "reference"), [(0.0, 22.0), (-40.0, -18.0)])
+def test_the_reference_of_a_signed_channel_has_its_sign(offset, reference):
+    cold = {"lab_temperature_C": lambda rng: offset + 22.0 + rng.uniform(-0.01, 0.01)}
+    rows = make_rows(make_bins(2, bins=4, repeats=2, temperatures=(60.0,), run_channels=cold), has_aging=True)
+    fitted, channels = fit_declared(rows), {c.name: c for c in find_channels(rows)}
+    result = ScoreTestResult(9.0, 1, 40, -9.0)
+    candidate = Candidate(("lab_temperature_C",), "mu", "multiply", "run", np.ones((1, 1)), result)
+    found = {
+        term.fixed[name]
+        for term, _ in terms_of(candidate, channels, fitted, EFFECTS)
+        for name in ("x_ref", "lab_temperature_C_ref")
+        if name in term.fixed and term.effect.id != "smooth"
+    }
+    assert found == {reference}
+
+
+def test_few_days_determine_what_the_declared_model_has_the_same_on_all_days():
+    rows = make_rows(make_bins(2, bins=4, repeats=1, days=(4.0, 28.0)), has_aging=True)
+    fitted = fit_declared(rows)
+    days = next(c for c in find_channels(rows) if c.name == "aging_days")
+    assert room_along(days, fitted) == 0
+    assert room_along(days, fitted, ("force", "multiply")) == 0
+    assert [room_along(days, fitted, t) for t in (("v_s", "multiply"), ("force", "add"))] == [2, 2]

@@ -1,11 +1,15 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
 from bins_helpers import make_bins
 
+from sealfit.closure.predict import _of_unknown_phase
 from sealfit.closure.ripples import agreement, common_wavelength, pass_shifts
 from sealfit.closure.spectrum import _on_grid
-from sealfit.fit.joint.model import passes
+from sealfit.effects import EFFECTS
+from sealfit.fit.joint.model import Term, passes
 from sealfit.fit.joint.rows import make_rows
 
 
@@ -75,3 +79,15 @@ def test_parabola_is_no_wave():
     value = 3 - 2 * x + 0.5 * x**2
     trend, _ = _on_grid(x.size)
     np.testing.assert_allclose(value - trend @ (trend.T @ value), 0.0, atol=1e-10)
+
+
+def test_the_unknown_phase_of_a_pass_counts_as_much_as_the_wave_is_strong_there():
+    bins = make_bins(temperatures=(60.0,), days=(4.0,), speeds=(1.0, 2.0), directions=(1, -1), bins=3)
+    rows = make_rows(bins, has_aging=False)
+    fixed = {"shift": {}, "z_ref": 0.0}
+    names = ("displacement_mm", "direction")
+    term = Term(EFFECTS["sinusoid_changing"], names, "force", "add", fixed)
+    values = {"A": 0.5, "B": 0.5, "lambda_": 3.0, "phi": 0.0}
+    after = SimpleNamespace(terms=(term,), values=(values,))
+    variance = _of_unknown_phase(after, rows, rows.force)
+    np.testing.assert_allclose(variance, np.where(rows.speed > 0, 0.5, 0.0))

@@ -459,3 +459,14 @@ def test_a_search_on_few_rows_is_not_believed_against_all_rows(found, searched, 
     model = before.model.with_term(term, {"A": 0.0})
     own = _searched(model, rows, before.scatter)
     assert np.array_equal(own.vector(), model.vector()) != searched
+
+
+@pytest.mark.parametrize("names", ["ABC", "CAB"])
+def test_groups_are_nested_where_the_repeats_of_a_run_are_on_several_specimens(names):
+    bins = bins_helpers.make_bins(
+        temperatures=(60.0,), days=(4.0,), speeds=(1.0, 4.0, 16.0), repeats=3, bins=2
+    )
+    bins["specimen_id"] = bins["condition"] + bins["repeat"].map(dict(zip((1, 2, 3), names, strict=True)))
+    rows = make_rows(bins, has_aging=True)
+    sizes = {level: start.size for level, start in rows.groups.starts.items()}
+    assert (sizes["file"], sizes["run"], sizes["specimen"]) == (18, 6, 2)

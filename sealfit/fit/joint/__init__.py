@@ -66,6 +66,14 @@ class Fitted:
         """Root mean square of the residual; every file has the same weight."""
         return float(np.sqrt(self.rows.weight @ self.residual**2))
 
+    @property
+    def knows_specimens(self) -> bool:
+        """Whether the scatter of specimens is estimated, if only as that of files with a specimen each."""
+        starts = self.rows.groups.starts
+        specimens, components = starts["specimen"].size, self.scatter.components
+        each = any(c.kind in LEVELS_OF_FORCE and starts[c.level].size == specimens for c in components)
+        return each and specimens - self.model.declared.mu_parameter_count >= 2
+
     @cached_property
     def basis(self) -> Tangent:
         """Orthonormal basis of the whitened tangent space without `at_limit`, of shape (n, rank)."""

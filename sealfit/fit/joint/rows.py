@@ -188,6 +188,11 @@ class Rows:
             return column.to_numpy(dtype=float, na_value=np.nan)
         return column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
 
+    def unsigned(self, channel: str) -> np.ndarray:
+        """Return a channel as the forms of effects read it: the speed without its sign, shape (n,)."""
+        values = self.values(channel)
+        return np.abs(values) if channel == "speed_mm_s" else values
+
     @cached
     def bin_width(self, channel: str) -> np.ndarray:
         """Return the width of each row's bin in a channel, shape (n,).
@@ -248,7 +253,9 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     which these bins are a part, so that its model applies to them.
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
-    keys = [table["record"], nesting_run(table, table["record"]), table["specimen_id"]]
+    run = nesting_run(table, table["record"])
+    # A run on several specimens is of the first: groups are nested.
+    keys = [table["record"], run, table["specimen_id"].groupby(run).transform("min")]
     codes = [table["stroke"].to_numpy(), *(pd.factorize(key, sort=True)[0] for key in keys)]
     order = np.lexsort(codes)
     table = table.iloc[order].reset_index(drop=True)
