@@ -101,24 +101,24 @@ def lack_of_fit(fitted: Fitted) -> float | None:
 def _p_of_shapes(fitted: Fitted) -> list[float]:
     """Return the p-values of shapes along strokes that the repeats of a run have in common.
 
-    Each is one number per stroke, the coefficient of a Legendre polynomial, so that noise may be correlated
-    within strokes.
+    Each is one number per file, the mean over its strokes of the coefficient of a Legendre polynomial: noise
+    may be correlated within strokes, and strokes of a file may have a shape in common.
     """
     rows = fitted.rows
     stroke, start = rows.codes("stroke"), rows.groups.starts["stroke"]
     count = np.bincount(stroke)
     place = (np.arange(stroke.size) - start[stroke] + 0.5) * 2 / count[stroke] - 1
-    scale = fitted.scatter.noise_sd(fitted.force)[start]
-    run, number = rows.table["run_id"].to_numpy()[start], rows.table["stroke"].to_numpy()[start]
+    scale = fitted.scatter.noise_sd(fitted.friction)[start]
+    run, file = rows.table["run_id"].to_numpy()[start], rows.codes("file")[start]
     chosen = count > SHAPES
     found = []
     for degree in range(1, SHAPES + 1):
         shape = Legendre.basis(degree)(place)
         strokes = pd.DataFrame(
-            {"run": run, "stroke": number, "z": np.bincount(stroke, shape * fitted.residual) / count}
+            {"run": run, "file": file, "z": np.bincount(stroke, shape * fitted.residual) / count}
         )
         strokes["z"] /= scale
-        cells = strokes[chosen].groupby(["run", "stroke"])["z"]
+        cells = strokes[chosen].groupby(["run", "file"])["z"].mean().groupby("run")
         mean, files = cells.mean().to_numpy(), cells.size().to_numpy()
         df = float((files - 1).sum())
         if df > 0:
@@ -134,11 +134,11 @@ def _p_of_run_means(fitted: Fitted) -> float | None:
     """
     rows = fitted.rows
     clean = without_repeat_pattern(rows, fitted.residual)
-    keys = rows.table[["run_id"]].assign(file=rows.codes("file"), residual=clean, force=fitted.force)
+    keys = rows.table[["run_id"]].assign(file=rows.codes("file"), residual=clean, friction=fitted.friction)
     files = keys.groupby(["run_id", "file"], sort=False).mean().reset_index()
     of_rows = pd.Series(fitted.scatter.level_variance("file", fitted.loads))
     spread = np.sqrt(of_rows.groupby(rows.codes("file")).mean()[files["file"]].to_numpy() + 1e-300)
-    noise = fitted.scatter.noise_sd(files["force"].to_numpy())
+    noise = fitted.scatter.noise_sd(files["friction"].to_numpy())
     per_file = len(rows.table) / len(files)
     scale = np.asarray(np.sqrt(spread**2 + noise**2 * fitted.scatter.design_effect / per_file))
     files["z"] = files["residual"] / scale
@@ -208,9 +208,9 @@ def level_table(
     The level of a candidate is the finest at which one of its `channels` varies, as that of an effect. The
     rows of the candidates are those of the fit that was `searched`, a part of all or means of them.
     """
-    rows, force = fitted.rows, fitted.force
-    noise = float(rows.weight @ fitted.scatter.noise_sd(force) ** 2)
-    free = float(force.size - rows.groups.starts["stroke"].size)
+    rows = fitted.rows
+    noise = float(rows.weight @ fitted.scatter.noise_sd(fitted.friction) ** 2)
+    free = float(rows.force.size - rows.groups.starts["stroke"].size)
     parts = [("sample", noise, free), *_scatter_by_level(fitted)]
     total = sum(variance for _, variance, _ in parts) or 1.0
     records = [

@@ -242,10 +242,10 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
     flagged = outlying_repeats(repeat_means(steady), config.quality.outlier_p)
     outlier, dropped, found = np.zeros(len(steady), bool), np.zeros(len(steady), bool), []
     unit = config.units.unit("force")
-    near = np.flatnonzero(steady["file"].isin(flagged["file"]))
-    places = steady.iloc[near].groupby(["file", "run_id"], sort=False).indices
+    near = np.flatnonzero(steady["run_id"].isin(flagged["run_id"]))
+    places = steady.iloc[near].groupby(["run_id", "repeat"], sort=False).indices
     for row in flagged.itertuples(index=False):
-        rows = near[places[row.file, row.run_id]]
+        rows = near[places[row.run_id, row.repeat]]
         out = config.quality.drop_outliers and not row.alone
         outlier[rows] = True
         dropped[rows] |= out

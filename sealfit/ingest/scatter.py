@@ -46,8 +46,9 @@ def repeat_means(steady: pd.DataFrame) -> pd.DataFrame:
     left out.
     """
     rows = steady[steady["used"].to_numpy(bool)] if "used" in steady.columns else steady
-    means = rows.groupby(["run_id", "repeat", "file"], sort=True, observed=True)["force_N"].mean().abs()
-    return means.reset_index()[["file", "run_id", "repeat", "force_N"]]
+    grouped = rows.groupby(["run_id", "repeat"], sort=True, observed=True)
+    means = grouped.agg(file=("file", "first"), force_N=("force_N", "mean")).reset_index()
+    return means.assign(force_N=means["force_N"].abs())[["file", "run_id", "repeat", "force_N"]]
 
 
 def repeat_scatter(steady: pd.DataFrame) -> Scatter:

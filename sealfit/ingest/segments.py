@@ -1,9 +1,6 @@
-"""Flat arrays of many strokes or runs one after the other, and medians, waves and stretches of one trace."""
+"""Medians, waves, transients and stretches of one trace."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
@@ -22,32 +19,6 @@ COMPARED = 8
 # Standard errors, and share of the force, by which the first part must be off, one pair or the other. What
 # warming leaves beside the parabola in a stroke of low noise reaches 10 standard errors and 2 % of the force.
 OFF = ((20.0, 0.002), (8.0, 0.1))
-
-
-class Pieces:
-    """Where each of k pieces lies in a flat array: rows `start` to `stop` (exclusive), both of shape (k,).
-
-    The pieces follow one another without gaps, and none is empty.
-    """
-
-    def __init__(self, sizes: Sequence[int] | np.ndarray):
-        self.size = np.asarray(sizes, np.int64)
-        self.stop = np.cumsum(self.size)
-        self.start = self.stop - self.size
-
-    @cached_property
-    def of(self) -> np.ndarray:
-        """The piece of every row, shape (rows,)."""
-        return np.repeat(np.arange(len(self.size)), self.size)
-
-    @cached_property
-    def slices(self) -> list[slice]:
-        """The rows of every piece."""
-        return [slice(*ends) for ends in zip(self.start.tolist(), self.stop.tolist(), strict=True)]
-
-    def spread(self, per_piece: np.ndarray) -> np.ndarray:
-        """Return a value per piece as one per row."""
-        return np.repeat(per_piece, self.size)
 
 
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:

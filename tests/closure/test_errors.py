@@ -1,4 +1,5 @@
 import numpy as np
+import pandas as pd
 from bins_helpers import make_bins
 
 from sealfit.closure.errors_and_intervals import lack_of_fit
@@ -24,3 +25,19 @@ def test_without_a_misfit_p_values_are_not_small_more_often_than_by_chance():
     be, in 41 %.
     """
     assert sum(p_value(seed) < 0.1 for seed in range(40)) <= 8
+
+
+def test_strokes_of_a_file_that_are_alike_are_no_further_files():
+    """Files have slopes of their own, common to their strokes; of 20 p-values one is below 0.05."""
+
+    def of_files(seed: int) -> float:
+        rng = np.random.default_rng(seed)
+        bins = make_bins(seed=seed, temperatures=(), days=(), gain=0.002, noise_N=0.05, bins=4)
+        slope = bins["file"].map({name: rng.normal(0, 0.3) for name in bins["file"].unique()})
+        strokes = [bins.assign(stroke=k, force_N=bins["force_N"] + rng.normal(0, 0.05, len(bins)))
+                   for k in (1, 2, 3, 4, 5, 6)]  # fmt: skip
+        bins, slope = pd.concat(strokes, ignore_index=True), np.tile(slope, 6)
+        bins["force_N"] += np.sign(bins["speed_mm_s"]) * slope * (bins["bin"] / bins["bin"].max() - 0.5)
+        return lack_of_fit(fit_declared(make_rows(bins, has_aging=True)))
+
+    assert sum(of_files(seed) < 0.05 for seed in range(12)) <= 2

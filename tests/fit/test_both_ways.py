@@ -39,3 +39,12 @@ def test_what_both_ways_share_is_counted_once(campaign):
     for name in ("value", "se", "lo95", "hi95"):
         one_way, together = (fit.loc[fit["quantity"] == "steady", name].to_numpy(float) for fit in fits)
         assert together == pytest.approx(one_way, rel=1e-6, nan_ok=True)
+
+
+def test_a_file_without_its_strokes_of_one_way_brings_no_offset_in(campaign):
+    table = campaign(noise=0.0, days=(0,), together=True)
+    shifted = table.assign(force_N=table["force_N"] + 0.7)
+    lone = shifted.index[(shifted["direction"] < 0)][0]
+    found = merge_directions(shifted.drop(index=lone))
+    assert set(found["direction"]) == {0}
+    assert len(found) == len(table) / 2 - 1

@@ -4,6 +4,7 @@ import bins_helpers
 import numpy as np
 import numpy.testing as npt
 import pytest
+from scipy.signal import lfilter
 
 from sealfit.closure.left_out import between_speeds
 from sealfit.effects import EFFECTS
@@ -13,7 +14,7 @@ from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
 from sealfit.fit.joint.rows import make_rows, set_speeds, thin
 from sealfit.fit.joint.search import start_model
-from sealfit.fit.joint.variance_components import curve_components
+from sealfit.fit.joint.variance_components import _design_effect, curve_components
 from sealfit.ingest.strokes import speed_clusters
 
 WAVE = Effect(
@@ -470,3 +471,34 @@ def test_groups_are_nested_where_the_repeats_of_a_run_are_on_several_specimens(n
     rows = make_rows(bins, has_aging=True)
     sizes = {level: start.size for level, start in rows.groups.starts.items()}
     assert (sizes["file"], sizes["run"], sizes["specimen"]) == (18, 6, 2)
+
+
+def test_three_speeds_in_one_file_show_a_curve_as_three_files_do():
+    bins = bins_helpers.make_bins(temperatures=(60.0,), days=(4.0,), speeds=(1.0, 8.0, 64.0), bins=4)
+    one_file = bins.assign(file=bins["condition"] + bins["repeat"].astype(str))
+    forms = [declare(make_rows(table, has_aging=True)).stribeck for table in (bins, one_file)]
+    assert forms[0] == forms[1]
+    assert set(forms[0].values()) == {"interpolated"}
+
+
+def test_a_condition_whose_files_were_all_left_out_has_a_finite_start():
+    bins = bins_helpers.make_bins(days=(1.0, 4.0, 16.0), speeds=(1.0, 8.0, 64.0, 100.0), repeats=1, bins=2)
+    rows = make_rows(bins, has_aging=True)
+    last = rows.conditions["condition"].iloc[-1]
+    rest = rows.subset((rows.table["condition"] != last).to_numpy())
+    assert np.isfinite(start_model(rest).theta).all()
+
+
+def test_one_short_stroke_does_not_hide_the_correlation_of_the_others():
+    rng = np.random.default_rng(0)
+    noise = lfilter([1.0], [1.0, -0.8], rng.normal(size=(60, 40)), axis=1)
+    sizes = [40] * 60
+    every = _design_effect(*_strokes(noise.ravel(), sizes))
+    short = _design_effect(*_strokes(np.r_[noise.ravel(), rng.normal(size=4)], [*sizes, 4]))
+    assert every > 3
+    assert short == pytest.approx(every, rel=0.05)
+
+
+def _strokes(values, sizes):
+    code = np.repeat(np.arange(len(sizes)), sizes)
+    return values, code, np.r_[0, np.cumsum(sizes)[:-1]], np.array(sizes)

@@ -200,6 +200,7 @@ def test_falling_friction_ends_at_the_physical_limit_of_sigma_2(campaign):
     row = steady(fit_conditions(table, Config()), "sigma_2")
     assert row.value == 0
     assert row.lo95 == 0
+    assert np.isnan(row.se)
     assert "physical limit 0" in row.reason
 
 

@@ -72,6 +72,13 @@ def test_strokes_of_one_file_count_once_and_unused_rows_not_at_all():
     assert means["force_N"].tolist() == [2.0, 5.0]
 
 
+def test_files_with_a_stroke_each_are_one_repeat():
+    table = campaign(6, np.random.default_rng(1))
+    split = pd.concat([table.assign(file=table["file"] + f"/{k}") for k in range(4)], ignore_index=True)
+    npt.assert_allclose(repeat_means(split)["force_N"], repeat_means(table)["force_N"])
+    assert repeat_scatter(repeat_means(split)).df == repeat_scatter(repeat_means(table)).df
+
+
 @pytest.mark.parametrize("runs", [6, 24])
 def test_false_flags_keep_to_the_family_wise_level(runs):
     rng = np.random.default_rng(runs)

@@ -203,7 +203,7 @@ def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
             "mu": np.abs(rows.force[chosen]) / load,
         }
     )
-    files = table.groupby(["file", "direction", "condition"], as_index=False).mean()
+    files = table.groupby(["file", "direction", "condition", "slow", "middle"], as_index=False).mean()
     of_level = ("condition", "repeat", "direction")
     levels = np.hstack([pd.get_dummies(files[name], dtype=float) for name in of_level])
     slope = files["slope"].to_numpy()[:, None]

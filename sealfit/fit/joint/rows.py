@@ -85,7 +85,8 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     not independent. In a merged row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id`
     has no sign.
     """
-    rows, record = steady, records(steady)
+    record = records(steady)
+    rows = steady.assign(file=record)
     run = rows["run_id"].where(nesting_run(rows, record) == rows["run_id"], rows["run_id"].str.rstrip("+-"))
     pace = rows["speed_mm_s"].abs()
     if "speed_set_mm_s" in rows.columns:
@@ -95,10 +96,13 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     merged = grouped["direction"].transform("nunique").eq(2)
     merged &= grouped["pace"].transform("max") <= SPEEDS_APART * grouped["pace"].transform("min")
     merged = merged.groupby(run).transform("all")
+    # A file that lost its strokes of one direction would bring a zero offset into the fit.
+    kept = merged | ~rows["run_id"].str.rstrip("+-").isin(set(run[merged]))
+    rows, run, merged = rows[kept], run[kept], merged[kept]
     if not merged.any():
         return rows
     size = {"force_N": rows["force_N"] * rows["direction"], "speed_mm_s": rows["speed_mm_s"].abs()}
-    own = rows.assign(run_id=run, file=record, **size)[merged]
+    own = rows.assign(run_id=run, **size)[merged]
     numbers = [c for c in own.columns if pd.api.types.is_float_dtype(own[c])]
     directions = own.groupby([*KEYS, "direction"], sort=False)[numbers].mean()
     means = own.drop(columns=numbers).groupby(KEYS, sort=False).first()

@@ -69,18 +69,20 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
             level[c], chosen[c] = pair, True
         if full:
             theta[of_v_s] = np.log(v_s)
-    for c in np.flatnonzero(~chosen):
+    present = np.bincount(condition, minlength=chosen.size) > 0  # its files may have been left out
+    for c in np.flatnonzero(present & ~chosen):
         mine = condition == c
         level[c] = np.mean(size[mine] / load[mine])
+    level[~present] = level[present].mean(axis=0)
     days = rows.conditions["aging_days"].to_numpy()
     for column, end in ((0, "s"), (1, "c")):
         index_0, index_a, index_b = (declared.index[name + end] for name in ("mu_0", "a_", "b_"))
         for k in np.unique(index_0[(index_0 >= 0)]):
-            mine = index_0 == k
+            mine = _known(index_0 == k, present)
             unaged = mine & (days == days[mine].min())
             theta[k] = level[unaged, column].mean()
         for k in np.unique(index_a[index_a >= 0]):
-            mine = index_a == k
+            mine = _known(index_a == k, present)
             mu_0 = theta[index_0[mine][0]]
             drop = mu_0 - level[mine, column]
             grid = np.geomspace(days[days > 0].min() / 100, days.max() * 3, 60)
@@ -90,6 +92,11 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
             theta[k] = a[best]
             theta[index_b[mine][0]] = np.log(grid[best])
     return Model(declared, theta)
+
+
+def _known(mine: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Return those of some conditions that have rows, or all if none has."""
+    return mine & present if (mine & present).any() else mine
 
 
 def _per_condition(speed, load, size, condition, full: bool):

@@ -19,13 +19,13 @@ from sealfit.ingest.scatter import two_nonnegative
 # ---------------------------------------------------------------- reml
 # Variance components at nested levels by restricted maximum likelihood (REML), with its exact gradient.
 #
-# With B = [1, F] the loadings of offset and gain, :math:`K_l` their variances at level l, and V_l the
+# With B the loads of the k kinds of random effects, :math:`K_l` their variances at level l, and V_l the
 # covariance up to that level, Woodbury's identity gives for each group
 #
 # .. math:: B^T V_l^{-1} B = Q - Q M Q, \quad M = K^{1/2} (1 + K^{1/2} Q K^{1/2})^{-1} K^{1/2},
 #           \quad Q = \sum_\mathrm{inside} B^T V_{l-1}^{-1} B
 #
-# Only 2 x 2 matrices are inverted: from the finest level to the coarsest for the likelihood, and back for its
+# Only k x k matrices are inverted: from the finest level to the coarsest for the likelihood, and back for its
 # gradient.
 #
 # Searle, Casella & McCulloch 1992, *Variance Components*, doi:10.1002/9780470316856, chapter 6.
@@ -129,7 +129,7 @@ class RestrictedLikelihood:
             size[level][k] = v
         own = self.variance + self.loads**2 @ size[self.finest]
         columns = self.columns / own[:, None]
-        # B' V^-1 B, shape (groups, 2, 2), and B' V^-1 [X r], shape (groups, 2, p + 1).
+        # B' V^-1 B, shape (groups, k, k), and B' V^-1 [X r], shape (groups, k, p + 1).
         square = self.loads[:, :, None] * (self.loads / own[:, None])[:, None, :]
         cross = self.loads[:, :, None] * columns[:, None, :]
         gram = self.layout[self.finest].gram(self.columns, columns)
@@ -223,9 +223,9 @@ def estimate_scatter(
 ) -> Scatter:
     """Return row noise and variance components of the residual of a model, by REML.
 
-    `residual`, measured minus model, and `friction`, to which noise and gains are proportional, have the
-    shape (n,) and are in N. `jacobian`, shape (n, p), is the tangent of the model. `start` has starting
-    values, and the components to be estimated.
+    `residual`, measured minus model, has the shape (n,) and is in N; `loads`, shape (n, kinds), are the
+    changes of the force per unit of each kind. `jacobian`, shape (n, p), is the tangent of the model. `start`
+    has starting values, and the components to be estimated.
     """
     friction = loads[:, GAIN]
     s0, g, design_effect = row_noise(rows, residual, friction)
@@ -364,7 +364,7 @@ def _design_effect(inside: np.ndarray, code: np.ndarray, start: np.ndarray, coun
     scale = np.sqrt(np.maximum(np.add.reduceat(inside**2, start) / count, 1e-300))[code]
     unit = inside / scale
     total, effect = max(float((unit**2).mean()), 1e-300), 1.0
-    for lag in range(1, max(2, int(count.min()) // 3)):
+    for lag in range(1, max(2, int(np.median(count)) // 3)):
         same = code[lag:] == code[:-lag]
         rho = float((unit[lag:] * unit[:-lag])[same].mean()) / total
         if rho < 0.05:

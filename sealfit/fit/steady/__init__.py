@@ -180,7 +180,7 @@ def _rows(
                 reach = stdtrit(variance.df, 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
                 low, high = _widened(condition.values[j], low, high, reach)
             # At its limit: not known with error zero.
-            stuck = name in ("mu_s", "mu_c") and condition.values[j] == 0.0
+            stuck = condition.values[j] == 0.0
             row |= {"value": condition.values[j], "se": None if stuck else np.sqrt(covariance[j, j])}
             row |= {"lo95": None if open_below else low, "hi95": high, "u_sys": abs(shift[j])}
         row |= {"quantity": "steady", "parameter": spelled[name], "unit": unit_of[name]}

@@ -1,8 +1,7 @@
 import numpy as np
-import numpy.testing as npt
 import pytest
 
-from sealfit.ingest.segments import Pieces, weighted_median
+from sealfit.ingest.segments import weighted_median
 
 SIZES = (40, 9, 1, 200, 7, 2, 31)
 
@@ -11,15 +10,6 @@ def traces(kind, seed=0):
     rng = np.random.default_rng(seed)
     made = [rng.normal(size=n).cumsum() + 1e-3 * rng.normal(size=n) for n in SIZES]
     return [np.round(values, 1) for values in made] if kind == "steps" else made
-
-
-def test_pieces_lie_one_after_the_other():
-    pieces = Pieces(SIZES)
-    flat = np.concatenate(traces("fine"))
-    for own, values in zip(pieces.slices, traces("fine"), strict=True):
-        npt.assert_array_equal(flat[own], values)
-    npt.assert_array_equal(pieces.of, np.repeat(np.arange(len(SIZES)), SIZES))
-    npt.assert_array_equal(pieces.spread(np.arange(len(SIZES))), pieces.of)
 
 
 @pytest.mark.parametrize("kind", ["fine", "steps"])
