@@ -177,7 +177,7 @@ def for_notebook() -> Lines:
 
 
 @dataclass
-class Part:
+class TimedPart:
     """Seconds of a step, or of a part of it: `rows` counts what it worked on, in `of`."""
 
     step: str
@@ -187,13 +187,13 @@ class Part:
     of: str = ""
 
 
-_parts: ContextVar[list[Part] | None] = ContextVar("parts", default=None)
+_parts: ContextVar[list[TimedPart] | None] = ContextVar("parts", default=None)
 
 
 @contextlib.contextmanager
-def profiled() -> Iterator[list[Part]]:
+def profiled() -> Iterator[list[TimedPart]]:
     """Give the list that everything `timed` in the block is written into, in the order in which it began."""
-    parts: list[Part] = []
+    parts: list[TimedPart] = []
     token = _parts.set(parts)
     try:
         yield parts
@@ -202,7 +202,7 @@ def profiled() -> Iterator[list[Part]]:
 
 
 @contextlib.contextmanager
-def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[Part]:
+def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[TimedPart]:
     """Take the time of the block, where somebody asked for it; rows may be told while it runs.
 
     Examples
@@ -216,7 +216,7 @@ def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[Part]:
     if parts is None:  # nobody asked
         parts = []
     step = next((part.step for part in parts if part.seconds is None), None)
-    part = Part(step or name, name if step else None, rows=rows, of=of)
+    part = TimedPart(step or name, name if step else None, rows=rows, of=of)
     parts.append(part)
     began = time.perf_counter()
     try:

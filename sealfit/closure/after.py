@@ -14,7 +14,14 @@ from sealfit.config import Config
 from sealfit.fit.aging import CURVE_POINTS, LawRows, aging_curves, fit_series, law_fit
 from sealfit.fit.aging.all_series import joint_laws
 from sealfit.fit.aging.law import search_limits
-from sealfit.fit.aging.law_table import Curve, CurveInterval, Estimate, covariance_rows, law_rows, without_law
+from sealfit.fit.aging.law_table import (
+    CurveInterval,
+    Estimate,
+    SeriesCurve,
+    covariance_rows,
+    law_rows,
+    without_law,
+)
 from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.declared import series_of_curve
@@ -171,7 +178,7 @@ def law_df(after: Fitted) -> float:
     return min(degrees_of_freedom(after), float(max(left, 1)))
 
 
-def _laws(after: Fitted, config: Config) -> Iterator[_Law]:
+def _laws(after: Fitted, config: Config) -> Iterator[_LawAfter]:
     """Yield every series and every quantity that the forces determine in some condition of the rubber."""
     conditions, index = after.rows.conditions, after.model.declared.index
     series = series_of_curve(conditions, aging=True)
@@ -181,10 +188,10 @@ def _laws(after: Fitted, config: Config) -> Iterator[_Law]:
         rubber = (conditions["rubber"] == conditions["rubber"].iloc[own[0]]).to_numpy()
         for end in "sc":
             if (index[f"mu_0{end}"][rubber] >= 0).any():
-                yield _Law(after, config, name, own, end)
+                yield _LawAfter(after, config, name, own, end)
 
 
-class _Law:
+class _LawAfter:
     """Eq. 15 of one quantity of one series in the after-model; `place` is None where it has none."""
 
     def __init__(self, after: Fitted, config: Config, series: str, conditions: np.ndarray, end: str) -> None:
@@ -196,7 +203,7 @@ class _Law:
         unaged = bool((days[(table["rubber"] == self.rubber).to_numpy()] == 0).any())
         quantity = f"mu_{end}" if after.rows.has_load else FORCES[f"mu_{end}"]
         unit = parameter_units(config.units, after.rows.has_load)["mu_s"]
-        self.curve_of = Curve(series, quantity, 0, np.unique(days[conditions]), unaged, unit)
+        self.curve_of = SeriesCurve(series, quantity, 0, np.unique(days[conditions]), unaged, unit)
         number = [int(declared.index[name][conditions[0]]) for name in (f"mu_0{end}", f"a_{end}", f"b_{end}")]
         self.place = number if min(number) >= 0 else None
         self.df = law_df(after)

@@ -27,7 +27,7 @@ from sealfit.closure.result import BeforeAfter, closure_document, effect_table
 from sealfit.closure.ripple_selection import numbered, steady_samples
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
-from sealfit.closure.selection import Selection, Start, select_effects
+from sealfit.closure.selection import Selection, StartingFit, select_effects
 from sealfit.closure.subsampling import Subsample, missed_by_subsample, reselect_on_all, subsamples
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -81,7 +81,7 @@ def close_loop(
             say("the declared model on all strokes")
             with timed("declared model", rows=part.every.force.size, of="bins, merged"):
                 declared = fit_declared(part.every)
-            start = Start(declared.model, declared.scatter)
+            start = StartingFit(declared.model, declared.scatter)
         heldout = _HeldOut(rows, part, steady_samples(traces, part.rows, config.strokes.turn), context)
         fine = part.rows if part.coarse is not part.rows else None
         with timed("search", rows=part.coarse.force.size, of="bins, merged"):
@@ -189,7 +189,7 @@ class _HeldOut:
             before, determined = self.refitted(selection.before)
             after, also = self.refitted(selection.after) if selection.added else (before, determined)
             return before, after, determined & also, None
-        start = Start(selection.before.model, selection.before.scatter)
+        start = StartingFit(selection.before.model, selection.before.scatter)
         rounds = max(a.round for a in selection.added)
         search = partial(_searched, self.part, self.samples, self.context, start, rounds)
         parts = run_map(search, [self.rows.subset(out) for out in self.masks], workers=self.workers)
@@ -220,7 +220,7 @@ class _HeldOut:
 
 
 def _searched(
-    part: Subsample, samples: pd.DataFrame, context: Context, start: Start, rounds: int, test: Rows
+    part: Subsample, samples: pd.DataFrame, context: Context, start: StartingFit, rounds: int, test: Rows
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Model]:
     """Return the forces before and after at the test rows, where both are determined, and the model after.
 

@@ -19,8 +19,8 @@ from sealfit.closure.criteria import (
     SHARED_PHASE,
 )
 from sealfit.closure.spectrum import (
+    AxisStrokes,
     Spectrum,
-    Strokes,
     background,
     effective_count,
     smooth_background,
@@ -175,7 +175,7 @@ def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
     any curve of the position that all files share explains must be the wave, and a curve along the travel,
     as of warming, must explain less.
     """
-    strokes = Strokes.of(samples, "displacement_mm")
+    strokes = AxisStrokes.of(samples, "displacement_mm")
     units, unit = np.unique(strokes.unit, return_inverse=True)
     if units.size < LEAST_GROUPS_HELD_OUT:
         return []
@@ -304,7 +304,7 @@ def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
 
     The samples are those of `find_ripple`; the wave runs along their column `axis`.
     """
-    strokes = Strokes.of(samples, axis)
+    strokes = AxisStrokes.of(samples, axis)
     count = strokes.size.size
     square, product = np.zeros((count, lengths.size, 2, 2)), np.zeros((count, lengths.size, 2))
     total, middle = np.zeros((2, count))
@@ -353,7 +353,7 @@ def common_wavelength(samples: pd.DataFrame, wavelength: float, axis: str) -> tu
 
     The error is a jackknife over files.
     """
-    lengths = 1 / (1 / wavelength + AROUND / np.median(Strokes.of(samples, axis).span))
+    lengths = 1 / (1 / wavelength + AROUND / np.median(AxisStrokes.of(samples, axis).span))
     waves = waves_of(samples, lengths, axis)
     files, file = np.unique(waves.unit, return_inverse=True)
     explained = np.einsum("pmi,pmi->pm", waves.amplitudes, waves.product)

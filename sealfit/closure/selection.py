@@ -41,7 +41,7 @@ from sealfit.fit.joint.whitening import Scatter
 from sealfit.tables import CALENDAR
 
 
-class Start(NamedTuple):
+class StartingFit(NamedTuple):
     """The declared model fitted to more rows, and their scatter."""
 
     model: Model
@@ -85,7 +85,7 @@ def select_effects(
     context: Context,
     *,
     fine: Rows | None = None,
-    start: Start | None = None,
+    start: StartingFit | None = None,
     rounds: int | None = None,
 ) -> Selection:
     """Add effects until no channel explains the residual, and return the result.
@@ -94,7 +94,7 @@ def select_effects(
     fixed. The samples are those of `steady_samples`. From a `start` the declared model needs no search. The
     search of a fold ends after `rounds`; what is left is not determined then.
     """
-    loop = _Loop(rows, samples, context, fine, start)
+    loop = _LoopState(rows, samples, context, fine, start)
     last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds
     for number in range(len(loop.added) + 1, last_round + 1):
         if loop.run_round(number):
@@ -102,11 +102,16 @@ def select_effects(
     return loop.selection(whole=rounds is None)
 
 
-class _Loop:
+class _LoopState:
     """State of the loop: the model, the effects added and refused, and the search results on the model."""
 
     def __init__(
-        self, rows: Rows, samples: pd.DataFrame, context: Context, fine: Rows | None, start: Start | None
+        self,
+        rows: Rows,
+        samples: pd.DataFrame,
+        context: Context,
+        fine: Rows | None,
+        start: StartingFit | None,
     ) -> None:
         self.rows, self.context = rows, context
         self.rng = np.random.default_rng(self.context.config.loop.seed)

@@ -18,7 +18,7 @@ from sealfit.closure.criteria import LEAST_SAMPLES_OF_STROKE, LOBE, NEIGHBOURS, 
 
 
 @dataclass(frozen=True)
-class Strokes:
+class AxisStrokes:
     """The m strokes along an axis, with n samples together."""
 
     place: np.ndarray  # (n,) along the axis, in its unit, ordered by stroke
@@ -31,7 +31,7 @@ class Strokes:
     direction: np.ndarray  # (m,)
 
     @classmethod
-    def of(cls, samples: pd.DataFrame, axis: str) -> Strokes:
+    def of(cls, samples: pd.DataFrame, axis: str) -> AxisStrokes:
         """Return the strokes of the samples that are long enough for the search for ripples."""
         place, residual = (samples[name].to_numpy(dtype=float) for name in (axis, "residual_N"))
         stroke = samples["stroke_id"].to_numpy()
@@ -167,7 +167,7 @@ def spectrum_of(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -
     half the median stroke. The samples are those of `sealfit.closure.ripples.find_ripple`, and `known` the
     wavelengths of the components in the model along this axis.
     """
-    grid = _Grid.of(Strokes.of(samples, axis))
+    grid = _Grid.of(AxisStrokes.of(samples, axis))
     if grid is None:
         return None
     sides, unit = np.unique(grid.strokes.direction), grid.strokes.unit
@@ -203,14 +203,14 @@ def spectrum_of(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -
 class _Grid:
     """Strokes and their frequencies, multiples of 1 / `longest`."""
 
-    strokes: Strokes
+    strokes: AxisStrokes
     points: np.ndarray  # (m,) grid points of each stroke per `longest`
     reach: np.ndarray  # (m,) number of frequencies that each stroke reaches
     numbers: np.ndarray  # (f,) multiples that are the frequencies
     longest: float  # length, or time, that all grids divide
 
     @classmethod
-    def of(cls, strokes: Strokes) -> _Grid | None:
+    def of(cls, strokes: AxisStrokes) -> _Grid | None:
         if strokes.span.size < LEAST_STROKES:
             return None
         step = strokes.span / (strokes.size - 1)

@@ -138,7 +138,7 @@ def moving_strokes(time: np.ndarray, displacement: np.ndarray) -> list[Stroke]:
 
 
 @dataclass(frozen=True)
-class Column:
+class TraceColumn:
     """A column of the trace files, and what each of some files holds in it.
 
     `position` counts from 1; `label` is what the files call it, "" if nothing; `role` is what its name says,
@@ -183,12 +183,12 @@ class Column:
 class Roles:
     """The columns by what they hold; None where none was found. `others` are all the rest."""
 
-    time: Column | None
-    displacement: Column | None
-    force: Column | None
-    load: Column | None
-    speed: Column | None
-    others: tuple[Column, ...]
+    time: TraceColumn | None
+    displacement: TraceColumn | None
+    force: TraceColumn | None
+    load: TraceColumn | None
+    speed: TraceColumn | None
+    others: tuple[TraceColumn, ...]
     sign: int = 1
     both_ways: bool = False
     signs_differ: bool = False
@@ -201,7 +201,7 @@ class Roles:
         return column.unit.dimension if column is not None and column.unit is not None else ""
 
 
-def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
+def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[TraceColumn]:
     """Return the columns that hold numbers.
 
     `tables` are the numbers of some files, each of shape (rows, width), nan where there are none.
@@ -219,11 +219,13 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[Column]:
             role = "force"
         by_name = bool(label) and dialect.names.count(label) == 1 and dialect.names_are_cells
         values = tuple(table[:, i] for table in tables)
-        found.append(Column(i + 1, label, role, sure, unit, values, by_name, said if unit is None else ""))
+        found.append(
+            TraceColumn(i + 1, label, role, sure, unit, values, by_name, said if unit is None else "")
+        )
     return _copies_marked(found)
 
 
-def _copies_marked(columns: list[Column]) -> list[Column]:
+def _copies_marked(columns: list[TraceColumn]) -> list[TraceColumn]:
     """Return the columns, the earlier of two with the same signal marked: loggers write the raw one first."""
     marked = []
     for i, column in enumerate(columns):
@@ -232,14 +234,14 @@ def _copies_marked(columns: list[Column]) -> list[Column]:
     return marked
 
 
-def _same_signal(one: Column, other: Column) -> bool:
+def _same_signal(one: TraceColumn, other: TraceColumn) -> bool:
     a, b = one.values[0], other.values[0]
     if rises(a) or rises(b) or np.ptp(a) == 0 or np.ptp(b) == 0:
         return False
     return abs(float(np.corrcoef(a, b)[0, 1])) > COPY
 
 
-def find_roles(columns: Sequence[Column]) -> Roles:
+def find_roles(columns: Sequence[TraceColumn]) -> Roles:
     """Return which column is what."""
     time = _best(columns, "time", _as_time)
     counters = [c for c in columns if c.role != "displacement" and all(map(is_counter, c.values))]
@@ -258,7 +260,7 @@ def find_roles(columns: Sequence[Column]) -> Roles:
     return _with_sign(found, velocities) if force is not None else found
 
 
-def _best(columns: Sequence[Column], role: str, behaves) -> Column | None:
+def _best(columns: Sequence[TraceColumn], role: str, behaves) -> TraceColumn | None:
     """Return the column with the most points: name and unit up to 5, behaviour up to 3; a copy comes last."""
     points = {}
     for column in columns:
@@ -273,32 +275,34 @@ def _best(columns: Sequence[Column], role: str, behaves) -> Column | None:
     return max((c for c in columns if c.position in points), key=lambda c: points[c.position], default=None)
 
 
-def _as_time(column: Column) -> float:
+def _as_time(column: TraceColumn) -> float:
     if not all(rises(values) for values in column.values):
         return 0.0
     even = float(np.median([evenness(values) for values in column.values]))
     return 0.3 * even if all(is_counter(values) for values in column.values) else max(even, 0.3)
 
 
-def _as_displacement(column: Column) -> float:
+def _as_displacement(column: TraceColumn) -> float:
     return float(np.median([spread(v) * smoothness(v) for v in column.values]))
 
 
-def _as_force(column: Column, velocities: Sequence[np.ndarray]) -> float:
+def _as_force(column: TraceColumn, velocities: Sequence[np.ndarray]) -> float:
     if all(np.ptp(values) == 0 for values in column.values):
         return 0.0
     found = [follows(v, speed).strength for v, speed in zip(column.values, velocities, strict=True)]
     return max(float(np.median(found)), 0.05)  # a named force may follow badly; it is still the force
 
 
-def _velocities(time: Column | None, displacement: Column | None, speed: Column | None) -> list[np.ndarray]:
+def _velocities(
+    time: TraceColumn | None, displacement: TraceColumn | None, speed: TraceColumn | None
+) -> list[np.ndarray]:
     if displacement is not None:  # without a time its direction is known all the same
         times = time.values if time is not None else [np.arange(len(x)) for x in displacement.values]
         return [velocity(t, x) for t, x in zip(times, displacement.values, strict=True)]
     return [smoothed(values) for values in speed.values] if speed is not None else []
 
 
-def _load(rest: Sequence[Column]) -> Column | None:
+def _load(rest: Sequence[TraceColumn]) -> TraceColumn | None:
     """Return the column of the normal load: one that is called so, or a second force that hardly varies."""
     named = [c for c in rest if c.role == "load" and c.may_be("load")]
     if named:

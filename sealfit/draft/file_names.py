@@ -46,7 +46,7 @@ class Token:
 
 
 @dataclass(frozen=True)
-class Part:
+class NamePart:
     """A piece of the names that stands for something.
 
     `ours` is the column that it gives, "" for a piece that is matched only. `texts` are its different values;
@@ -82,7 +82,7 @@ class Names:
 
     files: tuple[str, ...]
     pieces: tuple[Token, ...] = ()
-    parts: tuple[Part, ...] = ()
+    parts: tuple[NamePart, ...] = ()
     middle: tuple[int, int] | None = None
     words: tuple[str, ...] = ()
     templates: Mapping[str, str] = field(default_factory=dict)
@@ -103,12 +103,12 @@ class Names:
         pattern = self.settings.name_pattern
         return tuple(file for file in self.files if pattern and not re.fullmatch(pattern, file))
 
-    def changed(self, part: Part, **changes: object) -> Names:
+    def changed(self, part: NamePart, **changes: object) -> Names:
         """Return the names with one of the parts changed."""
         parts = tuple(replace(own, **changes) if own is part else own for own in self.parts)
         return replace(self, parts=parts)
 
-    def without(self, part: Part) -> Names:
+    def without(self, part: NamePart) -> Names:
         """Return the names without what one of the parts says: it is matched only."""
         return self.changed(part, ours="", unit="", doubt="")
 
@@ -244,14 +244,14 @@ def read_names(files: Sequence[str]) -> Names:
 # ---------------------------------------------------------------- parts
 
 
-def _parts(rows: Sequence[Sequence[Token]]) -> list[Part]:
+def _parts(rows: Sequence[Sequence[Token]]) -> list[NamePart]:
     """Return the parts of names that are cut alike."""
-    found: list[Part] = []
+    found: list[NamePart] = []
     for at, token in enumerate(rows[0]):
         texts = tuple(dict.fromkeys(row[at].text for row in rows))
         if token.kind == "date":
             doubt = "" if token.text[:4].isdecimal() else "the day is taken to stand before the month"
-            found.append(Part(at, "started_at", "", texts, "a date", doubt=doubt))
+            found.append(NamePart(at, "started_at", "", texts, "a date", doubt=doubt))
         elif token.kind == "word" and (part := _word(at, texts)):
             found.append(part)
         elif token.kind == "number":
@@ -259,7 +259,7 @@ def _parts(rows: Sequence[Sequence[Token]]) -> list[Part]:
     return _without_doubles(_with_bare_numbers(found, rows), rows)
 
 
-def _word(at: int, texts: tuple[str, ...]) -> Part | None:
+def _word(at: int, texts: tuple[str, ...]) -> NamePart | None:
     """Return a word that varies; None for one that is the same in all names."""
     if len(texts) == 1:
         return None
@@ -267,26 +267,26 @@ def _word(at: int, texts: tuple[str, ...]) -> Part | None:
     if len(texts) <= FEW:
         pattern = "|".join(sorted(map(re.escape, texts), key=len, reverse=True))
     if low <= DIRECTIONS.keys():
-        return Part(at, "direction", pattern, texts, "a word for the direction")
+        return NamePart(at, "direction", pattern, texts, "a word for the direction")
     if low <= RUBBERS:
-        return Part(at, "rubber", pattern, texts, "the short name of a rubber")
+        return NamePart(at, "rubber", pattern, texts, "the short name of a rubber")
     doubt = "what this word stands for is not known; it is kept as a label"
-    return Part(at, f"label_{at}", pattern, texts, "a word that varies", doubt=doubt)
+    return NamePart(at, f"label_{at}", pattern, texts, "a word that varies", doubt=doubt)
 
 
-def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) -> Part:
+def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) -> NamePart:
     """Return a number with what the letters around it say; without `ours` where they say nothing."""
     pattern = _number_pattern(texts)
     after, before = _around(rows, at)
     if after and (said := after_number(re.sub(r"[-_ /]", "", after))):
         ours, unit = said
         why = f"'{after}' stands after the number"
-        return _as_height(Part(at, ours, pattern, texts, why, unit=unit), before)
+        return _as_height(NamePart(at, ours, pattern, texts, why, unit=unit), before)
     ours = before_number(before) if before else ""
     if ours in NO_COUNTS and _counts_up(texts):
         ours = ""
     why = f"'{before}' stands before the number" if before else "a bare number"
-    return _as_height(Part(at, ours, pattern, texts, why), before)
+    return _as_height(NamePart(at, ours, pattern, texts, why), before)
 
 
 def _counts_up(texts: Sequence[str]) -> bool:
@@ -324,7 +324,7 @@ def _number_pattern(texts: Sequence[str]) -> str:
     return f"{sign}\\d+(?:{mark}\\d+)?" if marks else f"{sign}\\d+"
 
 
-def _as_height(part: Part, before: str) -> Part:
+def _as_height(part: NamePart, before: str) -> NamePart:
     """Return the part; a number that says how far the rubber was compressed gives the height left."""
     if part.ours != "compression_ratio_pct" or before.lower() in ("h", "height"):
         return part
@@ -335,7 +335,7 @@ def _as_height(part: Part, before: str) -> Part:
     return replace(part, expression="100 - {}", doubt=f"{taken}; {otherwise}")
 
 
-def _with_bare_numbers(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> list[Part]:
+def _with_bare_numbers(parts: Sequence[NamePart], rows: Sequence[Sequence[Token]]) -> list[NamePart]:
     """Return the parts with what numbers without letters are: repeats, running numbers, or not known."""
     known = [part for part in parts if part.ours and part.ours not in ("repeat", "started_at")]
     has_repeat = any(part.ours == "repeat" for part in parts)
@@ -358,12 +358,12 @@ def _with_bare_numbers(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -
     return made
 
 
-def _counts(part: Part) -> bool:
+def _counts(part: NamePart) -> bool:
     numbers = [as_float(text) for text in part.texts]
     return max(numbers) - min(numbers) < 2 * len(numbers)
 
 
-def _repeats(part: Part, known: Sequence[Part], rows: Sequence[Sequence[Token]]) -> bool:
+def _repeats(part: NamePart, known: Sequence[NamePart], rows: Sequence[Sequence[Token]]) -> bool:
     """Whether a number counts from 0 or 1 and differs between files of the same settings."""
     all_differ = len(part.texts) == len(rows) > COUNTED
     if len(part.texts) > FEW or all_differ or not _counts_up(part.texts):
@@ -373,9 +373,9 @@ def _repeats(part: Part, known: Sequence[Part], rows: Sequence[Sequence[Token]])
     return max(seen.values()) == 1 and len(settings) < len(rows)
 
 
-def _without_doubles(parts: Sequence[Part], rows: Sequence[Sequence[Token]]) -> list[Part]:
+def _without_doubles(parts: Sequence[NamePart], rows: Sequence[Sequence[Token]]) -> list[NamePart]:
     """Return the parts with one for each of our columns: the last, as file names say more than folders."""
-    made: list[Part] = []
+    made: list[NamePart] = []
     for i, part in enumerate(parts):
         later = next((other for other in parts[i + 1 :] if part.ours and other.ours == part.ours), None)
         if later is None:
@@ -401,7 +401,7 @@ def _words_instead(pieces: Sequence[Token], main: Sequence[Token]) -> Iterator[t
 
 
 def _unaged(
-    main: Sequence[Token], parts: Sequence[Part], others: Sequence[Sequence[Token]]
+    main: Sequence[Token], parts: Sequence[NamePart], others: Sequence[Sequence[Token]]
 ) -> tuple[tuple[int, int] | None, list[str]]:
     """Return the range of pieces that a word such as `unaged` replaces, and these words."""
     days = [part.at for part in parts if part.ours == "aging_days"]
@@ -429,10 +429,10 @@ def _optional_word(
     return None
 
 
-def _with_sign(parts: Sequence[Part], sign: tuple[int, str]) -> list[Part]:
+def _with_sign(parts: Sequence[NamePart], sign: tuple[int, str]) -> list[NamePart]:
     """Return the parts with the optional word as the direction."""
     at, text = sign
     why = f"'{text}' stands before the number in some names"
     doubt = f"'{text}' is taken for the other direction"
     pattern = f"(?:{re.escape(text)})?"
-    return [*parts, Part(at, "direction", pattern, ("", text), why, doubt=doubt)]
+    return [*parts, NamePart(at, "direction", pattern, ("", text), why, doubt=doubt)]

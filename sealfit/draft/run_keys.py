@@ -14,7 +14,7 @@ from sealfit.config import AGING_CONDITION
 from sealfit.draft.columns import Roles
 from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import CLOCK, Dialect
-from sealfit.draft.file_names import FEW, HEIGHT_FROM, Names, Part
+from sealfit.draft.file_names import FEW, HEIGHT_FROM, NamePart, Names
 from sealfit.draft.files_found import Found, RunsTable
 from sealfit.errors import ConfigError
 from sealfit.ingest.file_names import channels_of, name_parts
@@ -307,11 +307,11 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         notes.doubt("files.columns.specimen_id", reason, fix)
 
 
-def _example(part: Part) -> str:
+def _example(part: NamePart) -> str:
     return next((text for text in part.texts if text), "")
 
 
-def _values(part: Part) -> str:
+def _values(part: NamePart) -> str:
     texts = sorted((text for text in part.texts if text), key=natural)
     return ", ".join(texts[:5]) + (", ..." if len(texts) > 5 else "")
 

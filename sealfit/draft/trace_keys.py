@@ -10,8 +10,8 @@ import numpy as np
 
 from sealfit.draft.columns import (
     BY_BEHAVIOUR,
-    Column,
     Roles,
+    TraceColumn,
     mean_speed,
     moving_strokes,
     rises,
@@ -188,7 +188,7 @@ def column_keys(
     _other_columns(found, roles, clock or "", notes)
 
 
-def _evidence(column: Column, role: str, roles: Roles, read: int) -> str:
+def _evidence(column: TraceColumn, role: str, roles: Roles, read: int) -> str:
     by = []
     if column.role == role:
         by.append("its name")
@@ -201,7 +201,7 @@ def _evidence(column: Column, role: str, roles: Roles, read: int) -> str:
     return f"{text}; {behaves[role]}" if role in behaves else text
 
 
-def _column_doubts(column: Column, role: str, key: str, roles: Roles, notes: Notes) -> None:
+def _column_doubts(column: TraceColumn, role: str, key: str, roles: Roles, notes: Notes) -> None:
     named, unit_fits = column.role == role, column.in_unit_of(role)
     if not named and not unit_fits:
         in_unit = f", and {SLOTS[role].rpartition('_')[2]} is assumed" if key.endswith(SLOTS[role]) else ""
@@ -222,7 +222,7 @@ def _column_doubts(column: Column, role: str, key: str, roles: Roles, notes: Not
         notes.doubt(key, reason, "It looks like a magnitude: export the force with its sign.")
 
 
-def _integrated(speed: Column, notes: Notes) -> str:
+def _integrated(speed: TraceColumn, notes: Notes) -> str:
     """Add what makes a displacement of a speed; return the helper column."""
     rotation = speed.unit is not None and speed.unit.dimension == "rotation"
     helper = "speed_rpm" if rotation else "speed_column_mm_s"
@@ -304,7 +304,7 @@ def _other_columns(found: Found, roles: Roles, clock: str, notes: Notes) -> None
         notes.guess("trace.other_columns", "ignore", evidence)
 
 
-def _channel(column: Column, taken: set[str]) -> str:
+def _channel(column: TraceColumn, taken: set[str]) -> str:
     """Return a name for a column as a channel, none of those taken; "" for a ratio, a counter or a copy."""
     role = column.role or (column.unit.dimension if column.unit is not None else "")
     if column.copy_of or role not in CHANNELS or all(rises(values) for values in column.values):
@@ -333,7 +333,7 @@ def settled_units(roles: Roles, notes: Notes) -> dict[str, Unit | None]:
     return units
 
 
-def _assumed(column: Column, role: str, slot: str, notes: Notes) -> Unit | None:
+def _assumed(column: TraceColumn, role: str, slot: str, notes: Notes) -> Unit | None:
     if role == "time":
         step, long = np.median(np.diff(column.values[0])), np.ptp(column.values[0])
         if step >= 1.0 and long > LONG_S:

@@ -17,7 +17,7 @@ from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.columns import force_inputs
 from sealfit.ingest.file_names import Listing
-from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, Part, plan_parts, shaped
+from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, PartitionResult, plan_parts, shaped
 from sealfit.ingest.quality import computed_force, improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import (
     constant_strokes,
@@ -49,7 +49,7 @@ def inputs_table(
     campaign: Path,
     marks: Fingerprints,
     plan: Sequence[np.ndarray],
-    parts: Sequence[Part],
+    parts: Sequence[PartitionResult],
     used: np.ndarray,
     faults: Sequence[Fault],
 ) -> tuple[pd.DataFrame, Fingerprints]:
@@ -209,7 +209,7 @@ def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndar
 
 def _known_parts(
     listings: Sequence[Listing], marks: Fingerprints, place: Place, config: Config
-) -> dict[int, Part]:
+) -> dict[int, PartitionResult]:
     """Return the parts that are stored, by their numbers in the plan."""
     made, seen = {}, seen_by_parts(config)
     for i, listing in enumerate(listings if place.known else ()):
@@ -222,10 +222,10 @@ def _known_parts(
 
 def _read(
     asked: Mapping[int, Asked],
-    make: Callable[[Asked], Part],
+    make: Callable[[Asked], PartitionResult],
     workers: int,
     on_file: Callable[[int, int], None] | None,
-) -> dict[int, Part]:
+) -> dict[int, PartitionResult]:
     """Return the parts; the largest are read first, so that at the end no process has much left alone."""
     order = sorted(asked, key=lambda i: -len(asked[i].refs))
     total, done, made = sum(len(part.refs) for part in asked.values()), 0, {}
@@ -239,7 +239,7 @@ def _read(
 
 
 def _asked_again(
-    listings: Sequence[Listing], parts: Sequence[Part], strokes: pd.DataFrame
+    listings: Sequence[Listing], parts: Sequence[PartitionResult], strokes: pd.DataFrame
 ) -> dict[int, Asked]:
     """Return the parts to make again: the whole campaign omits other strokes or has other columns."""
     # A stroke whose own file shows something wrong is left out by its part anyway.

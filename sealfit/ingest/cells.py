@@ -14,7 +14,7 @@ import pyarrow.csv as pacsv
 
 from sealfit.config import TraceFormat
 from sealfit.errors import Fault
-from sealfit.ingest.files import Layout, as_number, bad_file, split_line, without_strays
+from sealfit.ingest.files import FileLayout, as_number, bad_file, split_line, without_strays
 
 # ---------------------------------------------------------------- rows
 
@@ -153,7 +153,7 @@ def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str
     return faults
 
 
-def body_of(text: bytes, layout: Layout, settings: TraceFormat) -> bytes:
+def body_of(text: bytes, layout: FileLayout, settings: TraceFormat) -> bytes:
     """Return the data lines of a file, without line ends after the last one; BadFile if it has none."""
     body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
     if not body.strip(b"\n \t,;"):
@@ -169,7 +169,7 @@ def width_of(body: bytes, delimiter: str) -> int:
 
 
 def read_cells(
-    body: bytes, layout: Layout, settings: TraceFormat, ours: Mapping[int, str], must: Collection[str]
+    body: bytes, layout: FileLayout, settings: TraceFormat, ours: Mapping[int, str], must: Collection[str]
 ) -> Trace:
     """Return the data of a text file, whose data lines are `body` (`body_of`); the others as `checked_cells`.
 
@@ -248,7 +248,7 @@ def _iso(times: np.ndarray) -> np.ndarray:
 
 
 def _fast(
-    body: bytes, rows: int, layout: Layout, settings: TraceFormat, numeric: Sequence[int]
+    body: bytes, rows: int, layout: FileLayout, settings: TraceFormat, numeric: Sequence[int]
 ) -> dict[int, np.ndarray] | None:
     """Return the columns as Arrow reads them; None where a cell, a line or the delimiter is beyond it."""
     table = _arrow(body, settings, numeric)

@@ -13,7 +13,7 @@ from sealfit.config import Config, TraceFormat
 from sealfit.errors import KEPT, NOTED, BadFile, Fault, SealfitError, nearest, shortened
 from sealfit.ingest.cells import OVERLOAD, Trace, cell_faults, listed, numbers_of
 from sealfit.ingest.expression import parse
-from sealfit.ingest.files import Layout, bad_file, split_line
+from sealfit.ingest.files import FileLayout, bad_file, split_line
 from sealfit.tables import BINS, RUNS
 from sealfit.units import Units, other_unit
 
@@ -194,7 +194,7 @@ def force_inputs(config: Config) -> set[str]:
     return {beside(name, RESERVED) for name in read - {*SLOTS, *condition_columns(config)}}
 
 
-def locate(layout: Layout, width: int, settings: TraceFormat) -> dict[int, str]:
+def locate(layout: FileLayout, width: int, settings: TraceFormat) -> dict[int, str]:
     """Return our name for each position (from 0) of a file with `width` columns.
 
     Columns that the config does not list keep the file's name (`column_4` where it has none), or a name
@@ -259,7 +259,7 @@ INSTEAD = {
 }
 
 
-def required(table: Mapping[str, object], layout: Layout, names: Sequence[str] = SLOTS[:3]) -> None:
+def required(table: Mapping[str, object], layout: FileLayout, names: Sequence[str] = SLOTS[:3]) -> None:
     """Raise `BadFile` if, after everything is computed, a column that a trace needs is not there."""
     found = []
     for name in names:
@@ -272,13 +272,13 @@ def required(table: Mapping[str, object], layout: Layout, names: Sequence[str] =
         raise BadFile(*found)
 
 
-def missing_column(column: str | int, layout: Layout, fix: str, reason: str = NO_COLUMN) -> Fault:
+def missing_column(column: str | int, layout: FileLayout, fix: str, reason: str = NO_COLUMN) -> Fault:
     """Return the fault of a file that lacks a column, and is left out."""
     place = {"line": layout.names_line, "column": str(column)}
     return bad_file("missing_column", reason, fix, **place).fault
 
 
-def header_units(layout: Layout, settings: TraceFormat, units: Units, clock: bool) -> list[Fault]:
+def header_units(layout: FileLayout, settings: TraceFormat, units: Units, clock: bool) -> list[Fault]:
     """Return a warning for each slot with another unit in the header than that its numbers are taken in.
 
     With `clock` the times are times of day, whatever the header says.
@@ -304,7 +304,7 @@ def header_units(layout: Layout, settings: TraceFormat, units: Units, clock: boo
     return faults
 
 
-def _missing(ours: str, layout: Layout, width: int, settings: TraceFormat) -> Fault:
+def _missing(ours: str, layout: FileLayout, width: int, settings: TraceFormat) -> Fault:
     theirs = settings.their_columns[ours]
     if isinstance(theirs, int):
         reason = f"there is no column {theirs}: the lines have {width}."

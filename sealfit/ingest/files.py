@@ -163,7 +163,7 @@ _CONTROL = bytes(set(range(32)) - {9, 10, 12, 13}) + b"\x7f"
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class FileLayout:
     """Where a trace file's data begin and what its columns are called.
 
     `header` are the lines before the data, without line ends; `names` is empty where columns go by position;
@@ -227,7 +227,7 @@ def refuse_marked_up(text: bytes) -> None:
             raise bad_file("no_table", f"is {what}, not a table.", "Export the trace as CSV.")
 
 
-def find_layout(text: bytes, settings: TraceFormat) -> Layout:
+def find_layout(text: bytes, settings: TraceFormat) -> FileLayout:
     """Return where the data of a trace file begin; ConfigError as `found_by`.
 
     BadFile if no line matches `header_ends_at`, or the header is shorter than the config says.
@@ -238,7 +238,7 @@ def find_layout(text: bytes, settings: TraceFormat) -> Layout:
     start = len(text) - len(parts[count]) if len(parts) > count else len(text)
     header = tuple(lines[:count])
     if settings.names == "none":
-        return Layout(header, (), None, start, count + 1)
+        return FileLayout(header, (), None, start, count + 1)
     back = settings.names_line or (2 if settings.units_row else 1)
     if back > count:
         reason = f"has a header of {count} lines, and its names should stand {back} lines before the data."
@@ -246,7 +246,7 @@ def find_layout(text: bytes, settings: TraceFormat) -> Layout:
         raise bad_file("header_not_found", reason, fix)
     cells = split_line(without_strays(header[-back], settings), settings.delimiter)
     names = tuple(name.strip() for name in cells)
-    return Layout(header, names, count - back + 1, start, count + 1)
+    return FileLayout(header, names, count - back + 1, start, count + 1)
 
 
 def split_line(line: str, delimiter: str) -> list[str]:

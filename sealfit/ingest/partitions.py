@@ -130,7 +130,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Part:
+class PartitionResult:
     """What one part gives.
 
     Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found`
@@ -154,7 +154,7 @@ class Part:
     stored: Mapping[str, int] = field(default_factory=dict)
 
 
-def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
+def read_part(asked: Asked, campaign: Path, config: Config) -> PartitionResult:
     """Return the strokes and the tables of one part of a campaign, both in memory."""
     files = [read_strokes(ref, campaign, config) for ref in asked.refs]
     strokes = stroke_columns(files, config)
@@ -175,7 +175,7 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> Part:
     if asked.columns is not None:
         for name, table in tables.items():
             tables[name] = parquet.with_columns(table, asked.columns[name], config.units)
-    return Part(
+    return PartitionResult(
         marks={made.file: made.mark for made in files},
         rows=[made.rows for made in files],
         found=[len(made.strokes) for made in files],

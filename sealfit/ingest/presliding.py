@@ -72,7 +72,7 @@ LEAST_ROWS = 8
 FAR = 200.0
 
 
-class Start(NamedTuple):
+class MotionStart(NamedTuple):
     """How a stretch of motion starts, and the row at which the speed has reached its plateau.
 
     The distance from standstill in mm never falls. The force in N is positive against the motion. Both have
@@ -107,7 +107,7 @@ class Rise(NamedTuple):
         return self.left_N * np.exp(-distance_mm / self.length_mm)
 
 
-def rise_of(start: Start) -> Rise:
+def rise_of(start: MotionStart) -> Rise:
     """Return where the pre-sliding rise of a start is over (0 mm without one), and what is left of it there.
 
     A bristle at constant speed follows dz/dx = 1 - z / z_ss (LuGre, Eq. 2 divided by v), so the force comes
@@ -147,7 +147,7 @@ def rise_of(start: Start) -> Rise:
     return without if SETTLED * without.length_mm >= length / 3.0 else rise
 
 
-def _rise_or_fall(start: Start) -> Rise:
+def _rise_or_fall(start: MotionStart) -> Rise:
     """Return the rise of a start, or the fall from the peak that damping makes of it."""
     if found := _turned(start):
         turned, peak_mm = found
@@ -160,7 +160,7 @@ def _rise_or_fall(start: Start) -> Rise:
     return _rise(start)
 
 
-def _turned(start: Start) -> tuple[Start, float] | None:
+def _turned(start: MotionStart) -> tuple[MotionStart, float] | None:
     """Return the fall from an early peak, turned upside down so that it comes up, and the peak's distance.
 
     None if the fall cannot be over soon enough (`_by_damping`), if the force is highest at the end of the
@@ -174,11 +174,13 @@ def _turned(start: Start) -> tuple[Start, float] | None:
     if peak >= half - 1 or distance[peak] > start.plateau_mm + SOON * distance[-1]:
         return None
     level = np.median(force[max(early, peak) : half])
-    fall = Start(distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0))
+    fall = MotionStart(
+        distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0)
+    )
     return fall, float(distance[peak])
 
 
-def _by_damping(start: Start, turned: Start, fall: Rise) -> bool:
+def _by_damping(start: MotionStart, turned: MotionStart, fall: Rise) -> bool:
     """Return whether a peak may be the bristles' damping.
 
     Such a peak is reached while the speed rises. It falls within a share of the stroke, as a peak of
@@ -192,7 +194,7 @@ def _by_damping(start: Start, turned: Start, fall: Rise) -> bool:
     return soon and peak_mm <= start.plateau_mm + fall.length_mm
 
 
-def _rise(start: Start) -> Rise:
+def _rise(start: MotionStart) -> Rise:
     """Return the rise of a start whose force comes up, and none of any other.
 
     Where a fast stroke starts, damping brings up a part of the force at once, and the bristles the rest. If
@@ -214,7 +216,7 @@ def _rise(start: Start) -> Rise:
     return Rise(ramp + later.end_mm, _before(later.left_N, ramp / later.length_mm), later.length_mm)
 
 
-def _explained(start: Start, length_mm: float) -> float:
+def _explained(start: MotionStart, length_mm: float) -> float:
     """Return the share of the variance of the force, its noise averaged out, that an exponential explains."""
     n = _rows_within(start, REACH * length_mm)
     edges = np.linspace(0, n, min(MEANS, n) + 1).astype(int)[:-1]
@@ -225,14 +227,14 @@ def _explained(start: Start, length_mm: float) -> float:
     return 1.0 - beside.fitted(_shape(distance, length_mm), force)[1] / max(force @ force, 1e-300)
 
 
-def _on_plateau(start: Start, begin_mm: float | None = None) -> Start:
+def _on_plateau(start: MotionStart, begin_mm: float | None = None) -> MotionStart:
     """Return a start from where the speed has reached its plateau, or from a later distance."""
     begin_mm = start.plateau_mm if begin_mm is None else begin_mm
     rows = slice(max(start.ramp_end, int(start.distance_mm.searchsorted(begin_mm))), None)
-    return Start(start.distance_mm[rows] - begin_mm, start.force_N[rows], 0)
+    return MotionStart(start.distance_mm[rows] - begin_mm, start.force_N[rows], 0)
 
 
-def _rise_from_rest(start: Start) -> Rise:
+def _rise_from_rest(start: MotionStart) -> Rise:
     level = _level_N(start)
     scale = _scale_mm(start, level)
     if not scale > 0.0:
@@ -250,7 +252,7 @@ def _rise_from_rest(start: Start) -> Rise:
     return Rise(min(end, max(LATEST * float(start.distance_mm[-1]), ramp)) if left_N else end, left_N, length)
 
 
-def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
+def _left_over(start: MotionStart, length_mm: float) -> tuple[float, float]:
     """Return C and x_0 of F = A + B x + C exp(-x / x_0) of a start, from its rows of constant speed.
 
     C is 0 where the force does not follow that law: where a rise that is over at some distance fits better.
@@ -270,7 +272,7 @@ def _left_over(start: Start, length_mm: float) -> tuple[float, float]:
     return 0.0, found
 
 
-def _law_on(plateau: Start, length_mm: float) -> tuple[float, float, float]:
+def _law_on(plateau: MotionStart, length_mm: float) -> tuple[float, float, float]:
     """Return C, x_0, and twice the log likelihood of the law less that of its best rival."""
     reach = REACH * length_mm
     sloped = min(plateau.distance_mm[-1], reach) >= SLOPED * length_mm
@@ -317,7 +319,7 @@ def _shape(x_mm: np.ndarray, length_mm: np.ndarray | float, power: int | None = 
     return np.exp(-share) if power is None else np.maximum(1.0 - share, 0.0) ** power
 
 
-def _level_N(start: Start) -> float | None:
+def _level_N(start: MotionStart) -> float | None:
     """Return the level of the plateau that the force comes up to; None where it does not come up."""
     distance, force = start.distance_mm, start.force_N
     low, high, *late = (int(distance.searchsorted(share * distance[-1])) for share in (*EARLY, *LATE))
@@ -329,7 +331,7 @@ def _level_N(start: Start) -> float | None:
     return level if level - begin > 0.02 * abs(level) and below else None
 
 
-def _settled_mm(start: Start, level_N: float, fitted_mm: float) -> float:
+def _settled_mm(start: MotionStart, level_N: float, fitted_mm: float) -> float:
     """Return the distance at which a rise of that length is over."""
     distance = start.distance_mm
     length = float(distance[-1])
@@ -349,7 +351,7 @@ def _below(plateau_N: np.ndarray, begin_N: float) -> bool:
     return begin_N < np.quantile(plateau_N, 0.01) - 4.0 * (np.median(steps) * to_noise)
 
 
-def _arrival_mm(start: Start) -> float:
+def _arrival_mm(start: MotionStart) -> float:
     """Return the distance at which the force first enters the band in which it stays late in the stroke."""
     distance, force = start.distance_mm, start.force_N
     low, high = np.searchsorted(distance, [share * distance[-1] for share in LATE])
@@ -358,7 +360,7 @@ def _arrival_mm(start: Start) -> float:
     return float(distance[int(np.argmax(force >= np.quantile(force[low:high], 0.02)))])
 
 
-def _scale_mm(start: Start, level_N: float | None) -> float:
+def _scale_mm(start: MotionStart, level_N: float | None) -> float:
     """Return the distance over which the force first comes up by 63 %, between samples; 0 if it does not.
 
     The distance is counted from where the force begins to come up.
@@ -377,13 +379,13 @@ def _scale_mm(start: Start, level_N: float | None) -> float:
     return float(distance[after - 1] + share * (distance[after] - distance[after - 1]))
 
 
-def _rows_within(start: Start, reach_mm: float) -> int:
+def _rows_within(start: MotionStart, reach_mm: float) -> int:
     """Return how many rows lie within a distance; at least 16 where there are so many."""
     return min(max(int(start.distance_mm.searchsorted(reach_mm)), 16), len(start.distance_mm))
 
 
 def _rise_length_mm(
-    start: Start, reach_mm: float, lengths_mm: np.ndarray, sloped: bool, power: int | None = None
+    start: MotionStart, reach_mm: float, lengths_mm: np.ndarray, sloped: bool, power: int | None = None
 ) -> float:
     """Return x_0 of F = A + B x - C exp(-x / x_0) by least squares on a grid of lengths, refined.
 

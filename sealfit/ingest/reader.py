@@ -26,7 +26,7 @@ from sealfit.ingest.expression import Expression, evaluate, parse
 from sealfit.ingest.file_names import TraceRef, name_parts
 from sealfit.ingest.files import (
     HEAD_BYTES,
-    Layout,
+    FileLayout,
     as_utf8,
     bad_file,
     find_layout,
@@ -71,12 +71,12 @@ def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
 
 def _content(
     raw: bytes, file: str, settings: TraceFormat, *, head: bool = False
-) -> tuple[Layout, bytes | Arrays, TraceFormat]:
+) -> tuple[FileLayout, bytes | Arrays, TraceFormat]:
     """Return a file's layout, its text as UTF-8 or its arrays, and the settings with its delimiter."""
     kind = kind_of(file, settings)
     if kind in OF_ARRAYS:
         found = read_arrays(raw, kind, settings, head=head)
-        return Layout(found.header, found.names, None, 0, 1), found, settings
+        return FileLayout(found.header, found.names, None, 0, 1), found, settings
     if kind == "csv":
         text = as_utf8(raw, settings.encoding, head=head)
         refuse_marked_up(text)
@@ -92,7 +92,7 @@ def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | 
     return header_fields(_content(raw, file, config.trace, head=True)[0].header, config)
 
 
-def _read_arrays(found: Arrays, layout: Layout, settings: TraceFormat) -> Trace:
+def _read_arrays(found: Arrays, layout: FileLayout, settings: TraceFormat) -> Trace:
     ours = locate(layout, len(found.columns), settings)
     line = np.arange(1, len(found.columns[0]) + 1)  # of a file without lines: the number of the sample
     rows = checked_cells(
@@ -101,7 +101,7 @@ def _read_arrays(found: Arrays, layout: Layout, settings: TraceFormat) -> Trace:
     return replace(rows, faults=(*found.faults, *rows.faults))
 
 
-def _read_text(text: bytes, layout: Layout, settings: TraceFormat, may_be_cut: bool) -> Trace:
+def _read_text(text: bytes, layout: FileLayout, settings: TraceFormat, may_be_cut: bool) -> Trace:
     cut = ()
     text = without_footer(text, settings.footer, layout.start)
     if may_be_cut:
@@ -117,7 +117,7 @@ def _read_text(text: bytes, layout: Layout, settings: TraceFormat, may_be_cut: b
     return replace(rows, faults=(*cut, *rows.faults))
 
 
-def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat) -> None:
+def _refuse_narrow(layout: FileLayout, width: int, settings: TraceFormat) -> None:
     """Raise `BadFile` if columns go by name and the first line has fewer cells than there are names."""
     named = len(layout.names)
     while named and layout.names[named - 1] in UNFILLED:
@@ -129,7 +129,7 @@ def _refuse_narrow(layout: Layout, width: int, settings: TraceFormat) -> None:
         raise bad_file("too_few_cells", reason, fix, line=layout.first_line)
 
 
-def _names_elsewhere(error: BadFile, layout: Layout, body: bytes, settings: TraceFormat) -> BadFile:
+def _names_elsewhere(error: BadFile, layout: FileLayout, body: bytes, settings: TraceFormat) -> BadFile:
     """Return the error, or another one if the names of the columns stand in another line, which it names."""
     wanted = {name for name in settings.their_columns.values() if isinstance(name, str)}
     if layout.names_line is None or wanted <= set(layout.names):
@@ -145,7 +145,7 @@ def _names_elsewhere(error: BadFile, layout: Layout, body: bytes, settings: Trac
     return error
 
 
-def _trace(rows: Trace, layout: Layout, ref: TraceRef, config: Config) -> Trace:
+def _trace(rows: Trace, layout: FileLayout, ref: TraceRef, config: Config) -> Trace:
     """Return the trace that the rows of a file make; raises as `read_trace`."""
     settings = config.trace
     known: Mapping[str, object] = {}
@@ -181,7 +181,7 @@ def _rate_Hz(rate: float | str, known: Mapping[str, object]) -> float:
     return value
 
 
-def _in_our_units(rows: Trace, config: Config, layout: Layout) -> Trace:
+def _in_our_units(rows: Trace, config: Config, layout: FileLayout) -> Trace:
     """Return the rows with numbers of other units converted; raises `BadFile` where they are labels."""
     changed = {}
     for name, convert in config.conversions("trace").items():
@@ -195,7 +195,7 @@ def _in_our_units(rows: Trace, config: Config, layout: Layout) -> Trace:
     return rows.having(changed)
 
 
-def _derive(rows: Trace, known: Mapping[str, object], settings: TraceFormat, layout: Layout) -> Trace:
+def _derive(rows: Trace, known: Mapping[str, object], settings: TraceFormat, layout: FileLayout) -> Trace:
     """Return the good ones of rows, with computed columns and integrated displacement."""
     speed = settings.integrate_displacement
     compute = {name: parse(text) for name, text in settings.compute.items()}

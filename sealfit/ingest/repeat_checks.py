@@ -12,7 +12,7 @@ from scipy.special import stdtr
 from sealfit.config import Config
 from sealfit.errors import KEPT, NOTED, STROKE_OUT, Fault
 from sealfit.ingest.quality import FINE, MEASURE_AGAIN
-from sealfit.ingest.scatter import Layout, ScatterFit, fit_scatter, repeat_means
+from sealfit.ingest.scatter import RepeatCodes, ScatterFit, fit_scatter, repeat_means
 
 # ---------------------------------------------------------------- outlying
 
@@ -54,7 +54,7 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
     exceeds its limit. So neither does an outlier widen the scale it is judged by, nor do two hide each other.
     The limit is Sidak's for the repeats left, on Student's t with the pooled degrees of freedom.
     """
-    layout = Layout.of(means)
+    layout = RepeatCodes.of(means)
     force = means["force_N"].to_numpy(float)
     tiny = 1e-6 * float(np.max(np.abs(force), initial=0.0)) + 1e-300  # repeats that agree to the last digit
     kept = np.ones(len(means), bool)

@@ -22,7 +22,7 @@ PATTERN_RUNS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Scatter:
+class RepeatScatter:
     """Standard deviation of a repeat about its run: `sd_N(force) = sqrt(s0_N^2 + (g |force|)^2)`, with `df`.
 
     `pattern` holds, per repeat number, the share by which repeats of that number differ from their runs'
@@ -51,7 +51,7 @@ def repeat_means(steady: pd.DataFrame) -> pd.DataFrame:
     return means.assign(force_N=means["force_N"].abs())[["file", "run_id", "repeat", "force_N"]]
 
 
-def repeat_scatter(steady: pd.DataFrame) -> Scatter:
+def repeat_scatter(steady: pd.DataFrame) -> RepeatScatter:
     """Return the scatter of repeats within their runs, pooled over runs, as a function of the force.
 
     s0 is in the force's unit, g without unit.
@@ -63,11 +63,13 @@ def repeat_scatter(steady: pd.DataFrame) -> Scatter:
     scoring). The common pattern of the repeats costs one degree of freedom per repeat number but one.
     """
     means = repeat_means(steady)
-    return fit_scatter(Layout.of(means), means["force_N"].to_numpy(float), np.ones(len(means), bool)).scatter
+    return fit_scatter(
+        RepeatCodes.of(means), means["force_N"].to_numpy(float), np.ones(len(means), bool)
+    ).scatter
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class RepeatCodes:
     """Run and repeat number of every row, as codes."""
 
     run: np.ndarray
@@ -76,7 +78,7 @@ class Layout:
     numbers: np.ndarray
 
     @classmethod
-    def of(cls, means: pd.DataFrame) -> Layout:
+    def of(cls, means: pd.DataFrame) -> RepeatCodes:
         """Return the layout of a table as `repeat_means` returns it."""
         run, names = pd.factorize(means["run_id"])
         repeat, numbers = pd.factorize(means["repeat"], sort=True)
@@ -87,7 +89,7 @@ class Layout:
 class ScatterFit:
     """Scatter of the rows kept, and where every row lies by it; arrays of one length."""
 
-    scatter: Scatter
+    scatter: RepeatScatter
     covariance: np.ndarray  # of s0^2 and g^2, shape (2, 2)
     mean: np.ndarray  # of the run, per row, pattern removed
     residual: np.ndarray
@@ -107,7 +109,7 @@ class ScatterFit:
         return min(self.scatter.df, 2.0 * variance**2 / spread) if spread > 0.0 else self.scatter.df
 
 
-def fit_scatter(layout: Layout, force_N: np.ndarray, kept: np.ndarray) -> ScatterFit:
+def fit_scatter(layout: RepeatCodes, force_N: np.ndarray, kept: np.ndarray) -> ScatterFit:
     """Fit run means, the pattern and the scatter to the rows kept; residuals of every row."""
     count = np.bincount(layout.run[kept], minlength=layout.runs).astype(float)
     pattern, cost = np.zeros(len(layout.numbers)), 0
@@ -125,7 +127,7 @@ def fit_scatter(layout: Layout, force_N: np.ndarray, kept: np.ndarray) -> Scatte
     share = np.where(count[layout.run] > 1, 1.0 - 1.0 / np.maximum(count[layout.run], 1.0), 0.0)
     df = max(float(np.maximum(count - 1.0, 0.0).sum()) - cost, 0.0)
     named = {int(number): float(value) for number, value in zip(layout.numbers, pattern, strict=True)}
-    scatter = Scatter(float(np.sqrt(s0_2)), float(np.sqrt(g_2)), df, named)
+    scatter = RepeatScatter(float(np.sqrt(s0_2)), float(np.sqrt(g_2)), df, named)
     sd = scatter.sd_N(mean)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(share > 0.0, residual / (sd * np.sqrt(np.where(share > 0.0, share, 1.0))), 0.0)
@@ -133,13 +135,13 @@ def fit_scatter(layout: Layout, force_N: np.ndarray, kept: np.ndarray) -> Scatte
     return ScatterFit(scatter, covariance, mean, residual, share, t)
 
 
-def _run_mean(layout: Layout, values: np.ndarray, kept: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _run_mean(layout: RepeatCodes, values: np.ndarray, kept: np.ndarray, count: np.ndarray) -> np.ndarray:
     total = np.bincount(layout.run[kept], values[kept], minlength=layout.runs)
     return np.divide(total, count, out=np.full(layout.runs, np.nan), where=count > 0)
 
 
 def _pattern(
-    layout: Layout, force_N: np.ndarray, rows: np.ndarray, present: np.ndarray, s0_2: float, g_2: float
+    layout: RepeatCodes, force_N: np.ndarray, rows: np.ndarray, present: np.ndarray, s0_2: float, g_2: float
 ) -> np.ndarray:
     """Return per repeat number the relative change that all runs share, from log F = run + repeat."""
     log_force = np.log(np.maximum(force_N, 1e-300))
@@ -164,7 +166,12 @@ def _pattern(
 
 
 def _variance(
-    layout: Layout, force_N: np.ndarray, kept: np.ndarray, count: np.ndarray, pattern: np.ndarray, cost: int
+    layout: RepeatCodes,
+    force_N: np.ndarray,
+    kept: np.ndarray,
+    count: np.ndarray,
+    pattern: np.ndarray,
+    cost: int,
 ) -> tuple[float, float, np.ndarray]:
     """Return s0^2 and g^2 of the rows kept, and their covariance."""
     none = np.zeros((2, 2))

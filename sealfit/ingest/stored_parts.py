@@ -18,7 +18,7 @@ from sealfit import __version__
 from sealfit.config import Config
 from sealfit.errors import Fault, disk
 from sealfit.ingest.file_names import Listing
-from sealfit.ingest.partitions import SAMPLED, Asked, Columns, Part, read_part
+from sealfit.ingest.partitions import SAMPLED, Asked, Columns, PartitionResult, read_part
 from sealfit.store import parquet
 from sealfit.store.staged_writes import PARQUET, sync
 
@@ -110,7 +110,7 @@ FORMAT = 6  # of a part's files; those of another one are made again
 _ABOUT = b"part"
 
 
-def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None) -> Part:
+def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None) -> PartitionResult:
     """Read a part and store it below `folder`, or keep its tables in memory where there is none.
 
     OutError if the disk is full or refuses.
@@ -137,7 +137,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     return replace(part, strokes=None, tables={}, stored=stored)
 
 
-def stored_strokes(part: Part, folder: Path | None) -> pa.Table:
+def stored_strokes(part: PartitionResult, folder: Path | None) -> pa.Table:
     """Return the strokes of a part, from the disk if they lie there: in `folder`, in which it was made."""
     if part.strokes is not None:
         return part.strokes
@@ -178,17 +178,17 @@ def known_parts(out: Path, files: Iterable[str], is_whole: Callable[[str], bool]
     return {name.split("-", 1)[0]: path for name, path in whole.items()}
 
 
-def load_part(path: Path) -> Part:
+def load_part(path: Path) -> PartitionResult:
     """Return a part that was stored before, without its tables."""
     strokes = parquet.read_ipc(path)
     about = json.loads(strokes.schema.metadata[_ABOUT])
     about["unused"] = frozenset((file, stroke) for file, stroke in about["unused"])
     about["faults"] = tuple(Fault(**fault) for fault in about["faults"])
     about["stored"][f"{PARTS}/{path.name}"] = path.stat().st_size
-    return Part(marks={}, strokes=strokes, **about)
+    return PartitionResult(marks={}, strokes=strokes, **about)
 
 
-def common_columns(parts: Sequence[Part]) -> Columns:
+def common_columns(parts: Sequence[PartitionResult]) -> Columns:
     """Return the columns of each table over all parts; numbers beside words are words.
 
     Tables of one folder must agree: a reader takes the columns of the first file for those of all.
@@ -203,7 +203,7 @@ def common_columns(parts: Sequence[Part]) -> Columns:
     return common
 
 
-def agrees(part: Part, columns: Columns) -> bool:
+def agrees(part: PartitionResult, columns: Columns) -> bool:
     """Whether the stored tables of a part have these columns, in this order."""
     has = {table: (part.wanted or part.columns)[table] for table in part.columns}
     return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())

@@ -77,7 +77,7 @@ class Stroke:
         return self.start + np.flatnonzero(self.steady)
 
 
-class _Motion(NamedTuple):
+class _TraceMotion(NamedTuple):
     """A trace as strokes are found in it: arrays of shape (n,), and the noise of a displacement sample."""
 
     time_s: np.ndarray
@@ -119,7 +119,7 @@ def find_strokes(
         return []
     bounds, origin = _bounds(smooth, turns, max(3.0 * noise, 1e-3 * span), settings.smooth_samples)
     # Single spikes must not decide where a rise ends.
-    motion = _Motion(time_s, displacement_mm, median_filter(force_N, 3, mode="nearest"), noise)
+    motion = _TraceMotion(time_s, displacement_mm, median_filter(force_N, 3, mode="nearest"), noise)
     found = []
     for number, (start, stop) in enumerate(pairwise(bounds), start=1):
         way = 1 if smooth[turns[number]] > smooth[turns[number - 1]] else -1
@@ -138,7 +138,9 @@ def _numbered(strokes: list[Stroke]) -> list[Stroke]:
     return [replace(stroke, number=number) for number, stroke in enumerate(strokes, start=1)]
 
 
-def _stroke(motion: _Motion, settings: Strokes, rows: slice, begin: int, origin: int, way: int) -> Stroke:
+def _stroke(
+    motion: _TraceMotion, settings: Strokes, rows: slice, begin: int, origin: int, way: int
+) -> Stroke:
     """Return the stroke that takes these rows of a trace; before `begin` it slides at another speed."""
     time_s, displacement_mm, force_N = (values[begin : rows.stop] for values in motion[:3])
     along, noise, tolerance = way * displacement_mm, motion.noise_mm, settings.speed_tolerance

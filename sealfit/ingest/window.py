@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import chdtrc
 
-from sealfit.ingest.presliding import Start, rise_of
+from sealfit.ingest.presliding import MotionStart, rise_of
 from sealfit.ingest.segments import stretches, transient_rows, weighted_median
 
 # Share of the plateau speed below which the platform rests. A ripple of the speed stays above it.
@@ -99,7 +99,7 @@ def steady_window(
         return Window(steady, sliding, left, length)
     fast = speed >= (1.0 - tolerance) * plateau
     settles = True
-    stroke, since = _Motion(time_s, along_mm, speed, fast, plateau, half), 0 if blurred else origin
+    stroke, since = _StrokeMotion(time_s, along_mm, speed, fast, plateau, half), 0 if blurred else origin
     for first, last in stroke.moving(moves):
         still = stroke.standstill(since, first)
         begin, end = stroke.ramp_end(still, first, last), stroke.stop_begin(first, last)
@@ -109,7 +109,7 @@ def steady_window(
         if end - begin >= LEAST_SAMPLES:
             rows = slice(still, end)
             distance = _distance(time_s[rows], along_mm[rows], begin - still, 0 if blurred else half)
-            rise = rise_of(Start(distance, force_N[rows], begin - still))
+            rise = rise_of(MotionStart(distance, force_N[rows], begin - still))
             if rise.end_mm > 0.0:
                 begin = max(begin, still + int(distance.searchsorted(rise.end_mm)))
             settled = force_N[begin:end] - rise.at(distance[begin - still :])
@@ -308,7 +308,7 @@ def speed_along(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Motion:
+class _StrokeMotion:
     """How one stroke moves: arrays of shape (n,); `fast` marks the band of the plateau."""
 
     time_s: np.ndarray

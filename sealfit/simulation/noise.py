@@ -67,7 +67,7 @@ class Quantised(Strict):
     resolution_N: float = Field(gt=0)
 
 
-class Gain(Strict):
+class RandomGain(Strict):
     """A random factor on the friction of every file, or of every specimen."""
 
     kind: Literal["repeat_gain", "specimen"]
@@ -126,7 +126,7 @@ Noise = Annotated[
     White
     | Autocorrelated
     | Quantised
-    | Gain
+    | RandomGain
     | RunSetup
     | Proportional
     | DisplacementNoise
@@ -138,7 +138,7 @@ Noise = Annotated[
 
 
 @dataclass(frozen=True, slots=True)
-class Scatter:
+class FileScatter:
     """Random numbers per file, shape (files,) each."""
 
     gain: np.ndarray  # factor on the friction
@@ -147,13 +147,13 @@ class Scatter:
     outlier: np.ndarray  # bool
 
 
-def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> Scatter:
+def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> FileScatter:
     """Return the scatter of `files`, their runs and specimens; gains multiply each other."""
     n = len(files)
     gain, offset, speed, outlier = np.ones(n), np.zeros(n), np.ones(n), np.zeros(n, bool)
     for kind, random in _streams(noise, seed):
         match kind:
-            case Gain():
+            case RandomGain():
                 codes, groups = pd.factorize(files["file" if kind.kind == "repeat_gain" else "specimen_id"])
                 gain *= 1.0 + kind.sd_rel * random.standard_normal(len(groups))[codes]
             case RunSetup():
@@ -167,7 +167,7 @@ def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> Scat
                 chosen = random.random(n) < kind.share
                 gain[chosen] *= 1.0 + kind.size_rel
                 outlier |= chosen
-    return Scatter(gain, offset, speed, outlier)
+    return FileScatter(gain, offset, speed, outlier)
 
 
 def logged(

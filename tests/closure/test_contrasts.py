@@ -204,7 +204,7 @@ def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():
 
 def test_what_no_form_can_describe_is_no_candidate(monkeypatch):
     """Three days leave no form beside the aging law that has a and b of its own."""
-    monkeypatch.setattr("sealfit.closure.selection._Loop.propose", lambda *given: [])
+    monkeypatch.setattr("sealfit.closure.selection._LoopState.propose", lambda *given: [])
 
     def slope(table, force):
         return force * (1 + 0.03 * (table["displacement_mm"].to_numpy() - 20) / 40)

@@ -62,7 +62,7 @@ def test_a_long_wave_is_dropped_where_a_later_effect_makes_it_needless(monkeypat
 
 
 def a_loop(monkeypatch, candidates, proposals):
-    loop = object.__new__(selection._Loop)
+    loop = object.__new__(selection._LoopState)
     loop.fitted, loop.added, loop.refused = SimpleNamespace(deviance=10.0), ["earlier"], set()
     loop.tests, loop.found = SimpleNamespace(fitted=loop.fitted), SimpleNamespace(claimable=[], laws=[])
     loop.context = SimpleNamespace(config=SimpleNamespace(loop=SimpleNamespace(max_rounds=9)), effects={})
@@ -112,7 +112,7 @@ def test_effects_that_mask_each_other_come_before_a_weaker_single_one():
 
     speed, time, distance = (candidate(*c) for c in (("speed_mm_s", 1e-3), ("time_s", 1), ("distance_mm", 1)))
     pair = MaskedPair(1e-9, 60.0, (time.key, distance.key))
-    loop = selection._Loop.__new__(selection._Loop)
+    loop = selection._LoopState.__new__(selection._LoopState)
     loop.found = selection._SearchResult([speed, time, distance], [], [], [speed], [pair])
     loop.masked, loop.refused, loop.negligible, loop.ripple = [], set(), set(), None
     loop.tests, loop.channels, loop.context = None, {}, SimpleNamespace(config=Config())

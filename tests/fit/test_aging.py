@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from sealfit.config import Config
 from sealfit.fit.aging import aging_curves, between_scatter, fit_series
-from sealfit.fit.aging.law import Groups, Values, fit_law, solve_law
+from sealfit.fit.aging.law import EqualGroups, Values, fit_law, solve_law
 from sealfit.fit.aging.law_table import CurveInterval, Estimate, _judge, curve_errors, curve_intervals
 from sealfit.fit.steady import fit_conditions
 from sealfit.physics import aging_law
@@ -164,8 +164,8 @@ def test_noisy_values_are_fitted_in_few_evaluations(monkeypatch):
     values = Values(
         days, 0.9 - 0.01 * np.log1p(3 * days) + noise, np.zeros(17, int), curve, np.eye(17) * 4e-4
     )
-    calls, plain = [], Groups.evaluate
-    monkeypatch.setattr(Groups, "evaluate", lambda *given: calls.append(1) or plain(*given))
+    calls, plain = [], EqualGroups.evaluate
+    monkeypatch.setattr(EqualGroups, "evaluate", lambda *given: calls.append(1) or plain(*given))
     fit_law(values)
     assert len(calls) < 1000
 

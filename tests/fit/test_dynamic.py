@@ -10,7 +10,7 @@ from bristle_helpers import integrated
 
 from sealfit.config import load_config
 from sealfit.fit.dynamic import bristle_rows, fit_dynamic
-from sealfit.fit.dynamic.bristle_model import Curve, Stroke
+from sealfit.fit.dynamic.bristle_model import RisingStroke, StribeckCurve
 from sealfit.fit.dynamic.presliding import fit_stiffness
 from sealfit.fit.dynamic.starts import starts_of, strokes_along
 from sealfit.fit.steady import fit_conditions
@@ -23,7 +23,7 @@ from sealfit.store import Store
 
 MODEL = {"mu_s": 0.9, "mu_c": 0.6, "v_s": 5.0, "sigma_2": 0.05, "sigma_0": 100.0, "sigma_1": 0.5}
 LOAD = 49.03
-CURVE = Curve(0.9 * LOAD, 0.6 * LOAD, 5.0, 0.05)
+CURVE = StribeckCurve(0.9 * LOAD, 0.6 * LOAD, 5.0, 0.05)
 NOISE = (
     {"kind": "white", "sd_N": 0.1},
     {"kind": "repeat_gain", "sd_rel": 0.005},
@@ -45,7 +45,7 @@ def start(file, speed, *, ramp=0.1, gain=1.0, deflection=0.0, rows=80, noise=0.0
     share = np.clip(time / ramp, 0, 1)
     distance = speed * np.where(time < ramp, 0.5 * ramp * share**2, time - 0.5 * ramp)
     force = force + noise * np.random.default_rng([seed, file]).standard_normal(rows)
-    return Stroke(file, file // 3, 1.0, distance, speed * share, force)
+    return RisingStroke(file, file // 3, 1.0, distance, speed * share, force)
 
 
 def test_exact_starts_give_both_numbers_back():
@@ -71,13 +71,13 @@ def test_no_damping_is_found_where_there_is_none():
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_damping_is_not_determined_if_strokes_begin_at_constant_speed(seed):
-    rng, strokes, curve = np.random.default_rng(seed), [], Curve(14.0, 9.0, 2.0, 0.02)
+    rng, strokes, curve = np.random.default_rng(seed), [], StribeckCurve(14.0, 9.0, 2.0, 0.02)
     for k, speed in enumerate(np.repeat([0.3, 1.0, 3.0, 10.0], 3)):
         distance = np.arange(40) / 15
         limit = curve.limit_N(np.array([speed]))[0]
         force = limit * (1 - np.exp(-40.0 * distance / limit)) + 0.02 * speed
         noisy = force + 0.05 * rng.standard_normal(40)
-        strokes.append(Stroke(k, k, 1.0, distance, speed * (1 + 1e-5 * rng.standard_normal(40)), noisy))
+        strokes.append(RisingStroke(k, k, 1.0, distance, speed * (1 + 1e-5 * rng.standard_normal(40)), noisy))
     found = fit_stiffness(strokes, curve)
     assert found.sigma_0 == pytest.approx(40.0, rel=0.02)
     row = list(bristle_rows(found, curve, load_config()))[1]

@@ -6,11 +6,11 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.fit.dynamic.bristle_model import Curve, Rises, Stroke, _followed
+from sealfit.fit.dynamic.bristle_model import Rises, RisingStroke, StribeckCurve, _followed
 from sealfit.fit.dynamic.starts import fit_ramps
 from sealfit.fit.least_squares import central_jacobian
 
-CURVE = Curve(44.0, 29.0, 5.0, 0.05)
+CURVE = StribeckCurve(44.0, 29.0, 5.0, 0.05)
 
 
 def strokes():
@@ -20,7 +20,7 @@ def strokes():
         speed = (k + 1.0) * np.clip(time / 0.2, 0.0, 1.0)
         distance = np.r_[0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(time))]
         force = 30 * (1 - np.exp(-distance / 0.3)) + 0.1 * generator.standard_normal(rows)
-        yield Stroke(k, k, 1.0 + 0.1 * k, distance, speed, force)
+        yield RisingStroke(k, k, 1.0 + 0.1 * k, distance, speed, force)
 
 
 @pytest.mark.parametrize("scale", [0.1, 30.0, 2000.0])

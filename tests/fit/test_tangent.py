@@ -5,7 +5,7 @@ import numpy.testing as npt
 import pytest
 
 from sealfit.fit.joint.rows import Groups
-from sealfit.fit.joint.tangent import Layout, OwnColumns, Tangent, blocks_of
+from sealfit.fit.joint.tangent import BlockLayout, OwnColumns, Tangent, blocks_of
 from sealfit.fit.joint.variance_components import GroupMeans, RestrictedLikelihood, orthonormal
 from sealfit.fit.joint.whitening import Component, Scatter, Whitening
 
@@ -26,7 +26,7 @@ def blocked(rng, rows=12):
     for k, row in zip(SPECIMENS.repeat(rows), dense, strict=True):
         row[[column not in SETS[k] for column in range(9)]] = 0.0
     padded = np.column_stack([dense, np.zeros(len(dense))])
-    layout = Layout(9, index, block.repeat(rows))
+    layout = BlockLayout(9, index, block.repeat(rows))
     return Tangent(layout, np.take_along_axis(padded, index[layout.block], axis=1)), dense
 
 

@@ -7,7 +7,7 @@ from scipy.ndimage import uniform_filter1d
 
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.presliding import Start, _before, rise_of
+from sealfit.ingest.presliding import MotionStart, _before, rise_of
 from sealfit.ingest.segments import transient_rows
 from sealfit.ingest.strokes import find_strokes
 
@@ -114,7 +114,7 @@ def test_twenty_samples_a_second_are_enough_where_the_window_holds_twenty():
 def test_the_end_of_a_rise_follows_its_length_without_jumps():
     lengths, x = np.geomspace(0.4, 0.6, 200), np.linspace(0.0, 40.0, 2001)
     noise = np.random.default_rng(0).normal(0.0, NOISE, x.size)
-    starts = [Start(x, LEVEL * (1.0 - np.exp(-x / length)) + noise, 0) for length in lengths]
+    starts = [MotionStart(x, LEVEL * (1.0 - np.exp(-x / length)) + noise, 0) for length in lengths]
     end = np.array([rise_of(start).end_mm for start in starts])
     assert np.abs(np.diff(np.log(end / lengths))).max() < 0.002
 
@@ -171,7 +171,7 @@ def test_a_rise_of_which_damping_brings_up_most_within_a_sample_is_that_of_the_b
     force = 12.5 - share * 25.0 * np.exp(-x / 0.0857)
     force[0] = -12.5
     noisy = force + np.random.default_rng(1).normal(0.0, 0.02, x.size)
-    rise = rise_of(Start(x, noisy, 0))
+    rise = rise_of(MotionStart(x, noisy, 0))
     assert rise.length_mm == pytest.approx(0.0857, rel=0.05)
     assert rise.end_mm > 5 * 0.0857
     assert np.abs(force - 12.5 - rise.at(x))[x > rise.end_mm].max() < 0.02
@@ -189,7 +189,7 @@ def test_a_fast_stroke_of_few_samples_whose_force_jumps_at_its_reversal_shows_it
     distance = np.r_[0.0, 0.007, 0.022, 0.049, 0.082 + 0.0345 * np.arange(56)]
     force = 76.5 - 62.0 * np.exp(-distance / 0.163)
     force[:4] = -50.0, -26.0, 0.6, 28.0
-    rise = rise_of(Start(distance, np.round(force, 2), ramp_end))
+    rise = rise_of(MotionStart(distance, np.round(force, 2), ramp_end))
     later = distance > rise.end_mm
     assert later.sum() > 30
     assert (force - rise.at(distance))[later] == pytest.approx(76.5, abs=0.15)
@@ -200,7 +200,7 @@ def test_a_rise_that_only_the_plateau_of_the_speed_shows_is_found():
     distance = np.r_[0.0, 0.01, 0.03, 0.056, 0.084 + 0.0288 * np.arange(131)]
     force = 1.45 - 1.72 * np.exp(-distance / 1.29)
     force[:4] = -1.48, -1.1, -0.75, -0.4
-    rise = rise_of(Start(distance, force, 4))
+    rise = rise_of(MotionStart(distance, force, 4))
     later = distance > rise.end_mm
     assert later.sum() > 30
     assert (force - rise.at(distance))[later] == pytest.approx(1.45, abs=0.01)

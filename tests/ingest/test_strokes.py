@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.config import Strokes
-from sealfit.ingest.presliding import Start, rise_of
+from sealfit.ingest.presliding import MotionStart, rise_of
 from sealfit.ingest.strokes import displacement_noise_mm, find_strokes, steady_speeds, turning_rows
 from sealfit.ingest.window import slope
 
@@ -316,8 +316,8 @@ def test_slope_of_two_pieces_ignores_the_rest_between_them():
 
 def test_no_rise_is_found_in_a_force_that_falls_or_begins_within_its_later_band():
     x = np.linspace(0.0, 40.0, 1000)
-    assert rise_of(Start(x, 30.0 + 5.0 * np.exp(-x / 3.0), 0)).end_mm == 0.0
-    assert rise_of(Start(x, np.full(1000, 30.0), 0)).end_mm == 0.0
+    assert rise_of(MotionStart(x, 30.0 + 5.0 * np.exp(-x / 3.0), 0)).end_mm == 0.0
+    assert rise_of(MotionStart(x, np.full(1000, 30.0), 0)).end_mm == 0.0
 
 
 def test_a_stroke_hardly_longer_than_its_rise_keeps_its_plateau():

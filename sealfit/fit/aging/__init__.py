@@ -14,7 +14,7 @@ from sealfit.config import Config
 from sealfit.fit import covariance_matrix
 from sealfit.fit.aging import law_table
 from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
-from sealfit.fit.aging.law_table import Curve, Estimate, OneQuantity
+from sealfit.fit.aging.law_table import Estimate, OneQuantity, SeriesCurve
 from sealfit.fit.joint.declared import DAYS_FOR_LAW
 from sealfit.fit.steady import SteadyFit
 from sealfit.fit.steady.condition import FULL
@@ -122,7 +122,7 @@ def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str
     return found[~((found["parameter"] == pair[1]) & found["condition"].isin(few))]
 
 
-def _curves_of(found: pd.DataFrame, series: Sequence[str], quantities: Sequence[str]) -> list[Curve]:
+def _curves_of(found: pd.DataFrame, series: Sequence[str], quantities: Sequence[str]) -> list[SeriesCurve]:
     """Return the curves of some series and quantities; those with enough days are numbered."""
     unaged, unit = set(found.loc[found["aging_days"] == 0, "quantity"]), str(found["unit"].iloc[0])
     aged = found[found["aging_days"] > 0]
@@ -133,12 +133,12 @@ def _curves_of(found: pd.DataFrame, series: Sequence[str], quantities: Sequence[
     for name, quantity in product(series, quantities):
         days = np.sort(tested.get((name, quantity), np.zeros(0)))
         enough = days.size + (quantity in unaged) >= DAYS_FOR_LAW
-        curves.append(Curve(name, quantity, place if enough else -1, days, quantity in unaged, unit))
+        curves.append(SeriesCurve(name, quantity, place if enough else -1, days, quantity in unaged, unit))
         place += enough
     return curves
 
 
-def _numbers_of(found: pd.DataFrame, curves: list[Curve]) -> np.ndarray:
+def _numbers_of(found: pd.DataFrame, curves: list[SeriesCurve]) -> np.ndarray:
     """Return the number of each value's curve, shape (n,); -1 for unaged rubber, `WITHOUT_LAW` for none."""
     place = {(c.series, c.quantity): c.place for c in curves if c.place >= 0}
     keys = zip(found["series"], found["quantity"], strict=True)
@@ -225,7 +225,7 @@ def laws_of_series(
     return _rows(values, curves, fitted, moved[kept])
 
 
-def _rows(values: Values, curves: list[Curve], fitted: list[str], moved: np.ndarray) -> LawRows:
+def _rows(values: Values, curves: list[SeriesCurve], fitted: list[str], moved: np.ndarray) -> LawRows:
     """Return the rows of all curves; `fitted` are the quantities with a law, in the order of their origin."""
     quantities = {}
     model = np.empty(values.value.size)

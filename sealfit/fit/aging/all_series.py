@@ -109,7 +109,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataF
 
 def _shared(
     own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
-) -> _Curve | None:
+) -> _SharedCurve | None:
     """Return the shared curve of the days of a series, or None if they do not share one.
 
     `widened`, shape (conditions,), is the factor on variances.
@@ -122,12 +122,12 @@ def _shared(
         return None
     if not np.isfinite(widened).all() or not np.isfinite(df):
         return None
-    curve = _Curve(full, widened[is_full])
+    curve = _SharedCurve(full, widened[is_full])
     free = sum(c.chi2 / w for c, w in zip(full, widened[is_full], strict=True))
     if _worse(curve.rss - free, curve.df - sum(c.df for c in full), df):
         return None
     if len(full) < len(own):  # days with too few speeds for a separate fit, if they agree with the others
-        every = _Curve(own, widened)
+        every = _SharedCurve(own, widened)
         if not _worse(every.rss - curve.rss, every.df - curve.df, df):
             curve = every
     return curve
@@ -138,7 +138,7 @@ def _worse(rise: float, more: int, df: float) -> bool:
     return more > 0 and bool(fdtrc(more, df, rise / more) < SHARED_P)
 
 
-class _Curve:
+class _SharedCurve:
     """Least-squares fit of Eq. 14 to several conditions with one v_s and one sigma_2."""
 
     def __init__(self, own: Sequence[Condition], widened: np.ndarray) -> None:

@@ -125,7 +125,7 @@ class Values:
         return np.column_stack([origin, m + curve, m + self.curves + curve])
 
     @cached_property
-    def groups(self) -> list[Groups]:
+    def groups(self) -> list[EqualGroups]:
         """The values in groups that are independent given mu_0, those of one size together."""
         n, aged = self.value.size, np.flatnonzero(self.curve >= 0)
         member = csr_array((np.ones(aged.size), (aged, self.curve[aged])), shape=(n, self.curves))
@@ -134,7 +134,7 @@ class Values:
             of_values = (own < n).sum(axis=1)  # values come first
             for count in np.unique(of_values):
                 rows, curves = np.split(own[of_values == count], [count], axis=1)
-                found[rows.shape[1], curves.shape[1]] = Groups(self, rows, curves - n)
+                found[rows.shape[1], curves.shape[1]] = EqualGroups(self, rows, curves - n)
         return list(found.values())
 
     def part(self, keep) -> Values:
@@ -156,7 +156,7 @@ class Values:
         return np.abs(model) if self.size is None else self.size
 
 
-class Groups:
+class EqualGroups:
     """Groups of values and of their curves, of one size each and independent given mu_0.
 
     A group is a series with its correlated quantities, an unaged condition, or, if batches correlate
@@ -293,7 +293,7 @@ class _Eliminating(Linear):
     substitutes back.
     """
 
-    def __init__(self, groups: list[Groups]) -> None:
+    def __init__(self, groups: list[EqualGroups]) -> None:
         self.groups = groups
         self.ends = np.cumsum([own.rows.size for own in groups])[:-1]
 

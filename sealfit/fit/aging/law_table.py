@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize.elementwise import find_root
 from scipy.special import chdtrc, fdtrc, ndtri, stdtrit
 
-from sealfit.fit.aging.law import PROFILED, Groups, LawFit
+from sealfit.fit.aging.law import PROFILED, EqualGroups, LawFit
 from sealfit.fit.joint.declared import DAYS_FOR_LAW
 from sealfit.fit.least_squares import CHUNK, covariance_of, levenberg_marquardt
 from sealfit.fit.steady import table_row
@@ -147,7 +147,9 @@ class _Profile:
     the curve within its group. `chi2` and `log_b`, shape (g,), are those of the joint optimum.
     """
 
-    def __init__(self, fit: LawFit, own: Groups, others: tuple[np.ndarray, np.ndarray], place: int) -> None:
+    def __init__(
+        self, fit: LawFit, own: EqualGroups, others: tuple[np.ndarray, np.ndarray], place: int
+    ) -> None:
         self.own, (self.root, self.miss) = own, others
         self.at_a, self.at_b = own.m + place, own.m + own.width + place
         self.x = fit.x[own.places]
@@ -220,7 +222,7 @@ def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high
 
 
 @dataclass(frozen=True)
-class Curve:
+class SeriesCurve:
     """One quantity of one series: its number in the joint fit (-1 without a law) and the tested days."""
 
     series: str
@@ -289,7 +291,7 @@ class Estimate:
             return float(a * gradient[1]), float(np.sqrt(gradient @ self.covariance @ gradient))
 
 
-def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, df: float) -> Iterator[dict]:
+def law_rows(curve: SeriesCurve, found: Estimate, ends: CurveInterval, df: float) -> Iterator[dict]:
     """Return the rows of mu_0, a, b and c; `df` are the degrees of freedom of mu_0's interval."""
     mu_0, a, u = found.x
     b, se = np.exp(u), np.sqrt(np.diag(found.covariance))
@@ -317,7 +319,7 @@ def law_rows(curve: Curve, found: Estimate, ends: CurveInterval, df: float) -> I
         ) | {"series": curve.series}
 
 
-def _judge(curve: Curve, found: Estimate, ends: CurveInterval, t: float) -> dict[str, tuple[bool, str]]:
+def _judge(curve: SeriesCurve, found: Estimate, ends: CurveInterval, t: float) -> dict[str, tuple[bool, str]]:
     verdict = dict.fromkeys(LAW, (True, ""))
     first, last, b = curve.days[0], curve.days[-1], float(np.exp(found.x[2]))
     low, high = ends.b
@@ -355,7 +357,7 @@ def _judge(curve: Curve, found: Estimate, ends: CurveInterval, t: float) -> dict
     return verdict
 
 
-def without_law(curve: Curve) -> Iterator[dict]:
+def without_law(curve: SeriesCurve) -> Iterator[dict]:
     """Return the rows of a curve with too few days: no values, and a reason."""
     days = ", ".join(f"{day:g}" for day in ([0.0, *curve.days] if curve.unaged else curve.days)) or "none"
     needs = f"the law needs {DAYS_FOR_LAW} distinct days where {curve.quantity} is determined"
@@ -365,7 +367,7 @@ def without_law(curve: Curve) -> Iterator[dict]:
         yield table_row(parameter=name, unit=unit, **row) | {"series": curve.series}
 
 
-def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Iterator[dict]:
+def statistics_rows(curve: SeriesCurve, joint: LawFit, quantity: OneQuantity) -> Iterator[dict]:
     """Return the rows with the statistics of the fit of this curve."""
     part, squares, share, tau = quantity.part, quantity.squares, quantity.series, quantity.tau
     values = joint.values
@@ -415,7 +417,7 @@ def statistics_rows(curve: Curve, joint: LawFit, quantity: OneQuantity) -> Itera
         ) | {"series": curve.series}
 
 
-def covariance_rows(curve: Curve, covariance: np.ndarray) -> Iterator[dict]:
+def covariance_rows(curve: SeriesCurve, covariance: np.ndarray) -> Iterator[dict]:
     """Return the rows of table `aging_covariance`: the covariance of mu_0, a and ln b, shape (3, 3)."""
     names, units = ("mu_0", "a", "ln b"), (curve.unit, curve.unit, "")
     for i in range(3):

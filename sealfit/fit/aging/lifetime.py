@@ -51,7 +51,7 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Lifetime:
+class DaysToThreshold:
     """Days to a threshold, the 95 % interval, and the degree of extrapolation.
 
     `days` is inf if the law does not reach the threshold, 0 if unaged rubber is beyond it.
@@ -73,7 +73,7 @@ class Lifetime:
 def lifetime(
     law: JointLaw, goal: Goal, temperature_C: float | None = None, compression_ratio_pct: float | None = None
 ):
-    """Return the `Lifetime` of rubber aged at a temperature and compression.
+    """Return the `DaysToThreshold` of rubber aged at a temperature and compression.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def lifetime(
         low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
     asked = days * float(law.factors(place)[0][0])
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
-    return Lifetime(days, low, high, threshold, beyond, _outside(law, place))
+    return DaysToThreshold(days, low, high, threshold, beyond, _outside(law, place))
 
 
 def over_laws(

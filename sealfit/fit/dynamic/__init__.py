@@ -12,7 +12,7 @@ import pandas as pd
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.fit import covariance_matrix
-from sealfit.fit.dynamic.bristle_model import Cells, Curve, Stroke, over_strokes
+from sealfit.fit.dynamic.bristle_model import Cells, RisingStroke, StribeckCurve, over_strokes
 from sealfit.fit.dynamic.presliding import (
     AT,
     Stiffness,
@@ -21,7 +21,7 @@ from sealfit.fit.dynamic.presliding import (
     largest_rows,
     peaks,
 )
-from sealfit.fit.dynamic.starts import Along, Start, starts_of, strokes_along, whole_strokes
+from sealfit.fit.dynamic.starts import Along, StrokeStart, starts_of, strokes_along, whole_strokes
 from sealfit.fit.joint.rows import nesting_run, records
 from sealfit.fit.steady import SteadyFit, condition_keys, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces
@@ -47,7 +47,7 @@ WIDE = "the starts disagree: only that it lies between {low:.3g} and {high:.3g} 
 
 
 def bristle_rows(
-    found: Stiffness | None, curve: Curve, config: Config, *, braked: bool = True
+    found: Stiffness | None, curve: StribeckCurve, config: Config, *, braked: bool = True
 ) -> Iterator[dict]:
     """Yield rows of table `dynamic_fit` for one condition: sigma_0, sigma_1 and statistics of the fit.
 
@@ -74,7 +74,7 @@ def bristle_rows(
         yield table_row(quantity="statistics", parameter=name, value=value, unit=unit)
 
 
-def _stiffness_row(found: Stiffness, curve: Curve, unit: str, config: Config) -> dict:
+def _stiffness_row(found: Stiffness, curve: StribeckCurve, unit: str, config: Config) -> dict:
     value = found.sigma_0
     row = {"quantity": "dynamic", "parameter": "sigma_0", "unit": unit, "value": value}
     if found.files < 2:
@@ -88,7 +88,7 @@ def _stiffness_row(found: Stiffness, curve: Curve, unit: str, config: Config) ->
     return table_row(**row, identified=found.stiffness_known, reason=reason)
 
 
-def _damping_row(found: Stiffness, curve: Curve, unit: str) -> dict:
+def _damping_row(found: Stiffness, curve: StribeckCurve, unit: str) -> dict:
     row = {"quantity": "dynamic", "parameter": "sigma_1", "unit": unit, "value": found.sigma_1}
     if found.files < 2 or not found.stiffness_known:
         why = ONE_START if found.files < 2 else "sigma_0 is not determined"
@@ -175,11 +175,11 @@ def fit_dynamic(
 
 
 # The traces of some conditions, their rows of `steady`, and their Stribeck curves.
-Asked = tuple[pd.DataFrame | StoredTraces, pd.DataFrame, Mapping[str, Curve]]
+Asked = tuple[pd.DataFrame | StoredTraces, pd.DataFrame, Mapping[str, StribeckCurve]]
 
 
 def _asked(
-    traces: pd.DataFrame | Sequence[StoredTraces], steady: pd.DataFrame, curves: Mapping[str, Curve]
+    traces: pd.DataFrame | Sequence[StoredTraces], steady: pd.DataFrame, curves: Mapping[str, StribeckCurve]
 ) -> list[Asked]:
     """Return the conditions to fit, in partitions that are read together."""
     if isinstance(traces, pd.DataFrame):
@@ -268,7 +268,9 @@ def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
     return (float(table["chi2"].sum()) / df, df) if df > 0 else (1.0, 1.0)
 
 
-def _evidence(starts: Sequence[Start], steady: pd.DataFrame, curve: Curve) -> list[Stroke]:
+def _evidence(
+    starts: Sequence[StrokeStart], steady: pd.DataFrame, curve: StribeckCurve
+) -> list[RisingStroke]:
     """Return the starts of a condition with their units of evidence and their ratio to the curve.
 
     The ratio is that of the loads, or of the sliding forces if the curve is not determined. `steady` has the
@@ -280,7 +282,7 @@ def _evidence(starts: Sequence[Start], steady: pd.DataFrame, curve: Curve) -> li
     ratio = np.where(np.isnan(ratio), 1.0, ratio).tolist()
     units = (_numbered(steady[name].to_numpy(int)).tolist() for name in ("file_number", "run_number"))
     return [
-        Stroke(file, run, part, s.distance_mm, s.speed_mm_s, s.force_N)
+        RisingStroke(file, run, part, s.distance_mm, s.speed_mm_s, s.force_N)
         for file, run, part, s in zip(*units, ratio, starts, strict=True)
     ]
 
@@ -290,7 +292,7 @@ def _numbered(numbers: np.ndarray) -> np.ndarray:
     return numbers if (numbers != numbers[:1]).any() else np.arange(len(numbers))
 
 
-def _curves(steady: pd.DataFrame, steady_fit: SteadyFit) -> dict[str, Curve]:
+def _curves(steady: pd.DataFrame, steady_fit: SteadyFit) -> dict[str, StribeckCurve]:
     """Return the Stribeck curve of each condition in `steady`, from its identified parameters."""
     fit, covariance = steady_fit["steady_fit"], steady_fit["steady_covariance"]
     known = fit[fit["identified"].to_numpy(bool)].groupby("condition")
@@ -307,7 +309,7 @@ def _curves(steady: pd.DataFrame, steady_fit: SteadyFit) -> dict[str, Curve]:
 
 def _curve(
     values: Mapping[str, float], covariances: Mapping[tuple[str, str], float], steady: pd.DataFrame
-) -> Curve:
+) -> StribeckCurve:
     """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified.
 
     `values` are identified parameters and statistics by name, `covariances` those of pairs of parameters.
@@ -320,6 +322,8 @@ def _curve(
             unit = np.array([factor, factor, 1.0, 1.0])
             covariance = covariance_matrix(covariances, (static, coulomb, "v_s", "sigma_2"))
             parameters = unit * [*known, sigma_2]
-            return Curve(*parameters.tolist(), covariance * np.outer(unit, unit), int(values.get("df", 1)))
+            return StribeckCurve(
+                *parameters.tolist(), covariance * np.outer(unit, unit), int(values.get("df", 1))
+            )
     flat = float(np.median(steady["size_N"] - sigma_2 * steady["speed_mm_s"].abs()))
-    return Curve(flat, flat, np.inf, sigma_2)
+    return StribeckCurve(flat, flat, np.inf, sigma_2)

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sealfit.fit.dynamic.starts import LEAST, Part
+from sealfit.fit.dynamic.starts import LEAST, StrokePart
 from sealfit.ingest.stored_parts import noise_from_bends
 from sealfit.physics import bristle_limit
 
@@ -23,7 +23,7 @@ class Cells:
     of samples of a stroke, `samples`, at most MOST_CELLS; `middle_mm`, shape (cells,), are their midpoints.
     """
 
-    def __init__(self, parts: Sequence[Part]) -> None:
+    def __init__(self, parts: Sequence[StrokePart]) -> None:
         self.parts = parts
         self.samples = float(np.median([part.force_N.size for part in parts]))
         self.reach_mm = float(np.median([part.distance_mm[-1] for part in parts]))
@@ -73,7 +73,7 @@ APART = 1e-10
 
 
 @dataclass(frozen=True)
-class Stroke:
+class RisingStroke:
     """A stroke from the start of motion to steady sliding."""
 
     file: int  # number of its file, or of the stroke itself if there is only one file
@@ -85,7 +85,7 @@ class Stroke:
 
 
 @dataclass(frozen=True)
-class Curve:
+class StribeckCurve:
     """A condition's Stribeck curve under its load: F_s, F_c in N; v_s in mm/s (inf: flat), sigma_2 in N s/mm.
 
     `covariance`, shape (4, 4), is that of these four in this order, with `df` degrees of freedom.
@@ -103,7 +103,7 @@ class Curve:
         """Whether the curve is determined; it is flat otherwise."""
         return bool(np.isfinite(self.v_s))
 
-    def moved(self) -> Iterator[Curve]:
+    def moved(self) -> Iterator[StribeckCurve]:
         """Yield the curve changed by one standard deviation along each principal axis of its covariance.
 
         Each keeps at least a tenth of its value, as the model needs them positive.
@@ -127,7 +127,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Tangent:
+class BristleTangent:
     """Residual of the forces at (log sigma_0, tau), and its derivative; strokes are padded with zeros.
 
     The linear parameters, `level` and `begin`, are at their optimum.
@@ -157,7 +157,7 @@ class Tangent:
 class Rises:
     """The strokes of a condition, padded to one length and simulated together."""
 
-    def __init__(self, strokes: Sequence[Stroke], curve: Curve) -> None:
+    def __init__(self, strokes: Sequence[RisingStroke], curve: StribeckCurve) -> None:
         sizes = np.array([s.force_N.size for s in strokes])
         self.there = np.arange(sizes.max()) < sizes[:, None]  # (strokes, rows)
         self.step, self.speed, self.force = (np.zeros(self.there.shape) for _ in range(3))
@@ -201,7 +201,7 @@ class Rises:
         linear = inverse @ (both @ self.force[..., None])
         return inverse, linear, self.force - (linear * both).sum(axis=1)
 
-    def tangent(self, at: np.ndarray) -> Tangent:
+    def tangent(self, at: np.ndarray) -> BristleTangent:
         """Return the residual at (log sigma_0, tau), and its derivative.
 
         The derivative of the linear parameters is that of their normal equations (Golub and Pereyra 1973).
@@ -214,7 +214,7 @@ class Rises:
             model = (linear * by).sum(axis=1)
             change = inverse @ (by @ residual[..., None] - both @ model[..., None])
             moved.append(-model - (change * both).sum(axis=1))
-        return Tangent(linear[:, 0, 0], linear[:, 1, 0], residual, np.stack(moved))
+        return BristleTangent(linear[:, 0, 0], linear[:, 1, 0], residual, np.stack(moved))
 
     def shows_damping(self, sigma_0: float) -> bool:
         """Return whether a small damping is distinguishable from the level and initial force of strokes."""

@@ -27,7 +27,7 @@ from scipy.ndimage import convolve1d
 from scipy.special import stdtrit
 
 from sealfit.config import Config
-from sealfit.fit.dynamic.bristle_model import Cells, Curve, Rises, Stroke, Tangent
+from sealfit.fit.dynamic.bristle_model import BristleTangent, Cells, Rises, RisingStroke, StribeckCurve
 from sealfit.fit.joint.search import least_squares_within
 from sealfit.fit.least_squares import levenberg_marquardt
 
@@ -116,7 +116,7 @@ class Stiffness:
         return float(self.quantile[1] * self.damping_se)
 
 
-def fit_stiffness(strokes: Sequence[Stroke], curve: Curve) -> Stiffness | None:
+def fit_stiffness(strokes: Sequence[RisingStroke], curve: StribeckCurve) -> Stiffness | None:
     """Return sigma_0 and tau of the strokes of a condition; None without strokes.
 
     `strokes` are all that start at rest or at a reversal, and `curve` is the condition's Stribeck curve.
@@ -178,7 +178,9 @@ def together(parts: Sequence[tuple[np.ndarray, np.ndarray | int]]) -> np.ndarray
     return total**2 / np.maximum(spread, 1e-300)
 
 
-def _between_files(found: Tangent, inverse: np.ndarray, file: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _between_files(
+    found: BristleTangent, inverse: np.ndarray, file: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the cluster-robust covariance of estimates, shape (p, p), and degrees of freedom, shape (p,).
 
     It is the jackknife over files (CR3). The degrees of freedom depend on the leverages of the files.

@@ -35,7 +35,7 @@ class Ramp:
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _PaddedRows:
     """Padded rows of strokes: time, displacement minus its mean, and mask, shape (strokes, rows) each."""
 
     time: np.ndarray
@@ -43,11 +43,11 @@ class _Rows:
     there: np.ndarray
 
     @classmethod
-    def of(cls, time: np.ndarray, along: np.ndarray, there: np.ndarray) -> _Rows:
+    def of(cls, time: np.ndarray, along: np.ndarray, there: np.ndarray) -> _PaddedRows:
         return cls(time, cls(time, along, there).centred(along), there)
 
-    def some(self, strokes: np.ndarray) -> _Rows:
-        return _Rows(self.time[strokes], self.along[strokes], self.there[strokes])
+    def some(self, strokes: np.ndarray) -> _PaddedRows:
+        return _PaddedRows(self.time[strokes], self.along[strokes], self.there[strokes])
 
     def centred(self, values: np.ndarray) -> np.ndarray:
         """Return values minus their stroke's mean, 0 in padding."""
@@ -93,7 +93,7 @@ def _fit_some(
     # Time at which a start at full speed would have given the same displacement.
     each, last = np.arange(len(sizes)), sizes - 1
     lagged = time[each, last] - (along[each, last] - along[:, 0]) / paces_mm_s
-    padded = _Rows.of(time, along, there)
+    padded = _PaddedRows.of(time, along, there)
     fits = [
         _fit_shape(padded, shape, lagged, lag, step) for shape, lag in ((_straight, 0.5), (_lagging, 1.0))
     ]
@@ -112,7 +112,7 @@ Shape = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def _fit_shape(
-    rows: _Rows, shape: Shape, lagged: np.ndarray, lag: float, step: np.ndarray
+    rows: _PaddedRows, shape: Shape, lagged: np.ndarray, lag: float, step: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """Return the best ramps of one shape.
 
@@ -142,11 +142,11 @@ def _fit_shape(
     return distance, rate, speed, squares
 
 
-def _moved(rows: _Rows, shape: Shape, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _moved(rows: _PaddedRows, shape: Shape, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return shape(rows.time - at[:, :1], np.exp(at[:, 1:]))
 
 
-def _solved(rows: _Rows, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _solved(rows: _PaddedRows, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the slope of the displacement on a centred distance, the residual, and its sum of squares."""
     square = np.einsum("kr,kr->k", distance, distance)
     slope = np.einsum("kr,kr->k", distance, rows.along) / np.maximum(square, 1e-300)
@@ -204,7 +204,7 @@ class Sliding:
 
 
 @dataclass(frozen=True)
-class Part:
+class StrokePart:
     """A part of one stroke; distance and force are positive in its direction."""
 
     row: int  # in table `steady`
@@ -214,7 +214,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Start(Part):
+class StrokeStart(StrokePart):
     """The start of one stroke, with smoothed displacement."""
 
     speed_mm_s: np.ndarray  # (n,) rate of the distance
@@ -269,7 +269,7 @@ def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
     return made
 
 
-def starts_of(strokes: Sequence[Along]) -> list[Start]:
+def starts_of(strokes: Sequence[Along]) -> list[StrokeStart]:
     """Return the start of every stroke that has one; a record that begins in steady sliding has none."""
     strokes = [stroke for stroke in strokes if stroke.until >= LEAST]
     noisy = [stroke for stroke in strokes if stroke.noisy]
@@ -284,7 +284,7 @@ def starts_of(strokes: Sequence[Along]) -> list[Start]:
     return [start for start in made if start is not None]
 
 
-def whole_strokes(strokes: Sequence[Along]) -> list[Part]:
+def whole_strokes(strokes: Sequence[Along]) -> list[StrokePart]:
     """Return every stroke from first row to last; its sliding force is the mean of its steady window."""
     made = []
     for stroke in strokes:
@@ -292,11 +292,11 @@ def whole_strokes(strokes: Sequence[Along]) -> list[Part]:
         if len(distance) >= LEAST and distance[-1] > 0.0:
             force, middle = stroke.force_N[stroke.steady], distance[stroke.steady]
             mean = Sliding(float(force.mean()), float(middle.mean()), 0.0, len(force), math.inf)
-            made.append(Part(stroke.row, distance, stroke.force_N, mean))
+            made.append(StrokePart(stroke.row, distance, stroke.force_N, mean))
     return made
 
 
-def _begun(stroke: Along, ramp: Ramp | None) -> Start | None:
+def _begun(stroke: Along, ramp: Ramp | None) -> StrokeStart | None:
     """Return the start of a stroke from its first motion, along its ramp if that fits; None if too short."""
     until, pace = stroke.until, stroke.pace_mm_s
     on_ramp = ramp is not None and ramp.rms_mm <= AS_NOISE * stroke.noise_mm and ramp.final_mm_s > 0.0
@@ -309,7 +309,7 @@ def _begun(stroke: Along, ramp: Ramp | None) -> Start | None:
     after = np.flatnonzero(stroke.steady)
     after = after[: max(LEAST, int(JUST_BEGUN * len(after)))]
     line = Sliding.of(stroke.along_mm[after] - stroke.along_mm[since], stroke.force_N[after])
-    return Start(stroke.row, distance, stroke.force_N[since:until], line, speed[since:until])
+    return StrokeStart(stroke.row, distance, stroke.force_N[since:until], line, speed[since:until])
 
 
 def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import pandas as pd
 from sealfit.effects.contract import CHANNEL, QUANTITIES_OF, SAMPLES, SECOND, Effect, width_of
 from sealfit.fit.joint.declared import QUANTITIES, Declared
 from sealfit.fit.joint.rows import ALONG, Rows
-from sealfit.fit.joint.tangent import Layout, Tangent, blocks_of
+from sealfit.fit.joint.tangent import BlockLayout, Tangent, blocks_of
 
 # Gauss-Legendre nodes on [-1, 1] and weights that sum to 1: two for smooth shapes, four for narrow ones.
 TWO_NODES, FOUR_NODES = (
@@ -243,7 +243,7 @@ class Model:
 
 def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, Tangent | None]:
     """Return the model's force, shape (n,), and its tangent, of shape (n, model.size), at every row."""
-    state = _State.of(model, rows)
+    state = _ForceParts.of(model, rows)
     if not jacobian:
         return state.force, None
     slopes, layout = state.slopes(), _layout(model, rows)
@@ -264,19 +264,19 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
     return state.force, Tangent(layout, values)
 
 
-def _layout(model: Model, rows: Rows) -> Layout:
+def _layout(model: Model, rows: Rows) -> BlockLayout:
     """Return the layout of the model's tangent.
 
     A block has the declared numbers of a specimen's conditions, then the parameters of all terms.
     """
     declared = model.declared
 
-    def make() -> Layout:
+    def make() -> BlockLayout:
         size = model.theta.size
         index, block = rows.cache.once(("blocks",), lambda: _blocks(declared, rows), at=declared)
         added = np.arange(size, model.size)
         index = np.column_stack([np.where(index == size, model.size, index), np.tile(added, (len(index), 1))])
-        return Layout(model.size, index, block)
+        return BlockLayout(model.size, index, block)
 
     return rows.cache.once(("layout", model.size), make, at=declared)
 
@@ -300,7 +300,7 @@ def loads_of(model: Model, rows: Rows, friction: np.ndarray | None = None) -> np
     That of a gain is friction, the force without added forces; where the model may be far off, another
     `friction` can be given, shape (n,). That of v_s is per unit of its logarithm.
     """
-    state = _State.of(model, rows)
+    state = _ForceParts.of(model, rows)
     slopes, friction = state.slopes(), state.friction if friction is None else friction
     has = {name: (model.declared.index[name] >= 0)[rows.condition] for name in ("v_s", "sigma_2")}
     v_s, sigma_2 = slopes["v_s"] * state.now["v_s"] * has["v_s"], slopes["sigma_2"] * has["sigma_2"]
@@ -309,12 +309,12 @@ def loads_of(model: Model, rows: Rows, friction: np.ndarray | None = None) -> np
 
 def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.ndarray:
     """Return the force's derivative with respect to the shape of a term not yet in the model, shape (n,)."""
-    state = _State.of(model, rows)
+    state = _ForceParts.of(model, rows)
     return state.term_slope(state.slopes(), acts_on, operation)
 
 
 @dataclass(frozen=True)
-class _State:
+class _ForceParts:
     """The parts of a model's force at the rows; each array has shape (n,)."""
 
     rows: Rows
@@ -331,7 +331,7 @@ class _State:
     force: np.ndarray
 
     @classmethod
-    def of(cls, model: Model, rows: Rows) -> _State:
+    def of(cls, model: Model, rows: Rows) -> _ForceParts:
         """Return the state of a model at some rows."""
         shapes = [shape_of(t, v, rows) for t, v in zip(model.terms, model.values, strict=True)]
         effects = [(t.acts_on, t.operation, shape) for t, shape in zip(model.terms, shapes, strict=True)]

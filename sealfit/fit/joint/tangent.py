@@ -25,7 +25,7 @@ LARGEST_BLOCK = 0.5
 
 
 @dataclass(frozen=True)
-class Layout:
+class BlockLayout:
     """The columns of each block, and the block of each row."""
 
     size: int  # number of columns, p
@@ -51,9 +51,9 @@ class Layout:
         np.put_along_axis(found, self.index, np.arange(self.index.shape[1])[None, :], axis=1)
         return found[:, :-1]
 
-    def of(self, rows: np.ndarray) -> Layout:
+    def of(self, rows: np.ndarray) -> BlockLayout:
         """Return the layout of some rows."""
-        return Layout(self.size, self.index, self.block[rows])
+        return BlockLayout(self.size, self.index, self.block[rows])
 
     def gram(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Return A' B of two sets of columns in this layout, shape (n, k) each -> (p, p)."""
@@ -79,14 +79,14 @@ class Layout:
 class Tangent:
     """Derivatives of rows, shape (n, p), by blocks: `values`, shape (n, k), 0 at empty places."""
 
-    layout: Layout
+    layout: BlockLayout
     values: np.ndarray
 
     @classmethod
     def dense(cls, columns: np.ndarray) -> Tangent:
         """Return columns, shape (n, p), as one block."""
         n, p = columns.shape
-        return cls(Layout(p, np.arange(p)[None, :], np.zeros(n, dtype=int)), columns)
+        return cls(BlockLayout(p, np.arange(p)[None, :], np.zeros(n, dtype=int)), columns)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -109,7 +109,7 @@ class Tangent:
         first, size = self.layout.size, self.layout.size + values.shape[1] - self.values.shape[1]
         index = np.where(self.layout.index == first, size, self.layout.index)
         index = np.column_stack([index, np.tile(np.arange(first, size), (len(index), 1))])
-        return Tangent(Layout(size, index, self.layout.block), values)
+        return Tangent(BlockLayout(size, index, self.layout.block), values)
 
     def gram(self) -> np.ndarray:
         """Return T' T, shape (p, p)."""
@@ -169,7 +169,7 @@ class Tangent:
         index = np.where(np.append(mask, False)[self.layout.index], number[self.layout.index], size)
         used = (index < size).any(axis=0)
         values = np.where((index < size)[self.layout.block], self.values, 0.0)
-        return Tangent(Layout(size, index[:, used], self.layout.block), values[:, used])
+        return Tangent(BlockLayout(size, index[:, used], self.layout.block), values[:, used])
 
     def orthonormal(
         self, tolerance: float, project_out: Callable[[np.ndarray], np.ndarray] = lambda columns: columns
@@ -200,7 +200,7 @@ class Tangent:
             values[rows, : part.shape[1]] = part
         size = int(counts.sum())
         index = np.where(places < counts[:, None], first[:, None] + places, size)
-        own = Tangent(Layout(size, index, layout.block), values)
+        own = Tangent(BlockLayout(size, index, layout.block), values)
         if border is None:
             return own
         border = own.project_out(own.project_out(border))  # the second projection removes rounding errors

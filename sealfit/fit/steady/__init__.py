@@ -32,7 +32,7 @@ from sealfit.fit.steady.uncertainty import (
     unit_variance,
 )
 from sealfit.ingest.columns import condition_columns
-from sealfit.ingest.scatter import Scatter, repeat_scatter
+from sealfit.ingest.scatter import RepeatScatter, repeat_scatter
 from sealfit.tables import STEADY_COVARIANCE, STEADY_FIT, STEADY_SHIFT, Schema
 from sealfit.units import Units
 
@@ -106,7 +106,7 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
     return found
 
 
-def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], Scatter, UnitVariance]:
+def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], RepeatScatter, UnitVariance]:
     """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
 
     A Stribeck curve that does not differ significantly from a straight line is dropped. FitError if there is
@@ -142,7 +142,7 @@ def _more_likely_weights(even: list[Condition]) -> list[Condition]:
     return (even, other)[chosen]
 
 
-def _unit_variance(conditions: list[Condition], scatter: Scatter) -> UnitVariance:
+def _unit_variance(conditions: list[Condition], scatter: RepeatScatter) -> UnitVariance:
     return unit_variance(*scatter_of_runs(conditions), scatter.df)
 
 
@@ -158,7 +158,7 @@ def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
 # ---------------------------------------------------------------- table
 def _rows(
-    condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config
+    condition: Condition, variance: UnitVariance, scatter: RepeatScatter, config: Config
 ) -> Iterator[tuple[Schema, dict]]:
     """Yield the rows of a condition, each with the table it belongs to."""
     unit_of = parameter_units(config.units, condition.has_load)
@@ -206,7 +206,7 @@ def _widened(value: float, low: float, high: float, reach: float) -> tuple[float
 
 
 def _statistics(
-    condition: Condition, variance: UnitVariance, scatter: Scatter, config: Config
+    condition: Condition, variance: UnitVariance, scatter: RepeatScatter, config: Config
 ) -> Iterator[dict]:
     repeated, force_unit = scatter.df > 0, config.units.unit("force")
     no_repeats = "" if repeated else "no run was repeated: there is no pure error to compare with."

@@ -17,7 +17,7 @@ from scipy.special import fdtrc, stdtrit
 
 from sealfit.errors import FitError
 from sealfit.fit.joint.rows import BOTH_DIRECTIONS, merge_directions
-from sealfit.ingest.scatter import Scatter
+from sealfit.ingest.scatter import RepeatScatter
 from sealfit.ingest.strokes import speed_clusters
 
 # Level of the preliminary test for set-up scatter (Bancroft 1944). A level of 5 % would miss it too often.
@@ -87,7 +87,7 @@ def shifts_of(table: pd.DataFrame) -> list[str]:
     return [name for name in table.columns if str(name).startswith(SHIFT)]
 
 
-def run_weights(runs: pd.DataFrame, scatter: Scatter) -> np.ndarray:
+def run_weights(runs: pd.DataFrame, scatter: RepeatScatter) -> np.ndarray:
     """Return 1/variance of run means, shape (n,), from the pooled scatter of repeats; without repeats 1."""
     if not scatter.df > 0:
         return np.ones(len(runs))
