@@ -4,7 +4,6 @@ import bins_helpers
 import numpy as np
 import numpy.testing as npt
 import pytest
-from scipy.signal import lfilter
 
 from sealfit.closure.left_out import between_speeds
 from sealfit.effects import EFFECTS
@@ -14,7 +13,7 @@ from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
 from sealfit.fit.joint.rows import make_rows, set_speeds, thin
 from sealfit.fit.joint.search import start_model
-from sealfit.fit.joint.variance_components import _design_effect, curve_components
+from sealfit.fit.joint.variance_components import curve_components
 from sealfit.ingest.strokes import speed_clusters
 
 WAVE = Effect(
@@ -487,18 +486,3 @@ def test_a_condition_whose_files_were_all_left_out_has_a_finite_start():
     last = rows.conditions["condition"].iloc[-1]
     rest = rows.subset((rows.table["condition"] != last).to_numpy())
     assert np.isfinite(start_model(rest).theta).all()
-
-
-def test_one_short_stroke_does_not_hide_the_correlation_of_the_others():
-    rng = np.random.default_rng(0)
-    noise = lfilter([1.0], [1.0, -0.8], rng.normal(size=(60, 40)), axis=1)
-    sizes = [40] * 60
-    every = _design_effect(*_strokes(noise.ravel(), sizes))
-    short = _design_effect(*_strokes(np.r_[noise.ravel(), rng.normal(size=4)], [*sizes, 4]))
-    assert every > 3
-    assert short == pytest.approx(every, rel=0.05)
-
-
-def _strokes(values, sizes):
-    code = np.repeat(np.arange(len(sizes)), sizes)
-    return values, code, np.r_[0, np.cumsum(sizes)[:-1]], np.array(sizes)

@@ -364,7 +364,7 @@ def _design_effect(inside: np.ndarray, code: np.ndarray, start: np.ndarray, coun
     scale = np.sqrt(np.maximum(np.add.reduceat(inside**2, start) / count, 1e-300))[code]
     unit = inside / scale
     total, effect = max(float((unit**2).mean()), 1e-300), 1.0
-    for lag in range(1, max(2, int(np.median(count)) // 3)):
+    for lag in range(1, max(2, int(count.min()) // 3)):
         same = code[lag:] == code[:-lag]
         rho = float((unit[lag:] * unit[:-lag])[same].mean()) / total
         if rho < 0.05:
