@@ -134,8 +134,8 @@ def rise_of(start: MotionStart) -> Rise:
     Examples
     --------
     >>> x = np.linspace(0.0, 40.0, 1001)
-    >>> end = rise_of(Start(x, 30.0 * (1.0 - np.exp(-x / 0.5)), 0)).end_mm  # 0.5 mm * ln(50000) = 5.41 mm
-    >>> 5.1 < end < 5.8
+    >>> start = MotionStart(x, 30.0 * (1.0 - np.exp(-x / 0.5)), 0)
+    >>> 5.1 < rise_of(start).end_mm < 5.8  # 0.5 mm * ln(50000) = 5.41 mm
     True
     """
     rise, length = _rise_or_fall(start), float(start.distance_mm[-1])
