@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri, stdtrit
 
 from sealfit.closure import criteria
-from sealfit.closure.channels import Channel, scatter_level
+from sealfit.closure.channels import Channel, scatter_level, too_short
 from sealfit.closure.confirm import about_means
 from sealfit.closure.multiplicity import critical_many, critical_small_sample
 from sealfit.closure.score_test import Candidate, ScoreTests, project
@@ -32,7 +32,7 @@ from sealfit.closure.small_sample_test import (
     moderated,
 )
 from sealfit.fit.joint import Fitted
-from sealfit.fit.joint.rows import LEVELS
+from sealfit.fit.joint.rows import ALONG, LEVELS
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
@@ -73,8 +73,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     in_model = _channels_in_model(selection)
     entries = []
     for name, channel in selection.channels.items():
-        tested = {c.target for c in search.candidates if c.channels[-1] == name}
-        added = name == "direction" or channel.grouping or (tested and FRICTION not in tested)
+        added = name == "direction" or channel.grouping or (name in ALONG and too_short(rows))
         target = ("force", "add") if added else FRICTION
         own = [c for c in search.candidates if (c.channels[-1], c.target) == (name, target) and not c.pair]
         own = sorted(own, key=lambda c: c.columns.shape[1])[:1]  # a straight line
