@@ -166,9 +166,8 @@ def _is_tested(conditions: Mapping[str, object], rows: Rows) -> bool:
     for name, value in conditions.items():
         own = rows.table[name].to_numpy()
         if name in ALONG:
-            same &= value <= np.max(own) + 1e-3 * abs(
-                np.max(own)
-            )  # another place of a stroke is not another run
+            most = np.max(own)  # another place of a stroke is not another run
+            same &= value <= most + 1e-3 * abs(most)
         elif isinstance(value, float) and name != "direction":
             same &= np.isclose(np.abs(own.astype(float)), abs(value), rtol=1e-3)
         else:
