@@ -48,3 +48,11 @@ def test_a_file_without_its_strokes_of_one_way_brings_no_offset_in(campaign):
     found = merge_directions(shifted.drop(index=lone))
     assert set(found["direction"]) == {0}
     assert len(found) == len(table) / 2 - 1
+
+
+def test_files_of_one_way_that_are_as_many_as_those_both_ways_stay(campaign):
+    table = campaign(noise=0.0, days=(0,), together=True)
+    repeat = table["repeat"].min()
+    one_way = table[(table["repeat"] == repeat) | (table["direction"] > 0)]
+    found = merge_directions(one_way)
+    assert set(found["repeat"]) == set(table["repeat"])

@@ -97,7 +97,9 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     merged &= grouped["pace"].transform("max") <= SPEEDS_APART * grouped["pace"].transform("min")
     merged = merged.groupby(run).transform("all")
     # A file that lost its strokes of one direction would bring a zero offset into the fit.
-    kept = merged | ~rows["run_id"].str.rstrip("+-").isin(set(run[merged]))
+    base = rows["run_id"].str.rstrip("+-")
+    both, lone = (part.groupby(base).transform("sum") for part in (merged, ~merged))
+    kept = merged | (2 * lone >= both)
     rows, run, merged = rows[kept], run[kept], merged[kept]
     if not merged.any():
         return rows
