@@ -34,7 +34,7 @@ MOST_PLACES = 60  # Largest number of places of a jump on a grid, or of pairs of
 NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1}
 """Number of mu_s, mu_c, v_s and sigma_2 that the speeds of a series determine, by the form of its curve."""
 
-PHASES = tuple(np.arange(4) * np.pi / 4)
+PHASE_GRID = tuple(np.arange(4) * np.pi / 4)
 """Phases of a ripple that are tried, in rad."""
 
 # Distance from 0, in ranges of the positions, beyond which the phase of a wave is given near the positions.
@@ -237,7 +237,7 @@ def periodic_terms(
     places = rows.values(peak.axis)
     far = peak.common_phase and np.abs(places).min() > FAR * np.ptp(places)
     fixed: dict = {"x_ref": reference(places) if far else 0.0}
-    phases, lengths = PHASES, (peak.wavelength,)
+    phases, lengths = PHASE_GRID, (peak.wavelength,)
     if not peak.common_phase:
         length, error = common_wavelength(samples, peak.wavelength, peak.axis)
         reach = t_quantile(max(rows.groups.starts["file"].size - 1, 2)) * error

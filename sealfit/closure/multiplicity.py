@@ -10,7 +10,7 @@ import numpy as np
 
 from sealfit.closure import small_sample_test
 from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES, UNEQUAL_RUNS
-from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of, score_statistic
+from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of_score, score_statistic
 from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, slope_log_p
 from sealfit.fit.joint import Fitted
 
@@ -113,7 +113,7 @@ def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
             for own in scores:
                 most = np.maximum(most, score_statistic(totals[:, first : first + df], own))
                 first += df
-            least = np.minimum(least, log_p_of(most, df, units))
+            least = np.minimum(least, log_p_of_score(most, df, units))
     return least
 
 

@@ -31,7 +31,7 @@ from sealfit.ingest.derived_columns import with_day_0
 from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # Relative tolerance of the tested range.
-FORCES = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
+FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 NO_INTERVAL = "no interval: as many parameters in the model as runs; test repeats or more speeds"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
@@ -63,7 +63,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     _check_values(table, after, model, notes)
     code = np.where([bool(note) for note in notes], -1, code)
     good = code >= 0
-    answer = np.full((len(table), len(FORCES)), np.nan)
+    answer = np.full((len(table), len(FORCE_COLUMNS)), np.nan)
     if not model["scatter"]["of_specimens"]:
         _note(notes, good, TESTED_ONLY)
     if model["df"] == 0:
@@ -86,7 +86,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         forces = (evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half)
         answer[good] = np.column_stack([*forces, mean - spread, mean + spread])
     return points.reset_index(drop=True).assign(
-        **dict(zip(FORCES, answer.T, strict=True)),
+        **dict(zip(FORCE_COLUMNS, answer.T, strict=True)),
         extrapolated=extrapolated & ~np.isnan(answer[:, 1]),  # of `force_after_N`
         note=["; ".join(note) for note in notes],
     )

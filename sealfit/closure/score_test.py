@@ -240,7 +240,7 @@ class ScoreTests:
         left = (left @ u[:, keep] / np.sqrt(s[keep]))[:, : max(1, units // 5)]
         scores = fitted.rows.groups.sums(left * fitted.unit_residual(level)[:, None], level)
         total = left.T @ fitted.white_residual
-        log_p = float(log_p_of(score_statistic(total[None, :], scores)[0], left.shape[1], units))
+        log_p = float(log_p_of_score(score_statistic(total[None, :], scores)[0], left.shape[1], units))
         jackknife = 0.0
         if units >= criteria.JACKKNIFE_UNITS:
             explained, against_units = _log(chdtrc(left.shape[1], total @ total)), 0.0
@@ -302,7 +302,7 @@ def score_statistic(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
     return ((totals @ inverse) * totals).sum(axis=1)
 
 
-def log_p_of(t: np.ndarray, df: int, units: int) -> np.ndarray:
+def log_p_of_score(t: np.ndarray, df: int, units: int) -> np.ndarray:
     """Return the log p-value of T, from Hotelling's F with as many units; T never exceeds their number."""
     share = np.clip(np.asarray(t) / units, 0.0, 1 - 1e-15)
     return np.log(np.maximum(betainc((units - df) / 2, df / 2, 1 - share), 1e-300))

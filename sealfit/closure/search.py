@@ -42,7 +42,7 @@ from sealfit.closure.criteria import (
 )
 from sealfit.closure.multiplicity import adjust_all
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
-from sealfit.closure.small_sample_test import log_p_of
+from sealfit.closure.small_sample_test import log_p_of_numbers
 from sealfit.effects.sensors import DAY_H, day_and_night
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import Term
@@ -403,7 +403,7 @@ def _joint_test(
         basis = orthonormal(made, LEAST_SINGULAR)
         if basis.shape[1] < 2 or numbers.df - 2 < LEAST_ERROR_DF_OF_RUNS:
             return None
-        joint = log_p_of(numbers.values[None, :], basis, 0.0, numbers.df)[0]
+        joint = log_p_of_numbers(numbers.values[None, :], basis, 0.0, numbers.df)[0]
         given = max(
             _conditional_log_p(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0])
         )
@@ -417,7 +417,7 @@ def _conditional_log_p(values: np.ndarray, one: np.ndarray, other: np.ndarray, d
     """Return log p of a unit column of independent numbers given another unit column, all of shape (d,)."""
     rest = one - (one @ other) * other
     left = values - (values @ other) * other
-    return float(log_p_of(left[None, :], rest[:, None] / np.linalg.norm(rest), 0.0, df - 1)[0])
+    return float(log_p_of_numbers(left[None, :], rest[:, None] / np.linalg.norm(rest), 0.0, df - 1)[0])
 
 
 def _larger_column(white: np.ndarray, groups, level: str) -> np.ndarray:

@@ -371,7 +371,7 @@ class ClusterTests:
         if k == 0 or d == k:
             return None
         chi2 = float(((numbers.values @ basis) ** 2).sum())
-        log_p = float(log_p_of(numbers.values[None, :], basis, numbers.known, d)[0])
+        log_p = float(log_p_of_numbers(numbers.values[None, :], basis, numbers.known, d)[0])
         share = float((columns**2).sum() / max((left**2).sum(), 1e-300))
         return SmallSampleTest(target, basis, numbers.known, chi2, log_p, share, d - k, self.level)
 
@@ -406,7 +406,7 @@ def mean_ratio(squares: np.ndarray, finer: np.ndarray) -> float:
     return float(np.mean(squares[known] / finer[known])) if known.any() else 1.0
 
 
-def log_p_of(values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None) -> np.ndarray:
+def log_p_of_numbers(values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None) -> np.ndarray:
     """Return log p-values of F for rows of d independent numbers, shape (m, d), and columns (d, k) -> (m,).
 
     Both may be padded with zeros to more than d.
@@ -417,7 +417,7 @@ def log_p_of(values: np.ndarray, basis: np.ndarray, known: float, d: int | None 
 def f_of(
     values: np.ndarray, basis: np.ndarray, known: float, d: int | None = None
 ) -> tuple[np.ndarray, int, float]:
-    """Return F, shape (m,), and its two degrees of freedom; arguments as `log_p_of`."""
+    """Return F, shape (m,), and its two degrees of freedom; arguments as `log_p_of_numbers`."""
     d, k = d or basis.shape[0], basis.shape[1]
     explained = ((values @ basis) ** 2).sum(axis=1)
     left = np.maximum((values**2).sum(axis=1) - explained, 1e-300)

@@ -243,7 +243,7 @@ def swapped_columns(entries: list[Entry], columns: Columns) -> list[Fault]:
 # Share by which commanded speeds and loads of one setting differ at most; a plate or a step is more.
 SETTING = 0.005
 # Share by which measured speeds of one commanded speed differ at most; rigs repeat within a few percent.
-SAME_SPEED = 0.05
+SAME_TESTED_SPEED = 0.05
 
 
 def _text(value: float | str) -> str:
@@ -304,7 +304,7 @@ def add_runs(
     stroke = columns.get("stroke", none)
     for words, members in groups.items():
         speeds = np.array([measured[i] for i in members])
-        settings = [[members[k] for k in own] for own in of_one_speed(speeds, SAME_SPEED)]
+        settings = [[members[k] for k in own] for own in of_one_speed(speeds, SAME_TESTED_SPEED)]
         if _there_and_back([[stroke[i] for i in own] for own in settings]):
             settings = [[i for own in settings for i in own]]
         for own in settings:

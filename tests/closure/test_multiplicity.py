@@ -16,9 +16,9 @@ from sealfit.closure.multiplicity import (
     adjust_small_sample,
     critical_many,
 )
-from sealfit.closure.score_test import Candidate, ScoreTestResult, log_p_of, score_statistic
+from sealfit.closure.score_test import Candidate, ScoreTestResult, log_p_of_score, score_statistic
 from sealfit.closure.small_sample_test import ContrastTest, SmallSampleTest, slope_log_p
-from sealfit.closure.small_sample_test import log_p_of as small_sample_log_p
+from sealfit.closure.small_sample_test import log_p_of_numbers as small_sample_log_p
 
 NOWHERE = -1e-9  # log of a p-value of 1
 TARGET = ("mu", "multiply")
@@ -30,7 +30,7 @@ def scored(scores):
     units, df = scores.shape
     t = float(score_statistic(total[None, :], scores)[0])
     return ScoreTestResult(
-        float(total @ total), df, units, float(log_p_of(np.array([t]), df, units)[0]), scores=scores
+        float(total @ total), df, units, float(log_p_of_score(np.array([t]), df, units)[0]), scores=scores
     )
 
 

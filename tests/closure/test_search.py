@@ -15,7 +15,7 @@ from sealfit.closure.channels import (
 )
 from sealfit.closure.forms import room_along, terms_of
 from sealfit.closure.naming import propose
-from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of
+from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of_score
 from sealfit.closure.search import search
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
@@ -141,7 +141,7 @@ def test_hotelling_p_is_students_t_for_one_column():
     # Scores 1..6 all of one sign: T = (sum)^2 / sum of squares = 441/91; t = mean/(sd/sqrt 6).
     scores = np.arange(1.0, 7.0)
     t = stats.ttest_1samp(scores, 0.0)
-    assert np.exp(log_p_of(np.array([441 / 91]), 1, 6)[0]) == pytest.approx(t.pvalue, rel=1e-9)
+    assert np.exp(log_p_of_score(np.array([441 / 91]), 1, 6)[0]) == pytest.approx(t.pvalue, rel=1e-9)
 
 
 def test_p_values_of_nulls_are_not_too_small():

@@ -7,7 +7,7 @@ from sealfit.closure import small_sample_test
 from sealfit.closure.channels import find_channels
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
-from sealfit.closure.small_sample_test import ClusterTests, Root, log_p_of, mean_ratio, small_root
+from sealfit.closure.small_sample_test import ClusterTests, Root, log_p_of_numbers, mean_ratio, small_root
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.tangent import Tangent
@@ -28,7 +28,7 @@ def test_one_column_is_students_t_of_a_slope():
     ]  # 8 numbers free of the mean
     basis = (centred.T @ x)[:, None] / np.linalg.norm(x)
     expected = stats.linregress(x, y).pvalue  # nine points less the mean less the slope: 7 degrees of freedom
-    assert np.exp(log_p_of((centred.T @ y)[None, :], basis, known=0.0)[0]) == pytest.approx(
+    assert np.exp(log_p_of_numbers((centred.T @ y)[None, :], basis, known=0.0)[0]) == pytest.approx(
         expected, rel=1e-9
     )
 
