@@ -49,12 +49,10 @@ class Term:
 
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return the inputs of the effect's shape: channels of the rows, shape (n,), and fixed values."""
-        given = {}
-        for name, channel in zip(self.effect.reads, self.channels, strict=True):
-            values = rows.values(channel)
-            if name in (CHANNEL, SECOND) and channel == "speed_mm_s":
-                values = np.abs(values)  # forms of the speed use its magnitude
-            given[name] = values
+        given = {
+            name: rows.unsigned(channel) if name in (CHANNEL, SECOND) else rows.values(channel)
+            for name, channel in zip(self.effect.reads, self.channels, strict=True)
+        }
         shift = self.fixed.get("shift")
         if shift is not None:  # NaN where the origin of a pass is unknown
             first = self.effect.reads[0]
