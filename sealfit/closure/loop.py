@@ -191,8 +191,8 @@ class _HeldOut:
             return before, after, determined & also, None
         start = StartingFit(selection.before.model, selection.before.scatter)
         rounds = max(a.round for a in selection.added)
-        search = partial(_searched, self.part, self.samples, self.context, start, rounds)
-        parts = run_map(search, [self.rows.subset(out) for out in self.masks], workers=self.workers)
+        repeated = partial(_searched, self.part, self.samples, self.context, start, rounds)
+        parts = run_map(repeated, [self.rows.subset(out) for out in self.masks], workers=self.workers)
         before, after = np.full((2, self.rows.force.size), np.nan)
         determined, models = np.zeros(self.rows.force.size, dtype=bool), []
         for k, (out, part) in enumerate(zip(self.masks, parts, strict=True)):
