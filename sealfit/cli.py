@@ -447,7 +447,3 @@ def _options(workers: int | None, scheduler: str | None, **more: object) -> dict
 def main() -> None:
     """Run the command line and exit with 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
     sys.exit(exit_code(app))
-
-
-if __name__ == "__main__":
-    main()

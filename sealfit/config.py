@@ -232,11 +232,13 @@ class TraceFormat(Strict):
 
 def _glob(pattern: str | None) -> str | None:
     """Raise ValueError for a pattern that pathlib refuses."""
-    parts = PurePosixPath(pattern or "*").parts
+    parts = PurePosixPath("*" if pattern is None else pattern).parts
     if not parts or any("**" in part and part != "**" for part in parts):
         raise ValueError('a pattern for paths is needed, in which "**" stands alone: "traces/**/*.csv"')
     if parts.count("**") > 3:  # each of them walks through all folders again
         raise ValueError('"**" stands for any number of folders, and three times are enough')
+    if parts[0] == "/" or ".." in parts:
+        raise ValueError("leads outside the campaign folder. Make it relative")
     return pattern
 
 

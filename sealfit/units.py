@@ -84,12 +84,14 @@ class Units:
             slot = column.partition("_")[0]
             return f"{self.quantity(slot)} ({self.unit(slot)})"
         unit = self.of(column)
-        ending = next((e for e in ("_mm_s", *_ENDINGS) if column.endswith(e)), "") if unit else ""
+        ending = next((e for e in _ENDINGS if column.endswith(e)), "") if unit else ""
         words = _MEANING.get(column, column.removesuffix(ending)).replace("_", " ")
         return f"{words} ({unit})" if unit else words
 
 
 _ENDINGS = {
+    "_mm_s": "mm/s",
+    "_m_s": "m/s",
     "_C": "°C",
     "_pct": "%",
     "_days": "d",

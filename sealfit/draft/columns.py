@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -215,6 +216,9 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[TraceColu
         if below not in (None, unit) and (unit is None or below.name != "1"):  # Druck A is not in amperes
             base, unit = label, below
         role, sure = column_role(base)
+        symbol = unit is not below and unit is not None and re.search(r"\s[A-Za-z]{1,2}$", label)
+        if symbol and unit.dimension in ("time", "length") and unit.dimension not in DIMENSION.get(role, ()):
+            unit = None  # Weg s, Kraft Ft: letters for the quantity
         if role == "torque":
             role = "force"
         by_name = bool(label) and dialect.names.count(label) == 1 and dialect.names_are_cells

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sealfit.draft.dialect import When
-from sealfit.units import Unit, Units
+from sealfit.units import Unit, Units, unit_of
 
 WIDTH = 110  # characters of a comment's line
 
@@ -66,7 +66,12 @@ class Notes:
 
 def file_column(name: str | int, unit: Unit | None, ours: str) -> Value:
     """Return a column of a file as a config writes it: with its unit where that is not the unit of `ours`."""
-    return name if unit is None or unit.name == Units().of(ours) else {"name": name, "unit": unit.name}
+    return name if is_own_unit(unit, ours) else {"name": name, "unit": unit.name}
+
+
+def is_own_unit(unit: Unit | None, ours: str) -> bool:
+    """Return whether a unit is that of our column, or not known."""
+    return unit is None or unit == unit_of(Units().of(ours))
 
 
 def date_lines(when: When) -> list[str]:

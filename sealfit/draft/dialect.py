@@ -288,7 +288,11 @@ def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Settin
             ours, pattern = "specimen_id", _after(match["key"], r'([^\s;,"][^;,\t"]*)')
         elif is_word or (number and as_number(number.group(), decimal or ".") is not None):
             pattern = _after(match["key"], rf"({_SIZE})")
-            unit = unit or (unit_of(value[number.end() :].strip(' ;,\t"')) if number else None)
+            words = _found(_after(match["key"], rf"{_SIZE}([^;,\t\"]*)"), headers)
+            said = {_unit_at_start(text, ours) for text in words if text.strip()}
+            if len(said) > 1:  # 24 h in one file, 7 d in another: one config cannot say it
+                continue
+            unit = unit or (said.pop() if said else None)
         else:
             continue
         values = tuple(_found(pattern, headers))
@@ -297,6 +301,12 @@ def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Settin
             values = tuple(_found(pattern, headers))
         if "" not in values:
             yield Setting(ours, name, pattern, unit, values, line, text.strip())
+
+
+def _unit_at_start(text: str, ours: str) -> Unit | None:
+    """Return the unit of a text, or that of its first word if it is one of the setting: `h at 70 °C`."""
+    first = unit_of(text.split()[0])
+    return unit_of(text) or (first if first and first.dimension == SETTINGS.get(ours) else None)
 
 
 def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]:
@@ -324,10 +334,11 @@ def rate_in(headers: Sequence[Sequence[str]], decimal: str) -> tuple[float | str
         if not value or value < 0:
             continue
         differ = len(set(one.values)) > 1
-        if _RATE.search(words):
+        step = one.unit is not None and one.unit.dimension == "time"  # a rate in ms is a step
+        if _RATE.search(words) and not step:
             scale = 1000.0 if one.unit is not None and one.unit.name == "kHz" else 1.0
             return f"{scale:g} * {RATE}" if differ else value * scale, one.text, one.pattern
-        if _STEP.search(words) and (one.unit is None or one.unit.dimension == "time"):
+        if (_RATE.search(words) and step) or (_STEP.search(words) and (step or one.unit is None)):
             scale = conversion(one.unit.name if one.unit else "s", "s")(1.0)
             rate = f"1 / ({scale:g} * {RATE})" if differ else float(f"{1 / (scale * value):.9g}")
             return rate, one.text, one.pattern

@@ -183,14 +183,14 @@ def settings_of(names: Names) -> Files:
     for part in names.parts:
         if part.ours in ("", "started_at"):
             continue
-        if any(mark in text for text in part.texts for mark in ",p") and part.ours != "rubber":
-            values[part.group] = {text: as_float(text) for text in part.texts if text[:1] in "-0123456789"}
+        numbers = [text for text in part.texts if re.match(r"-?\d", text)]
+        if any(mark in text for text in numbers for mark in ",p"):
+            values[part.group] = {text: as_float(text) for text in numbers}
         replaced = middle is not None and middle[0] <= part.at < middle[1]
         if replaced and (part.ours == "aging_days" or part.expression):
             values.setdefault(part.group, {})[""] = 0.0
         if part.ours == "direction":
-            signs = {text: DIRECTIONS.get(text.lower(), -1 if text else 1) for text in part.texts}
-            values[part.group] = {text: float(sign) for text, sign in (part.signs or signs).items()}
+            values[part.group] = dict(part.signs)
         elif part.expression:
             compute[part.ours] = part.expression.format(part.group)
     columns = _templates(names, pattern)
@@ -267,7 +267,8 @@ def _word(at: int, texts: tuple[str, ...]) -> NamePart | None:
     if len(texts) <= FEW:
         pattern = "|".join(sorted(map(re.escape, texts), key=len, reverse=True))
     if low <= DIRECTIONS.keys():
-        return NamePart(at, "direction", pattern, texts, "a word for the direction")
+        signs = {text: DIRECTIONS[text.lower()] for text in texts}
+        return NamePart(at, "direction", pattern, texts, "a word for the direction", signs=signs)
     if low <= RUBBERS:
         return NamePart(at, "rubber", pattern, texts, "the short name of a rubber")
     doubt = "what this word stands for is not known; it is kept as a label"
@@ -434,5 +435,6 @@ def _with_sign(parts: Sequence[NamePart], sign: tuple[int, str]) -> list[NamePar
     at, text = sign
     why = f"'{text}' stands before the number in some names"
     doubt = f"'{text}' is taken for the other direction"
-    pattern = f"(?:{re.escape(text)})?"
-    return [*parts, NamePart(at, "direction", pattern, ("", text), why, doubt=doubt)]
+    pattern, direction = f"(?:{re.escape(text)})?", DIRECTIONS.get(text.lower(), -1.0)
+    signs = {"": -direction, text: direction}
+    return [*parts, NamePart(at, "direction", pattern, ("", text), why, doubt=doubt, signs=signs)]

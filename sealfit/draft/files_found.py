@@ -14,12 +14,13 @@ from sealfit.config import AGING_CONDITION, Config, TraceFormat
 from sealfit.draft.dialect import MIN_ROWS, SETTINGS, STRAYS, Dialect, sniff
 from sealfit.draft.file_names import shape_of, tokens
 from sealfit.draft.vocabulary import UNAGED, name_and_unit, setting
-from sealfit.errors import BadFile, CampaignError, RequestError
+from sealfit.errors import BadFile, CampaignError, RequestError, did_you_mean
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
-from sealfit.ingest.listing import RUNS_CSV, natural, read_table
+from sealfit.ingest.listing import RUNS_CSV, is_utf8, natural, read_table
 from sealfit.ingest.runs import time_of
 from sealfit.ingest.workbooks import LONGEST, read_sheet
+from sealfit.store.manifest import STATE
 from sealfit.units import Unit
 
 SNIFFED = 24  # files of one kind of name that are looked at, spread evenly: more would show the same
@@ -81,8 +82,12 @@ def look(folder: Path) -> Found:
     """
     if not folder.is_dir():
         reason = "is a file, not a folder." if folder.is_file() else "there is no such folder."
-        raise RequestError(reason, file=folder, fix="Give the folder that holds the trace files.")
+        fix = did_you_mean(folder) or "Give the folder that holds the trace files."
+        raise RequestError(reason, file=folder, fix=fix)
     files = _files(folder)
+    if odd := [file for file in files if not is_utf8(file)]:
+        reason = f"the names of {len(odd)} files are not UTF-8, such as {os.fsencode(odd[0])!r}."
+        raise RequestError(reason, file=folder, fix="Rename them.")
     formats = Counter(suffix for file in files if (suffix := PurePosixPath(file).suffix.lower()) in FORMATS)
     texts = [file for file in files if _may_be_trace(file)]
     dialects, unreadable = _sniffed(folder, texts)
@@ -108,7 +113,8 @@ def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]
 def _files(folder: Path) -> list[str]:
     found = []
     for root, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith((".", "__"))]
+        results = [name for name in folders if (Path(root) / name / STATE).is_file()]
+        folders[:] = [name for name in folders if not name.startswith((".", "__")) and name not in results]
         below = Path(root).relative_to(folder)
         found += [(below / name).as_posix() for name in names if not name.startswith((".", "~"))]
     return sorted(found, key=natural)
@@ -237,7 +243,8 @@ def _no_traces(
 def read_tables(found: Found) -> dict[str, np.ndarray]:
     """Return the numbers of some traces, shape (rows, width) each, nan where there are none."""
     tables = {}
-    for file in evenly(list(found.dialects), READ):
+    whole = [file for file, one in found.dialects.items() if {*found.dialect.numbers} <= {*one.numbers}]
+    for file in evenly(whole, READ):
         dialect = found.dialects[file]
         lines = text_of(found.folder, file).split("\n")
         table = _numbers(lines[len(dialect.header) :], found.dialect)
@@ -307,7 +314,7 @@ def _names_files(column: Sequence[str], traces: Sequence[str]) -> int:
     paths = [PurePosixPath(file) for file in traces]
     known = {*traces, *(path.with_suffix("").as_posix() for path in paths)}
     known |= {path.name for path in paths} | {path.stem for path in paths}
-    return sum(cell.replace("\\", "/") in known for cell in column if cell)
+    return len({cell.replace("\\", "/") for cell in column if cell} & known)
 
 
 def _meanings(file_column: str, cells: Mapping[str, Sequence[str]]) -> tuple[dict[str, str], dict[str, Unit]]:
@@ -317,7 +324,7 @@ def _meanings(file_column: str, cells: Mapping[str, Sequence[str]]) -> tuple[dic
     for name in [*exact, *cells]:
         base, unit = name_and_unit(name)
         meaning = setting(base) or setting(name)
-        if unit is not None and unit.dimension != SETTINGS.get(meaning, unit.dimension):
+        if unit is not None and unit.dimension != SETTINGS.get(meaning):
             meaning = ""  # an oven's temperature is no time, whatever word stands beside it
         if not meaning and unit is not None and unit.dimension == "speed":
             meaning = "speed_mm_s"

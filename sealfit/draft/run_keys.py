@@ -85,10 +85,14 @@ def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Name
     """Return the names with the unit of their speed, or the number that is the speed, by what is measured."""
     said = values_by_file(names, speeds)
     if "speed_mm_s" in names.given:
-        ratio = _ratio({f: v.get("speed_mm_s") for f, v in said.items()}, speeds)
-        if ratio is None or abs(ratio - 1) <= AGREES:
-            return names
-        return _speed_in_unit(names, ratio, notes)
+        named = {f: v.get("speed_mm_s") for f, v in said.items()}
+        ratio = _ratio(named, speeds)
+        if ratio is not None and abs(ratio - 1) > AGREES:
+            return _speed_in_unit(names, ratio, notes)
+        if ratio is None and (other := _disagreement(named, speeds)):
+            fix = "Check the units of time and displacement, and whether this number is a speed."
+            notes.doubt("files.name_pattern", other, fix)
+        return names
     for part in names.parts:
         if part.ours.startswith("part_") and len(part.texts) > 1:
             ratio = _ratio({f: v.get(part.ours) for f, v in said.items()}, speeds)
@@ -107,6 +111,15 @@ def _ratio(said: Mapping[str, object], measured: Mapping[str, float]) -> float |
     middle = ratios[len(ratios) // 2]
     agree = sum(abs(ratio / middle - 1) <= AGREES for ratio in ratios)
     return middle if agree >= MOSTLY * len(ratios) else None
+
+
+def _disagreement(said: Mapping[str, object], measured: Mapping[str, float]) -> str:
+    """Return the first file whose named speed is not that measured; "" if there is none."""
+    for file, speed in said.items():
+        found = abs(measured.get(file, 0.0))
+        if isinstance(speed, int | float) and found and abs(abs(speed) / found - 1) > AGREES:
+            return f"the speed in the name of {file} is {abs(speed):g}, and {found:.3g} mm/s is measured."
+    return ""
 
 
 def _speed_in_unit(names: Names, ratio: float, notes: Notes) -> Names:
@@ -229,7 +242,8 @@ def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:
     columns = ", ".join(one.names[:4]) or "without names"
     form = f"separator '{one.delimiter}', decimal '{one.decimal or '.'}', columns {columns}"
     fix = "Move them to a folder of their own and draft a config for them, too."
-    reason = f"{len(others)} files are written otherwise ({form}): {shown}."
+    count = "1 file is" if len(others) == 1 else f"{len(others)} files are"
+    reason = f"{count} written otherwise ({form}): {shown}."
     notes.doubt("files", reason, f"One config reads files of one form. {fix}")
 
 
@@ -270,7 +284,7 @@ def glob_of(files: Sequence[str]) -> str:
 
 def _excluded(surplus: set[str], matched: set[str]) -> list[str]:
     """Return globs of files: of whole folders where nothing else lies there."""
-    kept = {PurePosixPath(file).parent.as_posix() for file in matched - surplus}
+    kept = {folder.as_posix() for file in matched - surplus for folder in PurePosixPath(file).parents}
     globs = []
     for file in sorted(surplus, key=natural):
         folder = PurePosixPath(file).parent.as_posix()
@@ -324,7 +338,7 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
             notes.guess("files.started_at", {"date": theirs, "time": clock}, evidence)
             continue
         value = file_column(theirs, table.units.get(theirs), ours)
-        if ours == "compression_ratio_pct" and _compressed(theirs, table, notes):
+        if ours == "compression_ratio_pct" and compressed(table.cells[theirs], theirs, notes):
             ours = "_compressed_pct"
         if value != ours:
             cell = next((cell for cell in table.cells[theirs] if cell), "")
@@ -343,10 +357,9 @@ def _table_keys(table: RunsTable, notes: Notes) -> None:
         notes.doubt("files.runs_columns", reason, fix)
 
 
-def _compressed(theirs: str, table: RunsTable, notes: Notes) -> bool:
-    """Whether a column says how much the rubber was compressed; the height that is left is then computed."""
-    cells = [cell for cell in table.cells[theirs] if cell]
-    numbers = [number for cell in cells if (number := as_number(cell)) is not None]
+def compressed(cells: Sequence[str], theirs: str, notes: Notes) -> bool:
+    """Whether cells say how much the rubber was compressed; the height that is left is then computed."""
+    numbers = [number for cell in cells if cell and (number := as_number(cell)) is not None]
     if not numbers or max(numbers) >= HEIGHT_FROM:
         return False
     fix = "If it is the height that was left, name it compression_ratio_pct, and delete this line."

@@ -17,16 +17,17 @@ from sealfit.draft.columns import (
     rises,
     stroke_count,
 )
-from sealfit.draft.config_text import Notes, date_lines, file_column
+from sealfit.draft.config_text import Notes, date_lines, file_column, is_own_unit
 from sealfit.draft.dialect import RATE, STRAYS, rate_in, settings_in, started_in
 from sealfit.draft.files_found import Found
+from sealfit.draft.run_keys import compressed
 from sealfit.draft.vocabulary import name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of
 from sealfit.ingest.strokes import several_speeds
 from sealfit.ingest.workbooks import rows_of_sheets
-from sealfit.units import UNITS, Unit, Units, conversion
+from sealfit.units import UNITS, Unit, conversion
 
 # A trace without a time unit is not taken to last longer than an hour at a sample per second or slower.
 LONG_S = 3600.0
@@ -43,6 +44,7 @@ CHANNELS = ("temperature", "humidity", "pressure")
 
 def _footer_key(footers: Sequence[Sequence[str]], sniffed: int, notes: Notes) -> None:
     """Add how the first line below the data begins, if it does so in words in all files that have one."""
+    footers = [footer for footer in footers if footer[0].strip(" \t,;")]
     if not footers:
         return
     what = f"{len(footers)} of {sniffed} files end in lines that are no data, such as '{footers[0][0][:60]}'"
@@ -371,12 +373,14 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
     settings = [one for one in settings_in(headers, found.dialect.decimal) if one.ours not in given]
     for one in settings:
         evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
-        notes.guess(f"trace.header_fields.{one.ours}", one.pattern, evidence)
+        pressed = one.ours == "compression_ratio_pct" and compressed(one.values, one.name, notes)
+        ours = "_compressed_pct" if pressed else one.ours
+        notes.guess(f"trace.header_fields.{ours}", one.pattern, evidence)
         if one.ours == "specimen_id" and len(set(one.values)) == len(one.values):
             reason = f"every file looked at has a specimen of its own: {_shown(one.text)}."
             fix = "If that counts the tests, delete this line."
             notes.doubt("trace.header_fields.specimen_id", reason, fix)
-        if one.unit is not None and one.unit.name != Units().of(one.ours):
+        if not is_own_unit(one.unit, one.ours):
             notes.guess(f"files.units.{one.ours}", one.unit.name, f"the unit in header line {one.line}")
     return [one.ours for one in settings]
 

@@ -176,9 +176,11 @@ RUBBERS = {
     "ptfe",
 }  # fmt: skip
 DIRECTIONS = {
-    **dict.fromkeys(("fwd", "forward", "vor", "vorwaerts", "vorwärts", "hin", "pos", "up", "push", "cw"), 1),
-    **dict.fromkeys(("bwd", "rev", "back", "backward", "her", "neg", "down", "pull", "ccw"), -1),
-    **dict.fromkeys(("zurueck", "zurück", "rueck", "rück", "rueckwaerts", "rückwärts"), -1),
+    **dict.fromkeys(
+        ("fwd", "forward", "vor", "vorwaerts", "vorwärts", "hin", "pos", "up", "push", "cw"), 1.0
+    ),
+    **dict.fromkeys(("bwd", "rev", "back", "backward", "her", "neg", "down", "pull", "ccw"), -1.0),
+    **dict.fromkeys(("zurueck", "zurück", "rueck", "rück", "rueckwaerts", "rückwärts"), -1.0),
 }
 
 

@@ -155,7 +155,10 @@ def listed(rows: np.ndarray, make: Callable[[int], Fault], check: str, more: str
 
 def body_of(text: bytes, layout: FileLayout, settings: TraceFormat) -> bytes:
     """Return the data lines of a file, without line ends after the last one; BadFile if it has none."""
-    body = text[layout.start :].rstrip(b"\n \t" if settings.delimiter == "whitespace" else b"\n")
+    body = text[layout.start :]
+    last = len(body.rstrip(b"\n \t,;"))  # spreadsheets write separators for rows that are empty
+    body = body[:last] + body[last:].partition(b"\n")[0]
+    body = body.rstrip(b" \t") if settings.delimiter == "whitespace" else body
     if not body.strip(b"\n \t,;"):
         reason = "has a header but no data." if len(layout.names) > 1 else "holds no table of numbers."
         raise bad_file("no_rows", reason, "Export it again.")
@@ -163,8 +166,9 @@ def body_of(text: bytes, layout: FileLayout, settings: TraceFormat) -> bytes:
 
 
 def width_of(body: bytes, delimiter: str) -> int:
-    """Return how many cells the first line has."""
-    first = body.partition(b"\n")[0]
+    """Return how many cells the first line that is not blank has."""
+    blank = len(body) - len(body.lstrip(b"\n \t"))
+    first = body[body.rfind(b"\n", 0, blank) + 1 :].partition(b"\n")[0]
     return len(split_line(first.decode("utf-8", "replace"), delimiter))
 
 
@@ -251,9 +255,15 @@ def _fast(
     body: bytes, rows: int, layout: FileLayout, settings: TraceFormat, numeric: Sequence[int]
 ) -> dict[int, np.ndarray] | None:
     """Return the columns as Arrow reads them; None where a cell, a line or the delimiter is beyond it."""
-    table = _arrow(body, settings, numeric)
+    types = dict.fromkeys(numeric, pa.float64())
+    table = _arrow(body, settings, types)
     if table is None or table.num_rows != rows:  # blank lines, or line ends inside quotes
         return None
+    written = [
+        i for i, kind in enumerate(table.schema.types) if not (_numeric(kind) or pa.types.is_string(kind))
+    ]
+    if written:  # TRUE, a date or 08:30, which Arrow would write in another way
+        table = _arrow(body, settings, types | dict.fromkeys(written, pa.string()))
     columns = {i: _column(column) for i, column in enumerate(table.columns)}
     for i in range(len(layout.names), len(columns)) if layout.names else ():
         beyond = columns.pop(i)
@@ -263,14 +273,14 @@ def _fast(
     return columns if all(np.isfinite(columns[i]).all() for i in numeric) else None
 
 
-def _arrow(body: bytes, settings: TraceFormat, numeric: Sequence[int]) -> pa.Table | None:
-    """Return the table that Arrow reads; None where a cell, a line or the delimiter is beyond it."""
+def _arrow(body: bytes, settings: TraceFormat, types: Mapping[int, pa.DataType]) -> pa.Table | None:
+    """Return the table that Arrow reads, with the types of some columns given; None where it cannot read."""
     delimiter = settings.delimiter
     if delimiter == "whitespace":
         body, delimiter = re.sub(rb"(?m)^\t|\t$", b"", re.sub(rb"[ \t]+", b"\t", body)), "tab"
     mark = "\t" if delimiter == "tab" else delimiter
     width = width_of(body, delimiter)
-    if width <= max(numeric, default=0) or len(mark.encode()) != 1:
+    if width <= max(types, default=0) or len(mark.encode()) != 1:
         return None
     names = [str(i) for i in range(width)]
     try:
@@ -281,18 +291,21 @@ def _arrow(body: bytes, settings: TraceFormat, numeric: Sequence[int]) -> pa.Tab
             ),
             parse_options=pacsv.ParseOptions(delimiter=mark),
             convert_options=pacsv.ConvertOptions(
-                decimal_point=settings.decimal, column_types={str(i): pa.float64() for i in numeric}
+                decimal_point=settings.decimal, column_types={names[i]: kind for i, kind in types.items()}
             ),
         )
     except pa.ArrowInvalid:
         return None
 
 
+def _numeric(kind: pa.DataType) -> bool:
+    return pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_null(kind)
+
+
 def _column(column: pa.ChunkedArray) -> np.ndarray:
-    if pa.types.is_floating(column.type) or pa.types.is_integer(column.type) or pa.types.is_null(column.type):
+    if _numeric(column.type):
         return column.cast(pa.float64(), safe=False).to_numpy()  # a whole number beyond 2**53 is rounded
-    cells = column.cast(pa.string()).to_pylist()
-    return np.array([(cell or "").strip() or None for cell in cells], dtype=object)
+    return np.array(column.cast(pa.string()).to_pylist(), dtype=object)
 
 
 def seconds_of_day(cells: Sequence[str | None]) -> np.ndarray | None:
@@ -312,7 +325,9 @@ def seconds_of_day(cells: Sequence[str | None]) -> np.ndarray | None:
         return None
     seconds = np.array([np.nan if match is None else _since_midnight(*match.groups()) for match in found])
     known = np.flatnonzero(np.isfinite(seconds))
-    seconds[known] += _DAY_S * np.r_[0, np.cumsum(np.diff(seconds[known]) < -0.5 * _DAY_S)]
+    step = np.diff(seconds[known]) / _DAY_S
+    midnight = (step < -0.5) & ~(np.append(step[1:], 0.0) > 0.5)  # not if it is back at once: one wrong time
+    seconds[known] += _DAY_S * np.r_[0, np.cumsum(midnight)]
     return seconds - seconds[known[0]]
 
 

@@ -13,7 +13,7 @@ from sealfit.config import Config, TraceFormat
 from sealfit.errors import KEPT, NOTED, BadFile, Fault, SealfitError, nearest, shortened
 from sealfit.ingest.cells import OVERLOAD, Trace, cell_faults, listed, numbers_of
 from sealfit.ingest.expression import parse
-from sealfit.ingest.files import FileLayout, bad_file, split_line
+from sealfit.ingest.files import FileLayout, as_number, bad_file, split_line
 from sealfit.tables import BINS, RUNS
 from sealfit.units import Units, other_unit
 
@@ -140,7 +140,7 @@ def keys_of(
         others = [own for name, own in words.items() if name != "aging_days"]
         series = _joined(others, rows) if others else [ALL] * rows
         unaged = _joined([[UNAGED] * rows, *([rubber] if config.rubber else [])], rows)
-        aged = [days not in ("0", "-0") for days in texts["aging_days"]]
+        aged = [days != "0" for days in texts["aging_days"]]
         condition, series = (
             [own if old else new for own, new, old in zip(known, unaged, aged, strict=True)]
             for known in (condition, series)
@@ -149,14 +149,13 @@ def keys_of(
 
 
 def _spell(value: object) -> str | None:
-    """Return a value as text: numbers with %g, so 60, 60.0 and "60" are one condition; null as None."""
+    """Return a value as text: 60, 60.0 and "60" are one condition; null as None."""
     if pd.isna(value):
         return None
-    try:
-        return f"{float(value):g}"  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        text = str(value).strip()
-        return text or None
+    number = as_number(str(value))
+    if number is None:
+        return str(value).strip() or None
+    return str(int(number)) if number.is_integer() and abs(number) < 2**53 else f"{number:g}"
 
 
 def _joined(parts: Iterable[Sequence[str | None]], rows: int) -> list[str | None]:
@@ -175,7 +174,7 @@ def numeric_names(settings: TraceFormat) -> set[str]:
     texts = [parse(text) for text in settings.compute.values()]
     if settings.keep is not None:
         texts.append(parse(settings.keep, condition=True))
-    names = set(SLOTS).union(*(text.names for text in texts))
+    names = set(SLOTS).union(*(text.numbers for text in texts))
     return names | {settings.integrate_displacement} if settings.integrate_displacement else names
 
 
@@ -338,6 +337,7 @@ def channel_columns(rows: Trace, config: Config) -> Trace:
     are faults; where most cells are empty, the rest are remarks, and each is named.
     """
     kept, drop, faults, good = dict(rows.columns), np.zeros(len(rows.line), bool), [], ~rows.bad
+    said = {fault.column for fault in rows.faults}
     for name, values in rows.columns.items():
         if name in SLOTS:
             continue
@@ -355,7 +355,8 @@ def channel_columns(rows: Trace, config: Config) -> Trace:
         missing = good & ~(np.abs(numbers) < OVERLOAD)
         share = missing.sum() / max(good.sum(), 1)
         if share == 1:
-            faults.append(_left_out(name, "the column is empty", "", NOTED))
+            if name not in said:
+                faults.append(_left_out(name, "the column is empty", "", NOTED))
             del kept[name]
         elif share > config.quality.max_bad_rows:
             reason = f"{missing.sum()} of {good.sum()} cells hold no number"

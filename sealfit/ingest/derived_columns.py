@@ -19,7 +19,7 @@ from sealfit.ingest.columns import (
     Columns,
     known,
     mapped,
-    over,
+    overlaid,
     put,
     where,
 )
@@ -74,10 +74,15 @@ def _means_unaged(cell: float | str) -> bool:
     return isinstance(cell, str) and cell.strip().lower() in UNAGED_WORDS
 
 
-def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
-    """Return the columns with the config's constants and computed columns, and faults of the computed ones.
+def with_constants(columns: Columns, rows: int, config: Config) -> Columns:
+    """Return the columns with the config's constants where a file has no value."""
+    return overlaid({name: [value] * rows for name, value in config.runs.constants.items()}, columns)
 
-    A constant stands where a file has no value. Helpers, columns whose name begins with "_", are left out.
+
+def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
+    """Return the columns with the config's computed columns, and faults of these.
+
+    Helpers, columns whose name begins with "_", are left out.
     CampaignError if an expression reads a column that is not there, or words as numbers.
     """
 
@@ -86,8 +91,6 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
         return np.array([none if value is None else value for value in column])
 
     columns, faults = dict(columns), []
-    for name, value in config.runs.constants.items():
-        columns[name] = over(columns.get(name, [None] * len(entries)), [value] * len(entries))
     for name, text in config.runs.compute.items():
         expression = parse(text)
         read = {column: columns[column] for column in expression.names if column in columns}
@@ -247,7 +250,7 @@ SAME_TESTED_SPEED = 0.05
 
 
 def _text(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
+    return value if isinstance(value, str) else f"{value:.12g}"
 
 
 def as_set(columns: Columns) -> Columns:
@@ -379,13 +382,13 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
             faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], fix=fix))
         for name, column in told.items():
             mine, theirs = column[i], column[j]
-            if mine != theirs and not _same(mine, theirs):
+            if mine != theirs:
                 there = "none" if theirs is None else _text(theirs)
                 reason = f"differs from the other repeats of run '{run[i]}', {_place(entries[j])}: {there}."
                 fix = "One run is one condition, speed and load: give it another run_id, or correct the cell."
                 value = "none" if mine is None else mine
                 faults.append(entry.fault("run_disagrees", reason, name, value=value, fix=fix))
-        if specimen[i] != specimen[j] and _same(told["speed_mm_s"][i], told["speed_mm_s"][j]):
+        if specimen[i] != specimen[j] and told["speed_mm_s"][i] == told["speed_mm_s"][j]:
             scatter = "their scatter counts as that of repeats"
             reason = f"run '{run[i]}' has repeats on several specimens; {scatter}."
             about = {"value": specimen[i], "fix": "Give each specimen a run_id of its own.", **KEPT}
@@ -395,9 +398,3 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
 
 def _place(entry: Entry) -> str:
     return f"line {entry.line}" if entry.line is not None else entry.file
-
-
-def _same(a: float | str | None, b: float | str | None) -> bool:
-    if isinstance(a, int | float) and isinstance(b, int | float):
-        return math.isclose(a, b, rel_tol=1e-9)
-    return a == b

@@ -169,7 +169,7 @@ class _Checked:
             ) if not name.startswith("__"):
                 self.names.add(name)
                 compared = _OPERATORS[type(op)]
-                return lambda values: compared(np.asarray(values[name]).astype(str), label).astype(float)
+                return lambda values: compared(_as_text(values[name]), label).astype(float)
         function, parts = self.operation(node)
         inner = [self.number(part, depth + 1) for part in parts]
         return lambda values: np.asarray(function(*(part(values) for part in inner)), float)
@@ -219,6 +219,11 @@ def _as_number(value: object, name: str, text: str) -> np.ndarray:
         fix += "numbers under [files.values]; run_id, specimen_id and started_at stay text."
         raise ConfigError(f"in {text!r}: '{name}' is text, not a number.", column=name, fix=fix)
     return array.astype(float, copy=False)
+
+
+def _as_text(value: object) -> np.ndarray:
+    array = np.asarray(value)
+    return np.char.mod("%.12g", array) if array.dtype.kind in "fiu" else array.astype(str)
 
 
 def _day(date: object) -> float:

@@ -13,7 +13,7 @@ from sealfit.config import Files
 from sealfit.errors import ConfigError, shortened
 from sealfit.ingest.columns import Columns, taken
 from sealfit.ingest.expression import evaluate, parse
-from sealfit.ingest.files import as_number, found_by
+from sealfit.ingest.files import TEXT_COLUMNS, as_number, found_by
 from sealfit.units import Conversion
 
 # ---------------------------------------------------------------- refs
@@ -67,7 +67,6 @@ class Listing(Sequence[TraceRef]):
 # ---------------------------------------------------------------- names
 # What the name of a trace file says: named parts of a pattern, value maps, templates and computed columns.
 
-TEXT_COLUMNS = ("run_id", "specimen_id", "started_at")  # "007" is a name here, not the number 7
 _FIELD = re.compile(r"\{([^{}]*)\}")
 
 

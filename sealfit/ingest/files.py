@@ -135,6 +135,8 @@ def in_file(file: str) -> Iterator[None]:
 
 # ---------------------------------------------------------------- text
 
+TEXT_COLUMNS = ("run_id", "specimen_id", "started_at")  # "007" is a name here, not the number 7
+
 HEAD_BYTES = 65_536  # a header longer than this is no header
 _BOMS = (  # UTF-32 first: its mark begins with that of UTF-16
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -180,8 +182,9 @@ class FileLayout:
 def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
     """Return the text as UTF-8 bytes without byte-order mark, lines ended by a single line feed.
 
-    `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then tries UTF-8, then takes
-    Latin-1. BadFile if the bytes are not text in that encoding, or begin as files of other formats do.
+    `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then takes UTF-8, and bytes that
+    are not UTF-8 as Latin-1. BadFile if the bytes are not text in that encoding, or begin as files of other
+    formats do.
     """
     _refuse_packed(raw)
     automatic = encoding == "auto"
@@ -200,8 +203,9 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
                 reason, line = f"is not {encoding}: {why}.", raw[: start or 0].count(b"\n") + 1
                 fix = "Export it again." if automatic else 'Set encoding = "auto".'
                 raise bad_file("wrong_encoding", reason, fix, line=line) from error
-            text = raw.decode("latin-1")  # UTF-8 was guessed
+            text = raw.decode("utf-8", "as_latin_1")  # UTF-8 was guessed
         raw = text.encode("utf-8", "replace").removeprefix(codecs.BOM_UTF8)
+    raw = raw.rstrip(b"\x1a")  # DOS's end of a file
     if raw.translate(None, _CONTROL) != raw:
         place = next(i for i, byte in enumerate(raw) if byte in _CONTROL)
         line = raw[:place].count(b"\n") + 1
@@ -210,6 +214,13 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
     if b"\r" in raw:
         raw = raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return raw
+
+
+def _latin_1(error: UnicodeError) -> tuple[str, int]:
+    return error.object[error.start : error.end].decode("latin-1"), error.end
+
+
+codecs.register_error("as_latin_1", _latin_1)
 
 
 def _refuse_packed(raw: bytes) -> None:
@@ -236,12 +247,14 @@ def find_layout(text: bytes, settings: TraceFormat) -> FileLayout:
     count = _header_lines(lines, settings)
     parts = text.split(b"\n", count)
     start = len(text) - len(parts[count]) if len(parts) > count else len(text)
-    header = tuple(lines[:count])
+    header = tuple(part.decode("utf-8", "ignore") for part in parts[:count])
     if settings.names == "none":
         return FileLayout(header, (), None, start, count + 1)
     back = settings.names_line or (2 if settings.units_row else 1)
-    if back > count:
-        reason = f"has a header of {count} lines, and its names should stand {back} lines before the data."
+    if back > len(header):
+        reason = (
+            f"has a header of {len(header)} lines, and its names should stand {back} lines before the data."
+        )
         fix = "Check header_lines and names_line in the rig config."
         raise bad_file("header_not_found", reason, fix)
     cells = split_line(without_strays(header[-back], settings), settings.delimiter)
@@ -290,7 +303,8 @@ def header_fields(header: tuple[str, ...], config: Config) -> dict[str, float | 
         for line in header:
             if match := found_by(pattern, line):
                 value = (match.group(1) if match.re.groups else match.group()) or ""
-                number = as_number(value, config.trace.decimal)
+                stays = name in (*TEXT_COLUMNS, *config.files.text_parts)
+                number = None if stays else as_number(value, config.trace.decimal)
                 if number is not None and name in units:
                     number = units[name].of_cell(number)
                 found[name] = value.strip() if number is None else number

@@ -154,7 +154,7 @@ def _column(values: np.ndarray) -> np.ndarray | None:
     if values.dtype.kind in "UO" and all(
         value is None or isinstance(value, str) for value in values.tolist()
     ):
-        return np.array([(value or "").strip() or None for value in values.tolist()], dtype=object)
+        return values.astype(object)
     return None
 
 
@@ -163,8 +163,10 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
 
     BadFile if one of these is a column that the config names.
     """
-    needed, kept, faults = set(settings.their_columns.values()), {}, []
-    rows = max((len(values) for values in found.values()), default=0)
+    kept, faults, by_place = {}, [], dict(enumerate(found, start=1))
+    needed = {by_place.get(own, own) for own in settings.their_columns.values()}
+    lengths = {len(values) for name, values in found.items() if name in needed}
+    rows = lengths.pop() if len(lengths) == 1 else max(map(len, found.values()), default=0)
     for name, values in found.items():
         column = _column(values)
         if column is not None and len(column) == rows:
@@ -178,6 +180,7 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
             raise bad_file("column_shape", f"{reason}.", fix, column=name)
         reason = f"{reason}; the column is not used."
         faults.append(Fault("channel_left_out", reason, column=name, **NOTED))
+        kept[name] = np.full(rows, np.nan)  # columns may go by position
     return Arrays(tuple(header), tuple(kept), tuple(kept.values()), tuple(faults))
 
 
@@ -235,7 +238,7 @@ def _tdms(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
         header += [_header_line(f"{place}/{name}", value) for name, value in channel.properties.items()]
     if head:
         return Arrays(tuple(header))
-    filled = {channel.name: channel for channel in group.channels() if len(channel)}
+    filled = {channel.name: channel for channel in group.channels()}
     made = _arrays(header, {name: np.asarray(channel[:]) for name, channel in filled.items()}, settings)
     if not isinstance(time_name, str) or time_name in names[group.name]:
         return made

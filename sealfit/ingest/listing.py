@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
 from itertools import islice
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from sealfit.config import Config
 from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, Fault, nearest, printable
 from sealfit.ingest.columns import NO_COLUMN, Columns, mapped, suggestion
 from sealfit.ingest.files import as_number, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
-from sealfit.store.manifest import glob_names
+from sealfit.store.manifest import found_by_glob, glob_names
 from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.store.paths import runs_tables
 
@@ -131,11 +131,10 @@ def read_table(
     lines, columns, found = _rows(below, names, delimiter, table, needed)
 
     def with_point(cell: str) -> str:
-        return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
+        thousands = delimiter == "," and re.fullmatch(r"[^,]*(,\d{3})+", cell.strip())
+        return cell if thousands or as_number(cell, ",") is None else cell.replace(",", ".")
 
-    # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
-    if delimiter != ",":
-        columns = {name: mapped(column, with_point) for name, column in columns.items()}
+    columns = {name: mapped(column, with_point) for name, column in columns.items()}
     for name in columns.keys() - {needed}:
         columns[name] = mapped(columns[name], _unless_missing)
     return lines, columns, faults + found
@@ -160,7 +159,7 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _unless_missing(cell: str) -> str | None:
-    return None if cell.lower().removesuffix(".0") in MISSING else cell
+    return None if re.sub(r"(?<=\d)[.,]0+$", "", cell.lower()) in MISSING else cell
 
 
 def _rows(
@@ -268,18 +267,14 @@ def _with_whole_paths(campaign: Path, entries: list[Entry], table: str) -> tuple
 
 def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
     glob = config.files.glob
-    if PurePosixPath(glob).is_absolute() or ".." in PurePosixPath(glob).parts or not glob:
-        reason = f"files.glob = {glob!r} leads outside the campaign folder."
-        raise stopped("path_outside", reason, "Make it relative.")
-    found = [path for path in campaign.glob(glob) if not path.is_dir()]
-    files = sorted((path.relative_to(campaign).as_posix() for path in found), key=natural)
+    files = sorted(found_by_glob(campaign, glob), key=lambda file: (natural(file), file))
     if not files:
         reason = f"no file in '{campaign}' matches files.glob = {glob!r}, "
         reason += "which stands for paths below that folder."
         raise stopped("missing_file", reason, _nearest_file(campaign, glob))
     faults, kept = [], []
     for file in files:
-        if not _is_utf8(file):
+        if not is_utf8(file):
             faults.append(_odd_name(file, "error"))
         elif pattern := next((p for p in config.files.exclude if fnmatchcase(file, p)), None):
             reason = f"excluded by files.exclude = {pattern!r}."
@@ -321,7 +316,7 @@ def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: C
         return []
     table, listed = entries[0].table, {entry.file for entry in entries}
     there, vain = files_beside(campaign, listed - outside), []
-    if config.files.glob and ".." not in config.files.glob and not config.files.glob.startswith("/"):
+    if config.files.glob:
         there.update(found := glob_names(campaign, config.files))
         if not found:
             reason = f"no file matches files.glob = {config.files.glob!r}."
@@ -330,13 +325,13 @@ def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: C
     files = there - listed - {table}
     reason, fix = f"is not in {table}.", f"Add it to {table} if it is a trace."
     return vain + [
-        Fault("not_listed", reason, file=f, fix=fix, **PASSED_OVER) if _is_utf8(f) else _odd_name(f, "info")
+        Fault("not_listed", reason, file=f, fix=fix, **PASSED_OVER) if is_utf8(f) else _odd_name(f, "info")
         for f in sorted(files, key=natural)
         if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
     ]
 
 
-def _is_utf8(file: str) -> bool:
+def is_utf8(file: str) -> bool:
     """Whether the name of a file is text; on Linux it may be any bytes."""
     try:
         file.encode()

@@ -19,6 +19,7 @@ from sealfit.ingest.derived_columns import (
     out_of_range,
     to_values,
     with_computed,
+    with_constants,
     with_day_0,
 )
 from sealfit.ingest.listing import Entry, read_table, stopped
@@ -59,7 +60,8 @@ def read_properties(
     if not lines and not faults:
         raise stopped("no_rows", "has a header but no rows.", "Write one row per specimen.", file=table)
     entries = [Entry(table, line, table) for line in lines]
-    columns = with_day_0(in_our_units(columns, config.conversions("runs")), _of_table(config, columns))
+    columns = with_constants(in_our_units(columns, config.conversions("runs")), len(lines), config)
+    columns = with_day_0(columns, _of_table(config, columns))
     words = {name: columns.pop(name) for name in {*LABELS, batch} if name in columns}
     columns, found = to_values(entries, columns, config)
     faults += found

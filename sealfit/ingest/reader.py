@@ -41,6 +41,7 @@ from sealfit.ingest.files import (
 )
 from sealfit.ingest.formats import OF_ARRAYS, Arrays, kind_of, read_arrays
 from sealfit.ingest.workbooks import read_sheet
+from sealfit.units import conversion
 
 UNFILLED = ("", "Comment")  # last names without cells: a stray separator, and LabVIEW's column of comments
 MIN_ROWS = 4  # fewer rows are no trace: there is not even a speed in them
@@ -155,7 +156,8 @@ def _trace(rows: Trace, layout: FileLayout, ref: TraceRef, config: Config) -> Tr
     read = np.arange(rows.rows_read)
     rows = _in_our_units(channel_columns(rows, config), config, layout)
     if settings.rate_Hz is not None:  # a row that is left out takes its time, too
-        rows = rows.having({"time_s": read / _rate_Hz(settings.rate_Hz, known)})
+        seconds = read / _rate_Hz(settings.rate_Hz, known)
+        rows = rows.having({"time_s": conversion("s", config.units.unit("time"))(seconds)})
     rows = rows.where(read >= settings.drop_first_rows)
     counted = len(rows.line)
     rows = _derive(rows.where(~rows.bad), known, settings, layout)
@@ -183,8 +185,10 @@ def _rate_Hz(rate: float | str, known: Mapping[str, object]) -> float:
 
 def _in_our_units(rows: Trace, config: Config, layout: FileLayout) -> Trace:
     """Return the rows with numbers of other units converted; raises `BadFile` where they are labels."""
-    changed = {}
-    for name, convert in config.conversions("trace").items():
+    changed, conversions = {}, dict(config.conversions("trace"))
+    if rows.clock:  # times of day are in s, whatever the unit of the column
+        conversions["time_s"] = conversion("s", config.units.unit("time"))
+    for name, convert in conversions.items():
         if name not in rows.columns:
             continue
         if rows.columns[name].dtype.kind != "f":
@@ -204,18 +208,17 @@ def _derive(rows: Trace, known: Mapping[str, object], settings: TraceFormat, lay
         if expression.names & {"displacement_mm", *later}:
             later.append(name)
     rows = _computed(rows, {n: e for n, e in compute.items() if n not in later}, known)
-    if not speed:
-        required(rows.columns, layout)
-        return clean(rows, SLOTS)
-    # The integral needs its time and speed clean first: one bad row would shift every displacement after it.
-    required(rows.columns, layout, (speed, "time_s"))
-    rows = clean(rows, ["time_s", speed, "force_N"])
-    v = rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
-    steps = 0.5 * (v[1:] + v[:-1]) * np.diff(rows.columns["time_s"])
-    rows = rows.having({"displacement_mm": np.cumsum(np.r_[0.0, steps])[: len(v)]})  # by the trapezoid rule
-    rows = _computed(rows, {name: compute[name] for name in later}, known)
+    if speed:
+        # The integral needs its rows clean first: one bad row would shift every displacement after it.
+        required(rows.columns, layout, (speed, "time_s"))
+        rows = clean(rows, [speed, *SLOTS])
+        v = rows.columns[speed] / (60.0 if settings.integrate_per == "min" else 1.0)
+        steps = 0.5 * (v[1:] + v[:-1]) * np.diff(rows.columns["time_s"])
+        integral = np.cumsum(np.r_[0.0, steps])[: len(v)]  # by the trapezoid rule
+        rows = rows.having({"displacement_mm": integral})
+        rows = _computed(rows, {name: compute[name] for name in later}, known)
     required(rows.columns, layout)
-    return rows
+    return clean(rows, SLOTS)
 
 
 def _computed(rows: Trace, compute: Mapping[str, Expression], known: Mapping[str, object]) -> Trace:

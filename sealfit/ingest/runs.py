@@ -40,6 +40,8 @@ from sealfit.ingest.columns import (
     where,
 )
 from sealfit.ingest.derived_columns import (
+    COUNTS,
+    NUMBERS,
     add_repeats,
     add_runs,
     as_set,
@@ -51,10 +53,11 @@ from sealfit.ingest.derived_columns import (
     swapped_columns,
     to_values,
     with_computed,
+    with_constants,
     with_day_0,
 )
 from sealfit.ingest.expression import parse, read_by
-from sealfit.ingest.file_names import Listing, channels_of, fits_up_to, name_parts, unmatched
+from sealfit.ingest.file_names import Listing, TraceRef, channels_of, fits_up_to, name_parts, unmatched
 from sealfit.ingest.files import as_number, bad_file, cut_files, placed, read_bytes
 from sealfit.ingest.formats import kind_of
 from sealfit.ingest.listing import Entry, list_entries, misspelt
@@ -151,10 +154,12 @@ def time_of(text: str, formats: Sequence[str] = ()) -> datetime | None:
 
 
 def _read(reader: Callable[..., datetime], *given: str) -> datetime | None:
+    """Return the time, or None: a program without a time writes 0001-01-01, for example."""
     try:
-        return reader(*given)
+        time = reader(*given)
     except ValueError:
         return None
+    return time if time.year >= 1900 else None
 
 
 def excel_time(text: str) -> datetime | None:
@@ -211,7 +216,8 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     columns = in_order(overlaid(_headers(campaign, entries, config), named, cells))
     columns, found = join_date_and_time(entries, columns, config)
     faults += found
-    columns, found = to_values(entries, with_day_0(columns, config), config)
+    columns = with_day_0(with_constants(columns, len(entries), config), config)
+    columns, found = to_values(entries, columns, config)
     faults += found
     columns, found = with_computed(entries, columns, config)
     faults += found
@@ -336,7 +342,10 @@ def _from_traces(
     measured = [math.nan] * len(entries)
     left_out: set[int] = set()
     faults: list[Fault] = []
-    for i in np.flatnonzero(np.any([~runs, *lacking.values()], axis=0)).tolist():
+    to_read = np.any([~runs, *lacking.values()], axis=0)
+    if not to_read.all() and _says_more(campaign, refs[0], columns, config):
+        to_read[:] = True
+    for i in np.flatnonzero(to_read).tolist():
         wanted, file = [name for name, lack in lacking.items() if lack[i]], entries[i].file
         try:
             trace, strokes = with_strokes(read_trace(campaign, refs[i], config), config)
@@ -352,18 +361,44 @@ def _from_traces(
         for name, column in sources.items():
             if columns.get(name, none)[i] is not None or column not in table:
                 continue
-            values = table[column]
-            if (values == values.iloc[0]).all():
-                value = values.iloc[0]
-                constant = value if isinstance(value, str) else of_its_kind(name, float(value))
-                whole.setdefault(name, list(none))[i] = constant
-            elif name in wanted:
-                span = f"{values.min()} to {values.max()}"
-                reason = f"varies within the file, {span}; a condition is one value."
-                fix = "Write the value that was set into runs.csv."
-                faults += placed(bad_file("condition_varies", reason, fix, column=name).faults, file)
+            try:
+                value = _constant(name, table[column], wanted=name in wanted)
+            except BadFile as error:
                 left_out.add(i)
+                faults += placed(error.faults, file)
+                continue
+            if value is not None:
+                whole.setdefault(name, list(none))[i] = value
     return whole, measured, left_out, faults
+
+
+def _constant(name: str, values: pd.Series, *, wanted: bool) -> float | str | None:
+    """Return the value of a column of a trace; None if it varies, where no constant is wanted.
+
+    BadFile if it varies where one is wanted, or is text where a number is needed.
+    """
+    value = values.iloc[0]
+    if (values != value).any():
+        if not wanted:
+            return None
+        reason = f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
+        raise bad_file("condition_varies", reason, "Write the value that was set into runs.csv.", column=name)
+    if not isinstance(value, str):
+        return of_its_kind(name, float(value))
+    if name in (*NUMBERS, *COUNTS):
+        fix = "Export it as a number, or write it into runs.csv."
+        raise bad_file("not_a_number", f"is '{value}', which is no number.", fix, column=name)
+    return value
+
+
+def _says_more(campaign: Path, ref: TraceRef, columns: Columns, config: Config) -> bool:
+    """Return whether a file has a constant column of `FROM_TRACES` that nothing else gives."""
+    try:
+        rows = read_trace(campaign, ref, config).columns
+    except BadFile:
+        return False
+    found = (rows.get(beside(name, RESERVED)) for name in FROM_TRACES if name not in columns)
+    return any(values is not None and len(set(values)) == 1 for values in found)
 
 
 def _missing(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:

@@ -11,7 +11,7 @@ import platform
 import stat
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from fnmatch import fnmatch
+from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePath
 from typing import Annotated, NamedTuple
@@ -98,8 +98,20 @@ def glob_names(folder: Path, files: Files) -> list[str]:
     """Return the trace files that the config's glob finds, relative to `folder`; none without a glob."""
     if files.glob is None:
         return []
-    found = (path.relative_to(folder).as_posix() for path in folder.glob(files.glob) if path.is_file())
-    return sorted(name for name in found if not any(fnmatch(name, pattern) for pattern in files.exclude))
+    found = (name for name in found_by_glob(folder, files.glob) if (folder / name).is_file())
+    return sorted(name for name in found if not any(fnmatchcase(name, pattern) for pattern in files.exclude))
+
+
+def found_by_glob(folder: Path, glob: str) -> list[str]:
+    """Return what a glob finds in `folder`, but folders, hidden files and results of sealfit."""
+    found = [path.relative_to(folder) for path in folder.glob(glob) if not path.is_dir()]
+    parents = {parent for path in found for parent in path.parents}
+    results = {parent for parent in parents if (folder / parent / STATE).is_file()}
+    return [
+        path.as_posix()
+        for path in found
+        if results.isdisjoint(path.parents) and not any(part.startswith(".") for part in path.parts)
+    ]
 
 
 def seen_config(step: str, config: Config) -> Config:

@@ -95,7 +95,7 @@ def test_the_draft_reads_an_export(name, export):
     assert set(ingested.tables["inputs"]["status"]) == {"used"}
 
 
-@pytest.mark.parametrize("name", sorted(set(exports.EXPORTS) - {"excel_german", "excel_us"}))
+@pytest.mark.parametrize("name", sorted(set(exports.EXPORTS) - {"excel_us"}))
 def test_the_draft_leads_to_no_fault(name, export):
     *_, ingested = export(name)
     assert [str(fault) for fault in ingested.faults] == []
@@ -105,9 +105,8 @@ def test_the_draft_leads_to_no_fault(name, export):
 def test_lines_below_the_data_are_named_by_how_they_begin(name, footer, export):
     _, _, made, config, ingested = export(name)
     assert config.trace.footer == footer
-    assert any("end in lines that are no data" in doubt.reason for doubt in made.doubts) == (footer is None)
-    places = {264} if footer is None else set()  # the line below the 260 rows
-    assert {fault.line for fault in ingested.faults} == places
+    assert not any("end in lines that are no data" in doubt.reason for doubt in made.doubts)
+    assert not ingested.faults
 
 
 # ---------------------------------------------------------------- what single exports need
