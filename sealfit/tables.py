@@ -290,10 +290,10 @@ CHANNELS = table(
     Column("label", "the category, or null", TEXT),
     Column("n", "bins rows in the group", INT),
     Column("before_N", "mean residual before"),
-    Column("before_se_N", "its standard error, from whole units"),
+    Column("before_half_N", "half the width of its 95 % interval, from whole units; null for one unit"),
     Column("before_run", "run with the largest mean residual in the group", TEXT),
     Column("after_N", "mean residual after"),
-    Column("after_se_N", "its standard error, from whole units"),
+    Column("after_half_N", "half the width of its 95 % interval, from whole units; null for one unit"),
     Column("after_run", "run with the largest mean residual in the group", TEXT),
 )
 SHAPES = table(

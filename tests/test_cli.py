@@ -103,6 +103,7 @@ def test_the_summary_names_the_settings_of_the_next_runs(sealfit, parts, campaig
     [
         (("speed_mm_s", 20.0, {"speed_mm_s": "mm/s"}), "speed_mm_s 20"),
         (("speed_mm_s", 20.0, {"speed_mm_s": "rpm"}), "speed_mm_s 20 rpm"),
+        (("speed_mm_s", 0.05, {"speed_mm_s": "m/s"}), "speed_mm_s 0.05 m/s"),
         (("rubber", "NBR", {}), "rubber NBR"),
     ],
 )

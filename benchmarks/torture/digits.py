@@ -350,8 +350,8 @@ def _standard_errors(name: str, table: pd.DataFrame) -> np.ndarray | None:
             return (table[high] - table[low]).to_numpy(float) / 4
     if "se" in table:
         return table["se"].to_numpy(float)
-    if "after_se_N" in table:
-        return table["after_se_N"].to_numpy(float)
+    if "after_half_N" in table:
+        return table["after_half_N"].to_numpy(float) / 2
     if {"sd_N", "df"} <= set(table):
         return table["sd_N"].max() / np.sqrt(2 * table["df"].to_numpy(float))
     for scatter in ("residual_N", "force_se_N", "force_sd_N"):  # of a row

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from pandas.api.typing import SeriesGroupBy
 
-from sealfit.closure.channels import Channel, unit_of
+from sealfit.closure.channels import Channel, scatter_level, unit_of
 from sealfit.closure.errors_and_intervals import (
     degrees_of_freedom,
     mean_half_width,
@@ -25,6 +25,7 @@ from sealfit.effects import EFFECTS
 from sealfit.effects.contract import SECOND, Effect
 from sealfit.effects.free import FREE, LEVELS, SMOOTH, SURFACE, WIDE, free_effect
 from sealfit.errors import ParameterError
+from sealfit.fit.aging.law_table import t_of_95
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
 from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
@@ -173,25 +174,34 @@ PERIODS = 4  # Periods of a periodic effect that are drawn.
 
 
 def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
-    """Return the mean residual by channel, before and after, with standard errors from whole files."""
+    """Return the mean residual by channel, before and after, with 95 % intervals from whole units."""
     rows = before.rows
-    files, runs = rows.codes("file"), rows.table["run_id"].to_numpy()
+    runs = rows.table["run_id"].to_numpy()
     records = []
     for name, known in selection.channels.items():
         values = rows.values(name) if name != "speed_mm_s" else np.abs(rows.speed)
         code, middle, labels = _grouped(values, numeric=known.numeric)
+        units = rows.codes(scatter_level([known], rows))
         for group in np.unique(code):
             inside = code == group
             record = {"channel": name, "x": middle[group], "label": labels[group], "n": int(inside.sum())}
             for stage, fitted in (("before", before), ("after", after)):
                 weight, residual = rows.weight[inside], fitted.residual[inside]
-                mean = weight @ residual / weight.sum()
-                per_file = np.bincount(files[inside], weight * (residual - mean))
-                record[f"{stage}_N"] = mean
-                record[f"{stage}_se_N"] = float(np.sqrt((per_file**2).sum()) / weight.sum())
+                record[f"{stage}_N"] = mean = weight @ residual / weight.sum()
+                record[f"{stage}_half_N"] = _half_width(
+                    weight * (residual - mean) / weight.sum(), units[inside]
+                )
                 record[f"{stage}_run"] = _farthest(runs[inside], weight, residual)
             records.append(record)
     return pd.DataFrame(records, columns=CHANNELS.names())
+
+
+def _half_width(parts: np.ndarray, units: np.ndarray) -> float:
+    """Return half the width of the 95 % interval of a mean, from its parts by unit; nan for one unit."""
+    sums = np.bincount(np.unique(units, return_inverse=True)[1], parts)
+    if sums.size < 2:
+        return np.nan
+    return float(t_of_95(sums.size - 1) * np.sqrt(sums @ sums * sums.size / (sums.size - 1)))
 
 
 def _grouped(values: np.ndarray, *, numeric: bool, groups: int = GROUPS) -> tuple[np.ndarray, list, list]:

@@ -106,7 +106,7 @@ def noise_from_bends(bends: np.ndarray) -> float:
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
-FORMAT = 6  # of a part's files; those of another one are made again
+FORMAT = 7  # of a part's files; those of another one are made again
 _ABOUT = b"part"
 
 

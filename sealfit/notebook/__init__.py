@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,6 +125,16 @@ def _path(given: str | Path | None) -> Path | None:
     return None if given is None else Path(given).expanduser()
 
 
+def _of_closure(make: Callable[[Mapping, Units], pd.DataFrame]) -> property:
+    """Return the property of `Results` that a function makes of closure.json."""
+    return property(lambda self: make(*self._closure()), doc=make.__doc__)
+
+
+def _stored(table: str, meaning: str) -> property:
+    """Return the property of `Results` that is a table of OUT."""
+    return property(lambda self: self.table(table), doc=meaning)
+
+
 class Results:
     """What sealfit found in a campaign: tables, plots, predictions and lifetimes.
 
@@ -140,40 +150,16 @@ class Results:
         self._open()
 
     # ------------------------------------------------------------ what the loop found
-    @property
-    def verdict(self) -> pd.DataFrame:
-        """One row: the verdict, its sentence, how good the fit is, and what is left."""
-        return frames.verdict(*self._closure())
-
-    @property
-    def errors(self) -> pd.DataFrame:
-        """A row per error: before and after the effects were added, and the noise floor."""
-        return frames.errors(*self._closure())
-
-    @property
-    def effects(self) -> pd.DataFrame:
-        """A row per effect that the loop found; one that is only a candidate is not in the model."""
-        return frames.effects(*self._closure())
-
-    @property
-    def effect_parameters(self) -> pd.DataFrame:
-        """A row per effect and parameter, with its 95 % interval and unit."""
-        return frames.effect_parameters(*self._closure())
-
-    @property
-    def effect_curves(self) -> pd.DataFrame:
-        """A row per effect, channel and place along it: what the effect does there, with its 95 % band."""
-        return self.table("shapes")
-
-    @property
-    def scatter(self) -> pd.DataFrame:
-        """A row per level: how much specimens, runs and files scatter."""
-        return frames.scatter(*self._closure())
-
-    @property
-    def sensitivity(self) -> pd.DataFrame:
-        """A row per variable, level and target: the smallest effect to be found with 80 % chance."""
-        return frames.sensitivity(*self._closure())
+    verdict = _of_closure(frames.verdict)
+    errors = _of_closure(frames.errors)
+    effects = _of_closure(frames.effects)
+    effect_parameters = _of_closure(frames.effect_parameters)
+    scatter = _of_closure(frames.scatter)
+    sensitivity = _of_closure(frames.sensitivity)
+    effect_curves = _stored(
+        "shapes",
+        "A row per effect, channel and place along it: what the effect does there, with its 95 % band.",
+    )
 
     # ------------------------------------------------------------ fits
     @property
@@ -195,25 +181,12 @@ class Results:
         return frames.with_units(frames.laws(fit, before, store.config), store.config.units)
 
     # ------------------------------------------------------------ data
-    @property
-    def runs(self) -> pd.DataFrame:
-        """A row per stroke, with all that is known of its file and run."""
-        return self.table("runs")
-
-    @property
-    def quality(self) -> pd.DataFrame:
-        """A row per finding in the data: where, what, what was done about it, and how to fix it."""
-        return self.table("quality")
-
-    @property
-    def steady(self) -> pd.DataFrame:
-        """A row per stroke: means over its steady window."""
-        return self.table("steady")
-
-    @property
-    def bins(self) -> pd.DataFrame:
-        """A row per bin of a steady window: what the joint model is fitted to."""
-        return self.table("bins")
+    runs = _stored("runs", "A row per stroke, with all that is known of its file and run.")
+    quality = _stored(
+        "quality", "A row per finding in the data: where, what, what was done about it, and how to fix it."
+    )
+    steady = _stored("steady", "A row per stroke: means over its steady window.")
+    bins = _stored("bins", "A row per bin of a steady window: what the joint model is fitted to.")
 
     def residuals(self, model: str = "after") -> pd.DataFrame:
         """Return a row per bin: measured minus model, fitted and held out; `model` is "after" or "before".

@@ -10,15 +10,12 @@ from matplotlib.figure import Figure
 from sealfit.errors import RequestError
 from sealfit.pipeline import reported
 from sealfit.report.drawing import saved
-from sealfit.report.figures import draw_all
+from sealfit.report.figures import OF_LOOP, OF_TABLES, draw_all
 from sealfit.report.page import answered
 from sealfit.report.style import compose
 from sealfit.store import Store
 
-FIGURES = (
-    "finding", "before_after", "effect_shapes", "refused", "residual_channels", "variance_levels",
-    "force_speed", "aging", "master_curve", "starts", "traces_mean",
-)  # fmt: skip
+FIGURES = tuple(make.__name__ for make in (*OF_LOOP, *OF_TABLES))
 
 
 class ShownFigure(Figure):

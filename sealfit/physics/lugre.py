@@ -182,7 +182,7 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
     Raises
     ------
     ParameterError
-        If `v_s` or `sigma_0` is not positive.
+        If `v_s` or `sigma_0` is not positive, or a load is negative.
 
     Examples
     --------
@@ -191,6 +191,8 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
     """
     if not np.all(np.asarray(sigma_0) > 0):
         raise ParameterError(f"sigma_0 = {np.min(sigma_0):g}: the bristles' stiffness must be positive.")
+    if np.any(np.asarray(load_N) < 0):
+        raise ParameterError(f"load_N = {np.min(load_N):g}: a normal load cannot be negative.")
     mu_c = np.asarray(mu_c, float)
     return (
         np.asarray(load_N, float)
@@ -265,6 +267,8 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
         raise ParameterError(
             f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative."
         )
+    if not load_N > 0:
+        raise ParameterError(f"load_N = {load_N:g}: bristles need a load above 0.", fix="Give a load in N.")
     share, factor = model.elements(load_N)
     speed = np.asarray(speed_mm_s, float)
     if speed.shape != time.shape:

@@ -77,7 +77,7 @@ def decimals(size: float, digits: int = 2) -> int:
 
 
 def measured(value: float | None, lo: float | None, hi: float | None) -> tuple[str, str]:
-    """Return a value and its interval, rounded to two significant digits of the interval's half-width.
+    """Return a value and its interval, rounded to two significant digits of the interval's shorter side.
 
     Examples
     --------
@@ -85,6 +85,8 @@ def measured(value: float | None, lo: float | None, hi: float | None) -> tuple[s
     ('0.835', '[0.821, 0.849]')
     >>> measured(6.123, 5.513, 6.7012)
     ('6.12', '[5.51, 6.70]')
+    >>> measured(1.5, 0.25, 21.0)
+    ('1.5', '[0.2, 21.0]')
     >>> measured(4.0, None, None), measured(4.0, None, 5.5)
     (('4.00', '–'), ('4.00', 'up to 5.50'))
     """
@@ -97,7 +99,8 @@ def measured(value: float | None, lo: float | None, hi: float | None) -> tuple[s
         return number(value), f"[{number(lo)}, {number(hi)}]"
     power = _power(max(abs(value), abs(lo), abs(hi)))
     value, lo, hi = (x / 10.0**power for x in (value, lo, hi))
-    places = min(decimals((hi - lo) / 2), 9)
+    sides = [side for side in (value - lo, hi - value) if side > 0] or [hi - lo]
+    places = min(decimals(min(sides)), 9)
     tail = _times_ten(power)
     return _fixed(value, places) + tail, f"[{_fixed(lo, places)}, {_fixed(hi, places)}]" + tail
 

@@ -290,7 +290,7 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
 # Words for the levels of closure.json and of table `levels`.
 LEVEL_WORDS = {
     "trace": "along strokes", "sample": "along strokes", "stroke": "between strokes",
-    "repeat": "between repeats", "file": "between repeats", "run": "between runs",
+    "repeat": "between files", "file": "between files", "run": "between runs",
     "condition": "between specimens", "specimen": "between specimens",
 }  # fmt: skip
 NAMED = 3  # variables whose smallest effect a sentence gives

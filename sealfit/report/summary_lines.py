@@ -211,7 +211,9 @@ def _setting(name: str, value: object, units: Mapping[str, str]) -> str:
     """Return a setting of a run, e.g. "speed_mm_s 20 rpm"; the unit where the name does not say it."""
     text = value if isinstance(value, str) else f"{value:.4g}"
     unit = units.get(name, "")
-    return f"{name} {text}" if name.endswith(unit.replace("/", "_")) else f"{name} {text} {unit}"
+    return (
+        f"{name} {text}" if name.endswith(f"_{unit.replace('/', '_')}") else f"{name} {text} {unit}".rstrip()
+    )
 
 
 def _left(left: Mapping, unit: str) -> str:
@@ -327,10 +329,11 @@ def _life(part: Mapping) -> str:
         beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
         ends = _degrees(part["temperature_ci95"])
         return f"it lasts {years} at {part['temperature_C']:.1f} degC{ends}{beyond}"
+    ends = "" if part["ci95"] in ([None, None], [0, 0]) else f", 95 % {_days_between(part['ci95'])}"
     if part["days"] is None:
-        return f"{part['threshold']:.4g} is not reached within 1e9 d"
+        return f"{part['threshold']:.4g} is not reached within 1e9 d{ends}"
     if part["days"] == 0:
-        return f"unaged rubber is already beyond {part['threshold']:.4g}"
+        return f"unaged rubber is already beyond {part['threshold']:.4g}{ends}"
     text = f"{part['days']:.3g} d to {part['threshold']:.4g}, 95 % {_days_between(part['ci95'])}"
     if part["beyond_tests"] is not None and part["beyond_tests"] > 1:
         text += f" (extrapolated: {part['beyond_tests']:.2g} times the longest test)"

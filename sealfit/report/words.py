@@ -157,7 +157,8 @@ def left_over(closure: Mapping, config: Config) -> Markup:
     elif left["channel"]:
         said.append(Markup("no variable is significant. The smallest p-value:{}").format(where))
     else:
-        said.append("no variable explains it: it is consistent with scatter")
+        within = closure["fit_quality"]["state"] == "within_scatter"
+        said.append("no variable explains it" + (": it is consistent with scatter" if within else ""))
     return _sentences(*said)
 
 
@@ -179,9 +180,9 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
     """Return the rows of the table before and after: label, note, before, after, change."""
     floor, stages, found = closure["noise_floor_N"], ("before", "after"), []
     for key, label in ERRORS.items():
-        if key == "heldout_extrapolated_rmse_N":
-            continue
         before, after = (closure[stage][key] for stage in stages)
+        if key == "heldout_extrapolated_rmse_N" and not known(before):
+            continue
         texts = together([before, after, floor if key in FLOORED else None])
         change = _percent(before, after) if known(before) and known(after) and before else NOTHING
         label, unit = label.format(held=closure["heldout_unit"]), config.units.of(key)
@@ -238,8 +239,8 @@ def curve_of(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Co
     if own.empty:
         return None
     rows = own[own["channel"] == own["channel"].iloc[0]]
-    step = max(1, (len(rows) - 1) // (CURVE_PLACES - 1))
-    rows, scale = rows.iloc[::step], shape_scale(effect)
+    step = 1 if rows["x"].isna().any() else max(1, (len(rows) - 1) // (CURVE_PLACES - 1))
+    rows, scale = rows.iloc[::step], shape_scale(effect)  # every category, and some places along a number
     places = rows["label"].where(rows["x"].isna(), rows["x"].map(given))
     values = [
         measured(*(scale * v for v in row)) for row in rows[["value", "lo95", "hi95"]].itertuples(index=False)

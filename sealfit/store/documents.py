@@ -86,6 +86,7 @@ DETECTABLE = record(
     lambda own: (own.smallest_N is None) == (own.smallest_pct is None),
     variable=Text,
     level=Text,
+    acts_on=Text,
     smallest_N=Maybe,
     smallest_pct=Maybe,
     files_needed=StrictInt | None,

@@ -189,7 +189,7 @@ def provenance(state: State) -> dict:
 
 STATE = "state.json"
 STAGING = ".staging-"  # the beginning of the name of a folder of staged files
-FORMAT = 9
+FORMAT = 10
 BATCH = "batch"  # column that names the batch, if nothing else is said
 DEFAULT = "default"
 

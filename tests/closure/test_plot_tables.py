@@ -54,6 +54,21 @@ def test_a_mean_residual_names_the_run_that_is_farthest_from_the_model():
     assert (table["before_run"].isin(set(bins["run_id"]))).all()
 
 
+def test_intervals_of_mean_residuals_hold_zero_where_nothing_is_missing():
+    held = []
+    for seed in range(12):
+        bins = bins_helpers.make_bins(repeats=2, bins=4, temperatures=(60.0,), setup=0.004, seed=seed)
+        bins["batch"] = np.where(bins["repeat"] == 2, "B", "A")
+        rows = make_rows(bins, has_aging=True)
+        fitted = fit_declared(rows)
+        channels = {c.name: c for c in find_channels(rows)}
+        table = channel_table(Selection(fitted, fitted, (), (), (), None, None, channels), fitted, fitted)
+        assert (table["before_half_N"] > 1e-6).sum() == table["before_half_N"].notna().sum()
+        own = table[table["channel"] == "batch"]
+        held += (own["before_N"].abs() <= own["before_half_N"]).tolist()
+    assert np.mean(held) > 0.85
+
+
 def test_partial_residuals_follow_the_data_where_the_shape_does_not():
     bins = bins_helpers.make_bins(repeats=2, temperatures=(60.0,), directions=(1, -1), noise_N=0.02, gain=0.0)
     bins["batch"] = np.where(bins["repeat"] == 2, "B", "A")

@@ -148,6 +148,22 @@ def test_a_floor_above_the_threshold_is_never_passed():
     assert lifetime(law, Goal(0.99), 60.0, 80.0).days == 0.0
 
 
+def test_a_threshold_that_some_draws_reach_has_an_interval():
+    law = fit_joint_law(campaign("stretched", (4.0, 0.6), a=0.3, scatter=0.02, seed=2), "stretched", "rate")
+    limit, start = law.x[0] - law.x[1], law.x[0]
+    never, at_once = (
+        lifetime(law, Goal(limit - 0.002), 60.0, 80.0),
+        lifetime(law, Goal(start + 0.002), 60.0, 80.0),
+    )
+    assert never.days == np.inf
+    assert 0 < never.low < never.high == np.inf
+    assert (at_once.days, at_once.low) == (0.0, 0.0)
+    assert 0 < at_once.high < 10
+    low, high = over_laws([law], Goal(limit - 0.002), 60.0, 80.0)
+    assert low == pytest.approx(never.low, rel=1e-6)
+    assert high == np.inf
+
+
 def test_the_delta_interval_agrees_with_values_drawn_anew():
     law = fit_joint_law(campaign(scatter=0.01), "log", "rate")
     found = lifetime(law, Goal(0.75), 50.0, 85.0)

@@ -142,6 +142,8 @@ def test_friction_that_falls_with_pressure_grows_less_than_the_load():
         ({"speed_mm_s": [1.0]}, "one speed a time"),
         ({"sigma_0": 0.0}, "stiffness must be positive"),
         ({"sigma_1": -1.0}, "neither can be negative"),
+        ({"load_N": 0.0}, "load above 0"),
+        ({"load_N": -50.0}, "load above 0"),
         ({"v_s": 0.0}, "v_s"),
         ({"contact": Contact(width_mm=1.0, reference_N_mm=-1.0)}, "both must be positive"),
     ],

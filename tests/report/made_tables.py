@@ -381,7 +381,7 @@ def channels(found):
                 units = means[stage][key]
                 row |= {
                     f"{stage}_N": units.mean(),
-                    f"{stage}_se_N": units.std() / np.sqrt(len(units)) if len(units) > 1 else None,
+                    f"{stage}_half_N": 2 * units.std() / np.sqrt(len(units)) if len(units) > 1 else None,
                     f"{stage}_run": units.abs().idxmax(),
                 }
             rows.append(row)

@@ -33,7 +33,7 @@ from sealfit.report.figures.residual import (
     residual_channels,
     run_means,
 )
-from sealfit.report.figures.speed import curve_lines, draw_starts, force_speed, run_points
+from sealfit.report.figures.speed import curve_lines, force_speed, run_points
 from sealfit.report.style import AFTER, Key, Panel, Plot, compose, is_logarithmic, value_ticks
 from sealfit.units import Units
 
@@ -111,6 +111,28 @@ def test_torque_rig_shows_true_units_and_no_slot_names():
         "run means, forward",
         "run means, backward",
     ]
+
+
+def test_a_campaign_that_only_goes_backward_has_a_legend_of_what_is_drawn():
+    made = torque_campaign()
+    tables = {name: made.tables[name] for name in ("steady", "curves", "residuals_after")}
+    tables["steady"] = tables["steady"][tables["steady"]["direction"] < 0]
+    tables["curves"] = tables["curves"][tables["curves"]["speed_mm_s"] < 0]
+    marks = {key.label: key.mark for key in force_speed(tables, made.config).legend}
+    assert (marks["run means"], marks["model"]) == ("left", "dashed")
+
+
+def test_a_quantity_has_the_colour_of_the_legend_in_a_series_without_the_others(made):
+    curves = made.tables["aging_curves"]
+    first, *_ = sorted(curves["series"].unique())
+    curves = curves[(curves["series"] != first) | (curves["quantity"] == "mu_c")]
+    plot = draw_all({**made.tables, "aging_curves": curves}, made.closure, made.config)["aging"]
+    colours = {key.label: key.colour for key in plot.legend}
+    own = curves[curves["series"] == first]["value"].to_numpy()
+    drawn = [line for panel in plot.panels for line in panel_figure(panel).axes[0].lines]
+    (line,) = [line for line in drawn if np.array_equal(line.get_ydata(), own)]
+    assert line.get_color() == colours["mu_c"]
+    assert sum("µ_c starts" in panel.alt or "μ_c starts" in panel.alt for panel in plot.panels) == 1
 
 
 def test_bands_of_backward_motion_are_not_upside_down():
@@ -251,12 +273,12 @@ def test_levels_are_drawn_as_variance(ax):
 
 
 def test_channels_have_95_percent_bars(ax):
-    mean = {"before_N": 1.0, "before_se_N": 0.5, "after_N": 0.0, "after_se_N": 0.5}
+    mean = {"before_N": 1.0, "before_half_N": 0.5, "after_N": 0.0, "after_half_N": 0.5}
     mean |= {"channel": "batch", "n": 9, "before_run": "r", "after_run": "r"}
     rows = table("channels", [{"label": name, **mean} for name in "ab"])
     draw_channel(ax, rows, "batch", TORQUE)
     ends = ax.containers[0].lines[2][0].get_segments()[0][:, 1]
-    npt.assert_allclose(ends, [1 - 0.97998, 1 + 0.97998], rtol=1e-4)  # 1.95996 of 0.5
+    npt.assert_allclose(ends, [0.5, 1.5])
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["a", "b"]
     assert ax.get_ylabel() == "residual (mN m)"
 
@@ -268,7 +290,7 @@ def test_means_that_are_all_missing_have_a_scale(made):
 
 
 def test_the_strongest_channel_comes_first(made):
-    assert channel_order(made.tables["channels"])[0] == "time_s"
+    assert channel_order(made.tables)[0] == "time_s"
 
 
 @pytest.mark.parametrize("commanded", [True, False])
@@ -281,7 +303,13 @@ def test_an_effect_of_the_direction_is_shown_over_the_signed_speed(made, command
         made_N = {"speed_mm_s": measured, "residual_N": size * speed.abs()}
         rows = rows if commanded else rows.drop(columns="speed_set_mm_s")
         tables[f"residuals_{stage}"] = rows.assign(**made_N)
-    known = {"channel": "direction", "before_N": 1.0, "before_se_N": 0.1, "after_N": 0.0, "after_se_N": 0.1}
+    known = {
+        "channel": "direction",
+        "before_N": 1.0,
+        "before_half_N": 0.1,
+        "after_N": 0.0,
+        "after_half_N": 0.1,
+    }
     tables["channels"] = table("channels", [{**known, "x": sign, "n": 9} for sign in (-1.0, 1.0)])
     effect = {**made.closure["effects"][0], "channels": ["direction"]}
     plot = finding(tables, {**made.closure, "effects": [effect]}, made.config)
@@ -377,20 +405,6 @@ def test_letters_that_the_font_lacks_become_text():
 def test_the_same_tables_give_the_same_bytes(made):
     plot = draw_all(made.tables, made.closure, made.config)["variance_levels"]
     assert draw(plot) == draw(plot)
-
-
-def test_a_model_of_few_points_is_drawn_without_corners(ax):
-    x = np.linspace(0.1, 2.5, 13)
-    rise = 30 * (1 - np.exp(-4 * x))
-    rows = {"condition": "a", "speed_set_mm_s": 1.0, "direction": 1, "distance_mm": x, "model_N": rise}
-    draw_starts(ax, pd.DataFrame({**rows, "force_N": rise, "force_se_N": 0.1}), {1.0: "#0072B2"}, Units())
-    fine, drawn = ax.lines[-1].get_data()
-    assert len(fine) == 6 * 12 + 1
-    npt.assert_allclose(drawn[::6], rise)
-    off, straight = (
-        np.abs(y - 30 * (1 - np.exp(-4 * fine))).max() for y in (drawn, np.interp(fine, x, rise))
-    )
-    assert off < 0.25 * straight
 
 
 def test_a_drawing_holds_all_that_it_uses_and_is_an_element_of_the_page(made):

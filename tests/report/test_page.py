@@ -195,7 +195,7 @@ def test_without_a_load_effects_act_on_friction_and_the_forces(unsaved):
     made = torque_campaign()
     why = "would distinguish linear in dust_mg, factor on friction from linear in dust_mg, added to F_s"
     wear = {**aging_campaign().closure["effects"][0], "label": "linear in dust_mg, factor on friction"}
-    place = {"variable": "dust_mg", "level": "run"}
+    place = {"variable": "dust_mg", "level": "run", "acts_on": "mu"}
     made.closure |= {
         "verdict": "unexplained",
         "effects": [{**wear, "channels": ["dust_mg"]}],
@@ -331,15 +331,16 @@ def test_the_page_states_the_sensitivity_and_the_effects_not_accepted(small, uns
     seen = {"variable": "displacement_mm", "level": "trace", "smallest_N": 0.123, "smallest_pct": 0.31}
     seen["files_needed"] = 44
     unseen = dict.fromkeys(("smallest_N", "smallest_pct", "files_needed"))
-    unseen |= {"variable": "speed_mm_s", "level": "run"}
+    seen["acts_on"] = "mu"
+    unseen |= {"variable": "speed_mm_s", "level": "run", "acts_on": "force"}
     label = "ripple along displacement_mm, factor on mu_s"
     refused = {"label": label, "acts_on": "mu_s", "channels": ["displacement_mm"], "p_value": 1e-6}
     refused = {**refused, "reason": "it is too small", "weak": False}
     sensitivity = [{**one, "cannot_tell": False} for one in (seen, unseen)]
     closure = {**small.closure, "sensitivity": sensitivity, "refused": [refused]}
     text = Page(build_report(small.tables, closure, small.provenance, small.config).html).text
-    assert "displacement (mm) along strokes 0.12 N 0.31 % 44" in text
-    assert "sliding speed (mm/s) between runs none – –" in text
+    assert "displacement (mm) along strokes μ 0.12 N 0.31 % 44" in text
+    assert "sliding speed (mm/s) between runs the friction force none – –" in text
     assert "ripple along displacement, acting on μ s (p < 0.001): it is too small." in text
 
 

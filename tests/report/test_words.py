@@ -99,6 +99,7 @@ def test_nothing_missing_gives_one_error():
 SEEN = {
     "variable": "displacement_mm",
     "level": "trace",
+    "acts_on": "mu",
     "smallest_N": 0.5,
     "smallest_pct": 1.25,
     "files_needed": 40,
@@ -213,7 +214,9 @@ def test_what_is_not_decided_has_names_in_words():
 
 
 def test_what_is_left_is_called_scatter_only_if_it_is():
-    assert "consistent with scatter" in left_over(document(), Config())
+    within = document() | {"fit_quality": {"state": "within_scatter", "ratio": 1.0, "p_value": 0.4}}
+    assert "consistent with scatter" in left_over(within, Config())
+    assert left_over(document(), Config()).endswith("No variable explains it.")
     left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005, "significant": True}
     text = left_over(document("unexplained", **left), Config())
     assert "A significant residual remains along displacement (mm) along strokes (p = 0.0005)." in text

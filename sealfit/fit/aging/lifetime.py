@@ -36,6 +36,8 @@ USES = {
 }
 # Range of lifetimes in days. A law has no meaning beyond it.
 AT_ONCE, FOREVER = 1e-9, 1e9
+# Ends of a 95 % interval of drawn lifetimes, and the method of their quantiles, which inf does not disturb.
+ENDS, OF_DRAWS = (0.025, 0.975), "inverted_cdf"
 
 
 @dataclass(frozen=True)
@@ -90,13 +92,16 @@ def lifetime(
     """
     place = _place(law, temperature_C, compression_ratio_pct)
     days = _days(law, law.x, goal, place)
-    low, high = days, days
-    if 0 < days < FOREVER:
+    if (
+        not 0 < days < FOREVER
+    ):  # the value may lie on the other side of the threshold, or the limit of the law
+        low, high = (float(end) for end in np.quantile(_drawn(law, goal, place), ENDS, method=OF_DRAWS))
+    else:
         with np.errstate(divide="ignore", invalid="ignore"):  # the lifetime may be 0 or inf nearby
             slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
         half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
-        low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
+    low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
     asked = days * float(law.factors(place)[0][0])
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
     return DaysToThreshold(days, low, high, threshold, beyond, _outside(law, place))
@@ -110,25 +115,30 @@ def over_laws(
 ) -> tuple[float, float]:
     """Return the ends of the model-averaged 95 % interval of the lifetime, 0 or inf if open.
 
-    The log lifetime of each law has a Student distribution, and the weights are exp(-BIC/2). With few tests
-    the law of least BIC is often not the true one, and its own interval too short. The laws are fitted to the
-    same values; the other arguments are those of `lifetime`. Buckland, Burnham & Augustin 1997, Biometrics
-    53(2), 603-618, doi:10.2307/2533961.
+    The log lifetime of each law has a Student distribution, or that of values drawn anew where it is 0 or
+    inf; the weights are exp(-BIC/2). With few tests the law of least BIC is often not the true one, and its
+    own interval too short. The laws are fitted to the same values; the other arguments are those of
+    `lifetime`. Buckland, Burnham & Augustin 1997, Biometrics 53(2), 603-618, doi:10.2307/2533961.
     """
     weights = np.exp(-0.5 * np.array([law.bic - min(one.bic for one in laws) for law in laws]))
     lives = [lifetime(law, goal, temperature_C, compression_ratio_pct) for law in laws]
-    found = list(zip(weights / weights.sum(), laws, lives, strict=True))
+    place = _place(laws[0], temperature_C, compression_ratio_pct)
+    drawn = [
+        None if 0 < life.days < FOREVER else _drawn(law, goal, place)
+        for law, life in zip(laws, lives, strict=True)
+    ]
+    found = list(zip(weights / weights.sum(), laws, lives, drawn, strict=True))
 
     def share(log_days: float) -> float:
         """Return the probability of a shorter life."""
         total = 0.0
-        for weight, law, life in found:
-            if 0 < life.days < FOREVER:
+        for weight, law, life, others in found:
+            if others is None:
                 error = np.log(life.days / max(life.low, 1e-300)) / law.t
                 away = log_days - np.log(life.days)
                 total += weight * (stdtr(max(law.df, 1), away / error) if error > 0 else float(away >= 0))
             else:
-                total += weight * (life.days == 0)
+                total += weight * np.mean(others <= np.exp(log_days))
         return total
 
     limits = np.log(1e-12), np.log(FOREVER)
@@ -208,16 +218,22 @@ def resampled(
     Quantiles of the logarithm are multiplied by Student's over the normal quantile, as the scatter is an
     estimate. `seed` is that of the random numbers.
     """
-    rng, place = np.random.default_rng(seed), _place(law, temperature_C, compression_ratio_pct)
-    mean = law.at(law.aged)
-    covariance = law.aged.covariance(law.scatter, mean)
-    drawn = mean + rng.standard_normal((draws, mean.size)) @ blockwise(np.linalg.cholesky, covariance).T
-    found = [_days(law, x, goal, place) for x in solved_many(law, whitening_of(covariance), drawn)]
+    place = _place(law, temperature_C, compression_ratio_pct)
+    found = _drawn(law, goal, place, draws, seed)
     days, wider = _days(law, law.x, goal, place), law.t / ndtri(0.975)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.log(np.quantile(found, [0.025, 0.975], method="inverted_cdf") / days)
+        ends = np.log(np.quantile(found, ENDS, method=OF_DRAWS) / days)
     low, high = days * np.exp(np.clip(ends * wider, -700, 700))
     return float(low) if low > AT_ONCE else 0.0, float(high) if high < FOREVER else np.inf
+
+
+def _drawn(law: JointLaw, goal: Goal, place: Aged, draws: int = 500, seed: int = 1) -> np.ndarray:
+    """Return lifetimes in days of fits to values drawn anew, shape (draws,)."""
+    mean = law.at(law.aged)
+    covariance = law.aged.covariance(law.scatter, mean)
+    normal = np.random.default_rng(seed).standard_normal((draws, mean.size))
+    drawn = mean + normal @ blockwise(np.linalg.cholesky, covariance).T
+    return np.array([_days(law, x, goal, place) for x in solved_many(law, whitening_of(covariance), drawn)])
 
 
 def temperature_for(

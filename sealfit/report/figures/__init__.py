@@ -19,6 +19,10 @@ from sealfit.report.figures.residual import (
 from sealfit.report.figures.speed import force_speed, starts
 from sealfit.report.style import Plot
 
+# The figures of closure.json, and those of the tables alone, in the order of the report.
+OF_LOOP = (finding, before_after, effect_shapes, refused)
+OF_TABLES = (variance_levels, residual_channels, force_speed, aging, master_curve, starts, traces_mean)
+
 
 def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> dict[str, Plot]:
     """Return every plot that these tables give, by name; one without data is not there.
@@ -26,10 +30,6 @@ def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config
     `tables` are those of the report, all of them present, some perhaps empty; `closure` is closure.json, None
     of properties. The config gives the labels their true units.
     """
-    of_tables = (
-        variance_levels, residual_channels, force_speed, aging, master_curve, starts, traces_mean,
-    )  # fmt: skip
-    of_loop = () if closure is None else (finding, before_after, effect_shapes, refused)
-    plots = [make(tables, closure, config) for make in of_loop]
-    plots += [make(tables, config) for make in of_tables]
+    plots = [] if closure is None else [make(tables, closure, config) for make in OF_LOOP]
+    plots += [make(tables, config) for make in OF_TABLES]
     return {plot.name: plot for plot in plots if plot is not None}

@@ -39,14 +39,20 @@ UNCORRECTED = Key("before, without the effects", style.FLOOR, "dotted")
 
 # ---------------------------------------------------------------- aging
 def draw_aging(
-    ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, units: Units, before: pd.DataFrame | None = None
+    ax: Axes,
+    points: pd.DataFrame,
+    curves: pd.DataFrame,
+    units: Units,
+    before: pd.DataFrame | None = None,
+    quantities: Sequence[str] = (),
 ) -> None:
     """Draw the coefficients of one series over aging time: the law with its band, and each condition's fit.
 
     `points` are the fits per condition, with columns quantity, aging_days, value, lo95, hi95; `curves` are
     rows of table `aging_curves`, and `before` those of the same table without the loop's effects.
+    `quantities` are those of all series, in the order of their colours.
     """
-    quantities = list(dict.fromkeys([*curves["quantity"], *points["quantity"]]))
+    quantities = list(dict.fromkeys([*quantities, *curves["quantity"], *points["quantity"]]))
     for k, quantity in enumerate(quantities):
         colour, marker = style.CYCLE[k % len(style.CYCLE)], "os^Dv"[k % 5]
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
@@ -94,30 +100,45 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
         note += " steady_fit.parquet and aging_curves.parquet have all."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
     before = tables.get("aging_curves_before", curves.iloc[:0])
-    ends = [points["lo95"], points["hi95"]] if of_property else []  # of means, never without bound
-    shown = pd.concat(
-        [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"], *ends]
-    ).dropna()
-    out = 0.0 if of_property else 0.002  # share of a campaign's values that may lie outside
-    span = style.padded(shown.quantile(out), shown.quantile(1 - out))
     right = max(curves["aging_days"].max(), points["aging_days"].max() if len(points) else 0.0)
-    limits = {"xlim": (-0.03 * right, 1.03 * right), "ylim": span}
-    unaged = points["series"].map(is_unaged).astype(bool)
     panels = []
-    for name in series:
-        curve, earlier = curves[curves["series"] == name], before[before["series"] == name]
-        here = points[(points["series"] == name) | (unaged & (points["rubber"] == rubber.get(name)))]
-        draw = partial(draw_aging, points=here, curves=curve, units=config.units, before=earlier)
-        first = float(curve["value"].iloc[0])
-        symbols = [symbol_plain(quantity) for quantity in quantities]
-        alt = f"Aging, {names(name)}: {joined(symbols)} over {number(right)} d; "
-        alt += f"{symbols[0]} starts at {number(first)}."
-        panels.append(Panel(names(name), alt, draw, limits=limits))
-    legend = [Key(q, style.CYCLE[k % len(style.CYCLE)], symbol=True) for k, q in enumerate(quantities)]
+    # Properties have units of their own, and panels of their own.
+    for drawn in [[quantity] for quantity in quantities] if of_property else [quantities]:
+        own, fits, earlier = (one[one["quantity"].isin(drawn)] for one in (curves, points, before))
+        limits = {"xlim": (-0.03 * right, 1.03 * right), "ylim": _span(own, fits, earlier, of_property)}
+        unaged = fits["series"].map(is_unaged).astype(bool)
+        for name in series:
+            curve = own[own["series"] == name]
+            if curve.empty:
+                continue
+            here = fits[(fits["series"] == name) | (unaged & (fits["rubber"] == rubber.get(name)))]
+            draw = partial(
+                draw_aging, points=here, curves=curve, units=config.units,
+                before=earlier[earlier["series"] == name], quantities=drawn,
+            )  # fmt: skip
+            symbols = [symbol_plain(quantity) for quantity in dict.fromkeys(curve["quantity"])]
+            title = f"{names(name)}, {symbols[0]}" if of_property and len(quantities) > 1 else names(name)
+            alt = f"Aging, {names(name)}: {joined(symbols)} over {number(right)} d; "
+            alt += f"{symbols[0]} starts at {number(float(curve['value'].iloc[0]))}."
+            panels.append(Panel(title, alt, draw, limits=limits))
+    keys = [] if of_property and len(quantities) > 1 else quantities
+    legend = [Key(q, style.CYCLE[k % len(style.CYCLE)], symbol=True) for k, q in enumerate(keys)]
     of_point = "mean of a condition, 95 %" if of_property else "fit per condition, 95 %"
     legend += [Key(of_point, style.FLOOR, "point"), Key("aging law, 95 % band", style.FLOOR, "band")]
     legend += [UNCORRECTED] if len(before) else []
     return Plot("aging", "Aging", tuple(panels), tuple(legend), note)
+
+
+def _span(
+    curves: pd.DataFrame, points: pd.DataFrame, before: pd.DataFrame, of_property: bool
+) -> tuple[float, float]:
+    """Return the ends of the axis of values; intervals of means have bounds, those of fits may have none."""
+    ends = [points["lo95"], points["hi95"]] if of_property else []
+    shown = pd.concat(
+        [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"], *ends]
+    ).dropna()
+    out = 0.0 if of_property else 0.002  # share of a campaign's values that may lie outside
+    return style.padded(shown.quantile(out), shown.quantile(1 - out))
 
 
 def property_means(values: pd.DataFrame) -> pd.DataFrame:
@@ -307,7 +328,9 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     before = tables.get("master_curve_before", table.iloc[:0])
     for (rubber, quantity), rows in groups:
         earlier = before[(before["rubber"] == rubber) & (before["quantity"] == quantity)]
-        shown = pd.concat([rows["value"], earlier.loc[earlier["kind"] == "law", "value"]])
+        shown = pd.concat(
+            [rows["value"], rows["lo95"], rows["hi95"], earlier.loc[earlier["kind"] == "law", "value"]]
+        )
         limits = {"ylim": style.padded(shown.min(), shown.max())}
         draw = partial(draw_master_curve, rows=rows, colours=colours, units=config.units, before=earlier)
         words = QUANTITIES.get(quantity, symbol_plain(quantity))
@@ -318,7 +341,9 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
         Key(f"{given(t)} °C", colour, "point")
         for t, colour in style.spread(list(colours.items()), style.MOST_KEYS)
     ]
-    legend += [Key("unaged", style.BLACK, "point"), Key("law, 95 % band", style.FLOOR, "band")]
+    if ((table["kind"] == "value") & (table["scaled_days"] == 0)).any():
+        legend.append(Key("unaged", style.BLACK, "point"))
+    legend.append(Key("law, 95 % band", style.FLOOR, "band"))
     legend += [UNCORRECTED] if len(before) else []
     note += " master_curve.parquet has all." if note else ""
     return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

@@ -10,6 +10,7 @@ from itertools import chain
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from scipy.special import stdtrit
 
 from sealfit.config import Config
 from sealfit.report import style
@@ -95,6 +96,10 @@ def run_means(residuals: pd.DataFrame, column: str) -> pd.Series:
     return files.groupby(level="run_id", sort=True).mean().dropna()
 
 
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
     """Return the errors before and after with the noise floor, or None if no error is known."""
     if not any(known(closure["before"][key]) for key, _ in ERRORS):
@@ -113,8 +118,8 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: C
         column = "heldout_residual_N" if held else "residual_N"
         a, b = run_means(before, column).to_numpy(), run_means(after, column).to_numpy()
         if len(a) >= 4 and len(b) >= 4:
-            alt = f"{'Held-out errors' if held else 'Errors'} of {len(a)} run means: standard deviation "
-            alt += f"{number(float(np.std(a)))} before, {number(float(np.std(b)))} {unit} after."
+            alt = f"{'Held-out errors' if held else 'Errors'} of {len(a)} run means: rms "
+            alt += f"{number(_rms(a))} before, {number(_rms(b))} {unit} after."
             draw = partial(draw_histogram, before=a, after=b, units=config.units, held_out=held)
             panels.append(Panel("Errors of run means", alt, draw))
     same = closure["before"] == closure["after"]
@@ -128,14 +133,14 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: C
 def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
     """Return the evidence for the verdict: the residual along one variable, and the panels of the errors.
 
-    The variable is that of the effect that reduces the held-out error most, or, without an effect, the one
-    along which the residual is largest relative to its error. Of the direction it is the signed speed, over
+    The variable is that of the effect that reduces the held-out error most, or, without an effect, the most
+    significant one. Of the direction it is the signed speed, over
     which an offset, a factor and viscous friction of one direction differ. None if there is no residual.
     """
     errors, channels = before_after(tables, closure, config), tables["channels"]
     if errors is None or channels.empty:
         return None
-    order = channel_order(channels)
+    order = channel_order(tables)
     added = [effect for effect in by_gain(closure["effects"]) if not effect["candidate"]]
     own = chain.from_iterable(effect["channels"] for effect in added)
     panel = _own_panel(next((name for name in own if name in order), order[0]), tables, config)
@@ -170,7 +175,7 @@ def refused(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config
 def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     """Return the mean residuals at each commanded speed and direction, as rows of table `channels`.
 
-    Where no speed was commanded, measured ones that agree to two digits are one. Standard errors are from the
+    Where no speed was commanded, measured ones that agree to two digits are one. Intervals are from the
     strokes' means.
     """
     found, stroke = {}, ["run_id", "file", "stroke"]
@@ -180,7 +185,8 @@ def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
         measured = means["speed_mm_s"].map(lambda value: float(f"{value:.2g}"))
         speed = (np.sign(measured) * means["speed_set_mm_s"]).fillna(measured)
         groups, farthest = means.groupby(speed), means["residual_N"].abs().groupby(speed).idxmax()
-        found[f"{stage}_N"], found[f"{stage}_se_N"] = groups["residual_N"].mean(), groups["residual_N"].sem()
+        found[f"{stage}_N"] = groups["residual_N"].mean()
+        found[f"{stage}_half_N"] = groups["residual_N"].sem() * stdtrit(groups.size() - 1, 0.975)
         found[f"{stage}_run"] = farthest.map(means["run_id"])
     return pd.DataFrame(found).rename_axis("x").reset_index()
 
@@ -247,7 +253,7 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
         ("before", style.BEFORE, "o", -apart),
         ("after", style.AFTER, "s", apart),
     ):
-        spread = Z95 * rows[f"{stage}_se_N"].fillna(0.0).to_numpy(float)
+        spread = rows[f"{stage}_half_N"].fillna(0.0).to_numpy(float)
         places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
         points, *_ = ax.errorbar(
             places,
@@ -287,11 +293,16 @@ def categories(rows: pd.DataFrame, channel: str) -> list[str]:
     return rows["label"].astype(str).tolist()
 
 
-def channel_order(channels: pd.DataFrame) -> list[str]:
-    """Return the channels by the variance of the residual that they explain, the largest first."""
-    z2 = (channels["before_N"] / channels["before_se_N"].replace(0.0, np.nan)) ** 2
-    strength = z2.groupby(channels["channel"], sort=False).mean().fillna(0.0)
-    return strength.sort_values(ascending=False, kind="stable").index.tolist()
+def channel_order(tables: Mapping[str, pd.DataFrame]) -> list[str]:
+    """Return the channels by the p-value of what they explain of the residual, the smallest first."""
+    tests = tables["levels"]
+    tests = tests[(tests["stage"] == "before") & tests["p_value"].notna()]
+    first = tests.sort_values(["p_value", "sd_N"], ascending=[True, False])["channel"].tolist()
+    names = tables["channels"]["channel"]
+    return [
+        *(name for name in dict.fromkeys(first) if name in set(names)),
+        *names[~names.isin(first)].unique(),
+    ]
 
 
 def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
@@ -302,7 +313,7 @@ def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plo
     span = _span(channels)
     panels = [
         _channel_panel(channels[channels["channel"] == name], name, tables, config, span)
-        for name in channel_order(channels)[:MOST_CHANNELS]
+        for name in channel_order(tables)[:MOST_CHANNELS]
     ]
     return Plot("residual_channels", "Residual by variable", tuple(panels), STAGES)
 
@@ -330,7 +341,7 @@ def _channel_panel(
 def _span(channels: pd.DataFrame) -> tuple[float, float]:
     """Return the ends of a scale for all means and intervals; a wide interval does not flatten the rest."""
     means = channels[["before_N", "after_N"]].fillna(0.0)
-    half = Z95 * channels[["before_se_N", "after_se_N"]].fillna(0.0).to_numpy()
+    half = channels[["before_half_N", "after_half_N"]].fillna(0.0).to_numpy()
     largest = 2.5 * means.abs().max().max()
     low = max((means - half).min().min(), -largest)
     high = min((means + half).max().max(), largest)

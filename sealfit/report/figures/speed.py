@@ -151,14 +151,14 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     legend = [Key(short(names(c)), style.BLACK) for c in style.spread(unaged, style.MOST_KEYS)]
     for level in style.spread(levels, style.MOST_KEYS):
         legend.append(Key(short(names(f"{last}={level}")), colour[level]))
-    both = points["direction"].nunique() > 1
-    legend.append(Key("run means, forward" if both else "run means", style.FLOOR, "point"))
-    if both:
-        legend.append(Key("run means, backward", style.FLOOR, "left"))
-    if len(curves):
-        legend.append(Key("model", style.FLOOR))
-    if curves["direction"].nunique() > 1:
-        legend.append(Key("model, backward", style.FLOOR, "dashed"))
+    for what, signs, marks in (
+        ("run means", set(points["direction"]), {1: "point", -1: "left"}),
+        ("model", set(curves["direction"]), {1: "line", -1: "dashed"}),
+    ):
+        named = (
+            {1: f"{what}, forward", -1: f"{what}, backward"} if len(signs) > 1 else dict.fromkeys(signs, what)
+        )
+        legend += [Key(named[sign], style.FLOOR, marks[sign]) for sign in (1, -1) if sign in signs]
     if curves["lo"].notna().any():
         legend.append(Key("95 % band", style.FLOOR, "band"))
     gap = (curves["after"] - curves["before"]).abs().max()
@@ -235,8 +235,6 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
 
 MOST_START_PANELS = 6
 MOST_SPEEDS = 3
-COARSE = 60  # points with which a curve shows corners
-FINER = 6  # pieces that it is then drawn with between two points
 UP = 0.98  # share of the last force at which a start counts as over
 BEYOND = 1.5  # of that distance is shown
 
@@ -256,21 +254,10 @@ def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], un
             x, force, linestyle="", marker=marker, markersize=2.6, color=colour, markerfacecolor=face,
             markeredgewidth=0.7,
         )  # fmt: skip
-        ax.plot(*_smooth(x, curve["model_N"]), color=colour, linestyle=line)
+        ax.plot(x, curve["model_N"], color=colour, linestyle=line)
     ax.set_xlim(0.0, _reach(curves))
     ax.set_xlabel(plain(units.label("distance_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
-
-
-def _smooth(x: pd.Series, y: pd.Series) -> tuple[np.ndarray, np.ndarray]:
-    """Return finer points between the known ones of a curve, by monotone cubic interpolation."""
-    from scipy.interpolate import PchipInterpolator
-
-    x, y = x[y.notna()].to_numpy(float), y.dropna().to_numpy(float)
-    if not 2 < len(x) <= COARSE:
-        return x, y
-    fine = np.interp(np.linspace(0, len(x) - 1, FINER * (len(x) - 1) + 1), np.arange(len(x)), x)
-    return fine, PchipInterpolator(x, y)(fine)
 
 
 def _reach(curves: pd.DataFrame) -> float:
