@@ -136,7 +136,7 @@ TABLES = """
 Every table is `OUT/<name>.parquet`. The Parquet metadata of each column holds its unit and meaning as well;
 where a config declares another quantity, the true unit stands there. [The folder OUT](results.md) says what
 a row of each table is. A table `<name>_after` has the columns of `<name>`, with the effects of the loop
-taken out.
+taken out, and without the files that it left out.
 """
 
 EFFECTS = """

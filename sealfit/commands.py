@@ -200,8 +200,9 @@ def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, SteadyFit], 
             raise
         other = "or ask the declared model, without effects: --model before"
         raise StaleError(error.message, file=error.file, fix=f"{error.fix} ({other})") from error
-    added = [effect for effect in store.read_json("closure")["effects"] if not effect["candidate"]]
-    suffix = "_after" if added else ""
+    closure = store.read_json("closure")
+    added = [effect for effect in closure["effects"] if not effect["candidate"]]
+    suffix = "_after" if added or closure["outlier_files"] else ""
     taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
     return _conditions_of(store, suffix), taken_out
 

@@ -259,9 +259,11 @@ def _close_loop(store: Store, staged: Staged, options: Options, progress: Silent
     config = store.seen_config("close-loop")
     workers, bins = options.workers, store.read("bins")
     closure = close_loop(bins, store.traces(), config, workers=workers, on_progress=progress.say)
-    if closure.tables["effects"].size:
+    left_out = bool(closure.document["outlier_files"])
+    if closure.tables["effects"].size or left_out:
         progress.say("the fits with the effects taken out")
-    after = after_fits(closure.after, store.read("steady"), store.traces(), config, workers=workers)
+    steady, traces = store.read("steady"), store.traces()
+    after = after_fits(closure.after, steady, traces, config, left_out=left_out, workers=workers)
     with timed("writing tables"):
         _write(staged, {**closure.tables, **after})
     started = store.read("runs", ["started_at"])["started_at"].dropna()

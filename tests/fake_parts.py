@@ -183,7 +183,7 @@ class Parts:
             after=None,
         )
 
-    def after_fits(self, after, steady, traces, config, *, workers=1):
+    def after_fits(self, after, steady, traces, config, *, left_out=False, workers=1):
         return {schema.name: small(schema.name) for schema in AFTER}
 
     def build_report(self, tables, closure, provenance, config):

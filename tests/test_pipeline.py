@@ -126,7 +126,7 @@ def test_where_nothing_is_missing_after_is_before(first):
     assert (after.pop("model"), before.pop("model")) == ("after", "before")
     assert after == before
     said = sealfit(*asked[:-1]).stdout
-    assert said.startswith("model       after: no effect was added, so this is the declared model\n")
+    assert said.startswith("model       after: no effect was added\n")
     assert sealfit(*asked[:-1], "--model", "both", code=1).stderr.startswith(
         "sealfit: there is no model 'both'."
     )

@@ -315,16 +315,17 @@ def after_fits(
     traces: pd.DataFrame | Sequence[StoredTraces],
     config: Config,
     *,
+    left_out: bool = False,
     workers: int = 1,
 ) -> dict[str, pd.DataFrame]:
-    """Return the tables `*_after` by name; they have no rows if no effect was added.
+    """Return the tables `*_after` by name; they have no rows if no effect was added and no file left out.
 
     `after` is the after-model, fitted to all bins; `steady` and `traces` are these tables, or where `traces`
     is stored. The laws of single series are those of the joint fit. Single conditions are fitted to the
     strokes' forces without the effects, and the effects' covariance is propagated through these fits. The
     laws for all series, the pre-sliding fits and the break-away forces follow from them.
     """
-    if not after.model.terms:
+    if not after.model.terms and not left_out:
         return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}
     free = without_effects(steady, after, config)
     with timed("after: conditions", rows=len(free), of="strokes"):

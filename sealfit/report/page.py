@@ -169,6 +169,7 @@ def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
         "verdict": Markup(" ").join(map(_of_property, properties)),
         "facts": [f"{one['quantity']}: {values_clause(one)}" for one in properties],
         "references": [],
+        "left_out": False,
     }
 
 
@@ -216,6 +217,7 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
         "verdict": words.verdict(closure, config),
         "facts": campaign_facts(tables, config),
         "references": added if "steady_fit_before" in tables else [],
+        "left_out": "steady_fit_before" in tables,
     }
 
 

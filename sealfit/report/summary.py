@@ -180,8 +180,9 @@ def of_closure(closure: Mapping, units: Units) -> dict:
 
 
 def of_after(store: Store) -> dict:
-    """Return the summaries of the fits with the loop's effects taken out; empty where none was added."""
-    if all(effect["candidate"] for effect in store.read_json("closure")["effects"]):
+    """Return the summaries of the fits after the loop; empty if it added no effect and left out no file."""
+    closure = store.read_json("closure")
+    if all(effect["candidate"] for effect in closure["effects"]) and not closure["outlier_files"]:
         return {}
     return {
         "fit_steady": of_fit(store.read("steady_fit_after"), "condition"),

@@ -310,7 +310,7 @@ def _model(part: Mapping) -> list[str]:
     if part["model"] == "before":
         return ["before: declared model, without the effects of the loop"]
     if not part["effects"]:
-        return ["after: no effect was added, so this is the declared model"]
+        return ["after: no effect was added"]
     return [f"after, {effect['reference']}: {effect['label']}" for effect in part["effects"]]
 
 

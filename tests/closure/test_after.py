@@ -257,6 +257,20 @@ def test_nothing_is_doubled_where_nothing_was_added():
     assert all(table.empty for table in tables.values())
 
 
+def test_a_file_that_the_loop_left_out_is_in_no_fit_after_it():
+    bins = make_bins(1, temperatures=(60.0,), bins=2)
+    wrong = bins["file"].iloc[-1]
+    steady = steady_of(bins)
+    steady.loc[steady["file"] == wrong, "force_N"] *= 1.3
+    after = fitted(bins[bins["file"] != wrong])
+    tables = after_fits(after, steady, made_traces(bins), Config(), left_out=True)
+    sound = fit_conditions(steady[steady["file"] != wrong], Config())["steady_fit"]
+    found = tables["steady_fit_after"]
+    npt.assert_allclose(found["value"], sound["value"], rtol=1e-9, atol=1e-12)
+    assert set(found["model"]) == {"after"}
+    assert not tables["aging_fit_after"].empty
+
+
 def test_a_condition_may_be_called_rubber():
     bins = make_bins(7, days=(4.0,), **SCATTER)
     steady = fit_conditions(steady_of(bins), Config())
