@@ -171,8 +171,9 @@ BINS = table(
 )
 
 # ---------------------------------------------------------------- fits (long: one row per parameter)
-# The fits before the loop are without effects. If the loop added effects or left out files, the tables with the
-# suffix `_after` have the fits without these; otherwise they are empty. Column `model` is "before" or "after".
+# The fits before the loop are without effects. If the loop added effects or left out files, the tables with
+# the suffix `_after` have the fits without these; otherwise they are empty. Column `model` is "before" or
+# "after".
 MODEL = Column("model", "before: without effects | after: at the reference of the loop's effects", TEXT)
 _FIT = (
     MODEL,
