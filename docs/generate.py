@@ -108,10 +108,11 @@ COMMON = """
 
 - Results go to stdout; progress, warnings and faults go to stderr. With `--json` stdout is exactly one JSON
   object, also on failure: `{"ok": false, "errors": [{"file", "line", "column", "value", "fix", "reason"}]}`.
-- Exit codes: 0 success (whatever the verdict), 1 faulty input or request, 2 wrong usage, 70 a bug (traceback
-  on stderr; please report it), 130 Ctrl-C.
+  A fault of the data also has `check`, `stroke`, `severity` and `action`.
+- Exit codes: 0 success (whatever the verdict), 1 faulty input or request, or any fault that `check` finds, 2
+  wrong usage, 70 a bug (traceback on stderr; please report it), 130 Ctrl-C.
 - Without `--strict` a faulty row or file is left out and listed in the summary, the report and the table
-  `quality`.
+  `quality`. A faulty cell of the table of runs always stops the command.
 - The results do not depend on `--workers` or `--scheduler`. The latter takes `tcp://host:8786` or a scheduler
   file and needs `pip install 'sealfit[cluster]'`: [on a cluster](../how-to/cluster.md).
 - **Python is run from `--effects-folder`**: [your own effects](../how-to/own-effects.md).
@@ -136,13 +137,15 @@ TABLES = """
 Every table is `OUT/<name>.parquet`. The Parquet metadata of each column holds its unit and meaning as well;
 where a config declares another quantity, the true unit stands there. [The folder OUT](results.md) says what
 a row of each table is. A table `<name>_after` has the columns of `<name>`, with the effects of the loop
-taken out, and without the files that it left out.
+taken out, and without the files that it left out. `steady_after` also has `effects_N` (mean force of the
+subtracted effects over the steady window), `effects_start_N` (their force at the start of the stroke) and
+`effects_u1_N`, ... (its change by one standard error in each direction in which the effects are uncertain).
 """
 
 EFFECTS = """
 What the loop can add to the model by name. h is the change: by `add` it is added to the quantity, by
 `multiply` the quantity is multiplied by 1 + h. `sealfit effects` prints the same list. An effect that none
-of these describes is a free shape of its channels (`smooth`, `surface`, `levels`). [Add your
+of these describes is a free shape of its channels (`smooth`, `surface`, `levels`, `slopes`). [Add your
 own](../how-to/own-effects.md).
 """
 

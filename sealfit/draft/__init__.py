@@ -63,12 +63,12 @@ def draft(folder: Path) -> Draft:
 
 
 def summary_lines(made: dict) -> list[str]:
-    """Return what `sealfit init` prints: what was found, what could not be told, the command to run next."""
+    """Return what `sealfit init` prints: what was found, what was not determined, the command to run next."""
     count = f"{made['files']} trace file" + ("s" if made["files"] != 1 else "")
     lines = [f"{count} in {made['folder']}; {made['motion']}"]
     shown = [guess for guess in made["guesses"] if guess["key"].startswith(SHOWN)]
     lines += [f"  {guess['key'].rpartition('.')[2]}: {guess['evidence']}" for guess in shown]
     if made["doubts"]:
-        lines.append("could not be told:")
+        lines.append("not determined:")
         lines += [f"  - {doubt['reason']} {doubt['fix']}" for doubt in made["doubts"]]
     return [*lines, f"draft: {made['config']}", f"next: {made['next']}"]

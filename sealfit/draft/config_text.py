@@ -32,7 +32,7 @@ class Guess:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What could not be told: about which key, what was found, and what to do."""
+    """What could not be determined: about which key, what was found, and what to do."""
 
     key: str
     reason: str

@@ -176,7 +176,7 @@ ONSET = Parameter("t_0", "{x}", 1.0, (1e-4, 1e5), "aging time at which the chang
 
 
 @effect(
-    label="Stribeck speed changing with age",
+    label="Stribeck velocity changing with age",
     equation="h = A ln(1 + t / t_0)",
     reference="unaged",
     reads=("aging_days",),
@@ -190,7 +190,7 @@ ONSET = Parameter("t_0", "{x}", 1.0, (1e-4, 1e5), "aging time at which the chang
     worked=({"aging_days": 2.0}, {"A": 0.3, "t_0": 2.0}, 0.3 * 0.6931471805599453),
 )
 def stribeck_speed_aging(inputs, *, A, t_0):
-    r"""Stribeck speed that changes with age; the declared model has one for all days.
+    r"""Stribeck velocity that changes with age; the declared model has one for all days.
 
     v_s is the speed of the transition from boundary friction to a film or a molecular time scale. Hardened
     rubber conforms less to roughness and relaxes more slowly, which changes v_s. As for the coefficients, the

@@ -142,7 +142,7 @@ def load_exponent(inputs, *, A):
     acts_on=(("mu", "add"), ("mu", "multiply")),
     parameters=(
         amplitude("A", "{y}", 0.3, "drop of friction across the Stribeck curve", (-10.0, 10.0)),
-        Parameter("v_s", "{x}", 5.0, (1e-6, 1e6), "Stribeck speed", search="ratio"),
+        Parameter("v_s", "{x}", 5.0, (1e-6, 1e6), "Stribeck velocity", search="ratio"),
         Parameter("n", "", 1.0, (0.2, 10.0), "Stribeck exponent", search=EXPONENTS, vanishes_at=2.0),
     ),
     source="Exponents from 1/2 upwards: Bo & Pavelescu 1982, Wear 82(3), 277-289; review: "
@@ -262,9 +262,9 @@ def grosch_peak(inputs, *, A, v_p, w):
     reference="{humidity_pct} = {humidity_pct_ref}",
     reads=("humidity_pct",),
     acts_on=ROOM,
-    parameters=(amplitude("A", "{y}/{x}", -0.001, "change per per cent of relative humidity"),),
+    parameters=(amplitude("A", "{y}/{x}", -0.001, "change per percent of relative humidity"),),
     source="Form: ours. First order in the humidity about its mean.",
-    # By hand: 20 % below the reference at -0.1 % of friction per per cent.
+    # By hand: 20 % below the reference at -0.1 % of friction per percent.
     worked=({"humidity_pct": 35.0, "humidity_pct_ref": 55.0}, {"A": -0.001}, 0.02),
 )
 def humidity(inputs, *, A):

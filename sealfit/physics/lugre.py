@@ -103,7 +103,7 @@ def stribeck_decay(speed_mm_s, v_s):
     Parameters
     ----------
     speed_mm_s, v_s : float or ndarray
-        Sliding speed v in mm/s, of either sign; Stribeck speed in mm/s, broadcast against it.
+        Sliding speed v in mm/s, of either sign; Stribeck velocity in mm/s, broadcast against it.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def stribeck_decay(speed_mm_s, v_s):
     v_s = np.asarray(v_s, float)
     if not np.all(v_s > 0):
         raise ParameterError(
-            f"v_s = {np.min(v_s):g}: the Stribeck speed must be positive.", fix="Give v_s > 0."
+            f"v_s = {np.min(v_s):g}: the Stribeck velocity must be positive.", fix="Give v_s > 0."
         )
     return np.exp(-((np.asarray(speed_mm_s, float) / v_s) ** 2))
 
@@ -134,7 +134,7 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
         Sliding speed v in mm/s, signed; normal load N in N. A load of 1 turns the coefficients into forces
         F_s, F_c.
     mu_s, mu_c, v_s, sigma_2 : float or ndarray, shape (n,)
-        Static and Coulomb coefficients; Stribeck speed in mm/s; viscous coefficient in N s/mm.
+        Static and Coulomb coefficients; Stribeck velocity in mm/s; viscous coefficient in N s/mm.
 
     Raises
     ------
@@ -207,7 +207,7 @@ class LuGre:
 
     mu_s: float  # static coefficient
     mu_c: float  # Coulomb coefficient
-    v_s: float  # Stribeck speed in mm/s
+    v_s: float  # Stribeck velocity in mm/s
     sigma_0: float  # stiffness in N/mm
     sigma_1: float = 0.0  # damping of the bristles in N s/mm
     sigma_2: float = 0.0  # viscous coefficient in N s/mm

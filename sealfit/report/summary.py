@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from sealfit.report.summary_lines import has_weak_evidence
 from sealfit.units import Units
 
 if TYPE_CHECKING:
@@ -217,6 +218,8 @@ def verdict_clauses(closure: Mapping, units: Units) -> list[str]:
         remains = "no significant residual remains"
         if closure["left"]["significant"]:
             remains = f"what remains{residual_clause(closure, units)} is less than repeats scatter by"
+        elif has_weak_evidence(closure["left"]):
+            remains = f"the evidence of what remains{residual_clause(closure, units)} is weak"
         untold = untold_clause(closure, units)
         said = [remains, quality, f"not decided by these files: {untold}" if untold else ""]
     else:
@@ -360,7 +363,10 @@ def untold_clause(closure: Mapping, units: Units) -> str:
         if smallest is None:
             size, more = "no effect is detectable", f"; at least {files} files are needed"
         else:
-            size, more = f"detection limit {smallest:.2g} % of the force", f"; 1 % needs about {files} files"
+            size, more = (
+                f"detection limit {smallest:.2g} % of the force",
+                f"; 1 % needs about {float(f'{files:.2g}'):.0f} files",
+            )
         variable = f"{units.label(entry['variable'])} {level_words(entry['level'])}"
         texts.append(f"{variable} ({size}{more if files else ''})")
     return ", ".join(texts)

@@ -12,6 +12,8 @@ NOT_TRACES = {  # why a file in the campaign's folder is none of its traces, by 
     "excluded": "excluded by files.exclude",
     "file_name": "with names that are not UTF-8",
 }
+# Family-wise error rate of the search, by default. A larger p-value is not significant.
+SEARCHED = 0.005
 # Level of the test for lack of fit.
 LACKING = 0.05
 # Largest activation energy of aging that is plausible, in kJ/mol; rubbers have 20 to 150.
@@ -216,10 +218,16 @@ def _setting(name: str, value: object, units: Mapping[str, str]) -> str:
     )
 
 
+def has_weak_evidence(left: Mapping) -> bool:
+    """Return whether the search found the remaining residual significant, but its evidence is weak."""
+    return left["p_value"] is not None and left["p_value"] <= SEARCHED and not left["significant"]
+
+
 def _left(left: Mapping, unit: str) -> str:
     """Return the remaining residual: its size above the floor, the variable, and the p-value."""
     above = f"rms {_number(left['rmse_N'])} {unit} above the noise floor, " if left["rmse_N"] else ""
-    significant = "" if left["significant"] else ", not significant"
+    weak = ", weak evidence" if has_weak_evidence(left) else ", not significant"
+    significant = "" if left["significant"] else weak
     return f"{above}along {left['channel']} (p = {left['p_value']:.2g}{significant})"
 
 

@@ -60,7 +60,7 @@ def test_arrays_broadcast():
 
 @pytest.mark.parametrize("v_s", [0.0, -1.0, float("nan")])
 def test_refuses_a_stribeck_speed_that_is_not_positive(v_s):
-    with pytest.raises(ParameterError, match="Stribeck speed must be positive"):
+    with pytest.raises(ParameterError, match="Stribeck velocity must be positive"):
         stribeck_decay(1.0, v_s)
 
 

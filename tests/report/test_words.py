@@ -199,7 +199,8 @@ def test_a_significant_residual_below_the_scatter_of_repeats_is_said_beside_clos
     left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005}
     words = "What remains along displacement (mm) along strokes (p = 0.0005) is less than repeats scatter by."
     assert words in said(document(**left, significant=True))
-    assert "No significant residual remains." in said(document(**left, significant=False))
+    assert "The evidence of what remains along" in said(document(**left, significant=False))
+    assert "No significant residual remains." in said(document(**{**left, "p_value": 0.2}, significant=False))
 
 
 def test_what_is_not_decided_has_names_in_words():
