@@ -290,6 +290,7 @@ CHANNELS = table(
     Column("x", "middle of the group of channel values; null for a category"),
     Column("label", "the category, or null", TEXT),
     Column("n", "bins in the group", INT),
+    Column("along_motion", "whether residuals count in the direction of motion, not of the axis", BOOL),
     Column("before_N", "mean residual before"),
     Column("before_half_N", "half the width of its 95 % interval, from whole units; null for one unit"),
     Column("before_run", "run with the largest mean residual in the group", TEXT),

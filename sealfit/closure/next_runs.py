@@ -12,7 +12,7 @@ import pandas as pd
 from sealfit.closure.channels import too_short
 from sealfit.closure.confirm import AcceptedEffect, added_force
 from sealfit.closure.criteria import IDENTIFIABLE
-from sealfit.closure.forms import describe, grid_of, reference
+from sealfit.closure.forms import AGING, describe, grid_of, reference
 from sealfit.closure.left_out import OutlierFile
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
@@ -23,6 +23,7 @@ from sealfit.fit.joint.model import Model, Term, evaluate, mean_derivatives
 from sealfit.fit.joint.rows import ALONG, POWER, Rows, sliding_power
 from sealfit.fit.joint.search import bounds_of
 from sealfit.ingest.columns import condition_columns
+from sealfit.tables import CALENDAR
 
 # ---------------------------------------------------------------- aliases
 # Effects that are not distinguishable from the model with these runs.
@@ -118,6 +119,7 @@ SECOND_SPECIMEN = (
     "would show the scatter of specimens, which these do not determine, and no interval has it: "
     "another specimen of a tested condition"
 )
+ONE_ORDER = 0.99  # Rank correlation above which a channel follows another one.
 ROWS = 4  # Rows per stroke at which forces are compared.
 
 
@@ -267,8 +269,12 @@ def largest_difference(
 
 
 def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterator[dict[str, object]]:
-    """Yield combinations of values of the channels; days are kept without an aging law."""
+    """Yield combinations of values of the channels; days are kept without an aging law.
+
+    A channel that follows an earlier one, as two sensors of one pressure do, follows it here too.
+    """
     values: dict[str, list] = {}
+    followed = _followed(rows, channels)
     aged = rows.conditions["series"][rows.conditions["aging_days"] > 0]
     law = bool(len(aged)) and all(model.declared.law[series] for series in aged)
     for name in channels:
@@ -276,7 +282,7 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
         if name == "direction":
             values[name] = [-1.0, 1.0]
             continue
-        if name == "displacement_mm" or (name == "aging_days" and not law):
+        if name == "displacement_mm" or name in followed or (name == "aging_days" and not law):
             continue
         if own.dtype.kind != "f":
             values[name] = list(np.unique(own))
@@ -285,7 +291,27 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
         beyond = high if name == "repeat" else high + BEYOND * (high - low)
         values[name] = [low, float(np.median(own)), high, beyond]
     for point in itertools.product(*values.values()):
-        yield dict(zip(values, point, strict=True))
+        changes = dict(zip(values, point, strict=True))
+        for name, leader in followed.items():
+            if leader in changes:
+                x, first = np.unique(rows.unsigned(leader), return_index=True)
+                changes[name] = float(np.interp(changes[leader], x, rows.unsigned(name)[first]))
+        yield changes
+
+
+def _followed(rows: Rows, channels: Sequence[str]) -> dict[str, str]:
+    """Return the channels whose order is that of an earlier one, and which that is.
+
+    Days are no such channel: what was confounded with them in the campaign is to be separated.
+    """
+    found: dict[str, str] = {}
+    numeric = [n for n in channels if n not in ("direction", AGING) and rows.unsigned(n).dtype.kind == "f"]
+    ranks = {name: pd.Series(rows.unsigned(name)).rank() for name in numeric}
+    for one, other in itertools.combinations(numeric, 2):
+        calendar = (one in CALENDAR) + (other in CALENDAR)
+        if calendar != 1 and one not in found and abs(ranks[one].corr(ranks[other])) > ONE_ORDER:
+            found.setdefault(other, one)
+    return found
 
 
 def _rows_with(rows: Rows, changes: Mapping[str, object]) -> Rows:

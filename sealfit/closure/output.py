@@ -170,23 +170,32 @@ def _fitting(term: Term, values: Mapping[str, float]) -> Term:
 
 GROUPS = 12  # Groups of a numeric channel in the residual plot.
 POINTS = 60  # Points of a plotted curve.
+ROUNDING = 1e-9  # Relative difference that rounding errors make.
 PERIODS = 4  # Periods of a periodic effect that are drawn.
 
 
 def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.DataFrame:
-    """Return the mean residual by channel, before and after, with 95 % intervals from whole units."""
+    """Return the mean residual by channel, before and after, with 95 % intervals from whole units.
+
+    In strokes both ways an added force and a change of friction differ in sign. Residuals count along the
+    motion where the channel explains more of them so.
+    """
     rows = before.rows
-    runs = rows.table["run_id"].to_numpy()
+    runs, motion = rows.table["run_id"].to_numpy(), np.sign(rows.speed)
     records = []
     for name, known in selection.channels.items():
         values = rows.values(name) if name != "speed_mm_s" else np.abs(rows.speed)
         code, middle, labels = _grouped(values, numeric=known.numeric)
         units = rows.codes(scatter_level([known], rows))
+        explained = [_between_groups(before.residual * sign, rows.weight, code) for sign in (1.0, motion)]
+        along = name != "direction" and explained[1] > (1 + ROUNDING) * explained[0]
+        sign = motion if along else np.ones(motion.size)
         for group in np.unique(code):
             inside = code == group
             record = {"channel": name, "x": middle[group], "label": labels[group], "n": int(inside.sum())}
+            record["along_motion"] = bool(along)
             for stage, fitted in (("before", before), ("after", after)):
-                weight, residual = rows.weight[inside], fitted.residual[inside]
+                weight, residual = rows.weight[inside], (fitted.residual * sign)[inside]
                 record[f"{stage}_N"] = mean = weight @ residual / weight.sum()
                 record[f"{stage}_half_N"] = _half_width(
                     weight * (residual - mean) / weight.sum(), units[inside]
@@ -194,6 +203,14 @@ def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.Dat
                 record[f"{stage}_run"] = _farthest(runs[inside], weight, residual)
             records.append(record)
     return pd.DataFrame(records, columns=CHANNELS.names())
+
+
+def _between_groups(values: np.ndarray, weight: np.ndarray, code: np.ndarray) -> float:
+    """Return the weighted variance of the groups' means."""
+    sums, total = np.bincount(code, weight * values), np.bincount(code, weight)
+    kept = total > 0
+    means = sums[kept] / total[kept]
+    return float(np.average((means - np.average(means, weights=total[kept])) ** 2, weights=total[kept]))
 
 
 def _half_width(parts: np.ndarray, units: np.ndarray) -> float:

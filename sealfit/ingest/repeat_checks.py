@@ -213,15 +213,27 @@ def _copied(row: pd.Series, what: str) -> Fault:
     return Fault("copy", f"{what}: a copy is no second measurement.", **_place(row), fix=fix, **STROKE_OUT)
 
 
+# Largest mean friction over both directions, as a share of its size in one, at which a force is a magnitude.
+MAGNITUDE = 0.05
+
+
 def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
-    """Return a fault if the friction of a whole campaign has the direction of the motion.
+    """Return a fault if the friction of a whole campaign has the direction of the motion, or no sign at all.
 
     An offset of the sensor larger than the friction turns the sign in one direction only; with strokes in
-    both, the mean over the directions is the friction.
+    both, the mean over the directions is the friction. A magnitude has the same size in both.
     """
     used = strokes[strokes["used"].to_numpy(bool)]
     against = used["force_N"] * used["direction"]
-    friction = float(against.groupby(used["direction"] > 0).median().mean())
+    ways = against.groupby(used["direction"] > 0).median()
+    friction = float(ways.mean())
+    if len(ways) == 2 and ways.min() < 0.0 and abs(friction) < MAGNITUDE * ways.max():
+        reason = (
+            "the force has one sign and one size in both directions, as a magnitude has; friction opposes "
+        )
+        fix = "Export the signed force. If a signed speed is recorded, give the force its sign: "
+        fix += 'force_N = "force_N * sign(SPEED)" under [trace.compute].'
+        return [Fault("turned_sign", f"{reason}the motion.", column="force_N", value=friction, fix=fix)]
     if not friction < 0.0:
         return []
     count = int((against < 0.0).sum())

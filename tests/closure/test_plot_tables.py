@@ -54,6 +54,21 @@ def test_a_mean_residual_names_the_run_that_is_farthest_from_the_model():
     assert (table["before_run"].isin(set(bins["run_id"]))).all()
 
 
+@pytest.mark.parametrize(("added", "along"), [(True, False), (False, True)])
+def test_residuals_of_friction_count_along_the_motion_where_strokes_go_both_ways(added, along):
+    bins = bins_helpers.make_bins(repeats=2, bins=4, temperatures=(60.0,), directions=(1, -1), noise_N=0.02)
+    bins["oil"] = bins["repeat"].astype(float)
+    step = np.where(bins["repeat"] == 2, 1.0, 0.0)
+    bins["force_N"] += step * (1.0 if added else np.sign(bins["speed_mm_s"]))
+    rows = make_rows(bins, has_aging=True)
+    fitted = fit_declared(rows)
+    channels = {c.name: c for c in find_channels(rows)}
+    table = channel_table(Selection(fitted, fitted, (), (), (), None, None, channels), fitted, fitted)
+    own = table[table["channel"] == "oil"]
+    assert set(own["along_motion"]) == {along}
+    assert np.ptp(own["before_N"]) == pytest.approx(1.0, rel=0.2)
+
+
 def test_intervals_of_mean_residuals_hold_zero_where_nothing_is_missing():
     held = []
     for seed in range(12):

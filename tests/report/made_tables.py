@@ -376,6 +376,7 @@ def channels(found):
                 "x": values[index].mean() if numeric else None,
                 "label": None if numeric else values[index].iloc[0],
                 "n": len(index),
+                "along_motion": False,
             }
             for stage in found:
                 units = means[stage][key]

@@ -274,7 +274,7 @@ def test_levels_are_drawn_as_variance(ax):
 
 def test_channels_have_95_percent_bars(ax):
     mean = {"before_N": 1.0, "before_half_N": 0.5, "after_N": 0.0, "after_half_N": 0.5}
-    mean |= {"channel": "batch", "n": 9, "before_run": "r", "after_run": "r"}
+    mean |= {"channel": "batch", "n": 9, "along_motion": False, "before_run": "r", "after_run": "r"}
     rows = table("channels", [{"label": name, **mean} for name in "ab"])
     draw_channel(ax, rows, "batch", TORQUE)
     ends = ax.containers[0].lines[2][0].get_segments()[0][:, 1]

@@ -145,7 +145,7 @@ class Whitening:
         level = np.bincount(code, mean * friction / sd)
         about = friction / sd - level[code] * mean
         spread = np.sqrt(np.bincount(code, about**2))
-        flat = spread < FLAT * np.abs(level)
+        flat = spread <= FLAT * np.abs(level)
         # Unit vector along F - mean.
         about = np.where(flat[code], 0.0, about / np.where(flat, 1.0, spread)[code])
         self.root = np.sqrt(scatter.shape)

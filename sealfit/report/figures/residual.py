@@ -188,7 +188,7 @@ def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
         found[f"{stage}_N"] = groups["residual_N"].mean()
         found[f"{stage}_half_N"] = groups["residual_N"].sem() * stdtrit(groups.size() - 1, 0.975)
         found[f"{stage}_run"] = farthest.map(means["run_id"])
-    return pd.DataFrame(found).rename_axis("x").reset_index()
+    return pd.DataFrame(found).rename_axis("x").reset_index().assign(along_motion=False)
 
 
 # ---------------------------------------------------------------- residual by level
@@ -282,7 +282,8 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     else:
         style.category_ticks(ax, categories(rows, channel))
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
-    ax.set_ylabel(f"residual ({plain(units.unit('force'))})")
+    along = " along the motion" if rows["along_motion"].any() else ""
+    ax.set_ylabel(f"residual{along} ({plain(units.unit('force'))})")
 
 
 def categories(rows: pd.DataFrame, channel: str) -> list[str]:
