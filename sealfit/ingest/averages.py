@@ -25,7 +25,7 @@ from sealfit.ingest.quality import (
     swapped_faults,
 )
 from sealfit.ingest.reader import parse_trace
-from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes
+from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes, resolution_mm
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, motion_fault, speed_fault
 from sealfit.ingest.window import acceleration
 from sealfit.store.manifest import Fingerprint, fingerprint
@@ -336,6 +336,7 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
         return trace
     time_s, displacement, force = (trace.columns[name] for name in SLOTS)
     noise, wanted = (displacement_noise_mm(values, order=4) for values in (displacement, force))
+    noise = max(noise, resolution_mm(displacement) / math.sqrt(12.0))
     inertia = mass * acceleration(time_s, displacement, noise, wanted / mass)
     return trace.having({"force_N": force - inertia})
 

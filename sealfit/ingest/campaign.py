@@ -15,7 +15,7 @@ import pyarrow as pa
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
-from sealfit.ingest.columns import force_inputs
+from sealfit.ingest.columns import condition_columns, force_inputs
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, PartitionResult, plan_parts, shaped
 from sealfit.ingest.quality import computed_force, improbable_loads, incomplete_columns, quality_table
@@ -24,6 +24,7 @@ from sealfit.ingest.repeat_checks import (
     copied_strokes,
     outlying_files,
     reversed_strokes,
+    settings_within_runs,
     turned_sign,
 )
 from sealfit.ingest.runs import FIX, list_traces
@@ -40,7 +41,7 @@ from sealfit.progress import timed
 from sealfit.store.manifest import Fingerprint, Fingerprints, fingerprint
 from sealfit.store.parquet import as_words
 from sealfit.store.staged_writes import file_size
-from sealfit.tables import RUNS, STEADY
+from sealfit.tables import CALENDAR, RUNS, STEADY
 
 # ---------------------------------------------------------------- inputs
 
@@ -174,6 +175,7 @@ def ingest_campaign(
     seen = steady.drop(columns=[*config.loop.ignore_channels, *inputs], errors="ignore")
     faults += incomplete_columns(seen, config.series_columns if config.aging else ())
     faults += improbable_loads(steady, config) + computed_force(inputs & {*steady.columns})
+    faults += settings_within_runs(seen, {*STEADY.names(), *CALENDAR, *condition_columns(config)})
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)
     strokes = strokes.assign(used=used)

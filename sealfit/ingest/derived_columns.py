@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from sealfit.config import Config
+from sealfit.config import AGING_CONDITION, Config
 from sealfit.errors import KEPT, NOTED, CampaignError, ConfigError, Fault
 from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.columns import (
@@ -358,6 +358,23 @@ def add_repeats(columns: Columns) -> Columns:
         free = (number for number in range(1, len(members) + len(used) + 1) if number not in used)
         numbers.update({i: next(free) for i in members if given[i] is None})
     return {**columns, "repeat": put(given, numbers)}
+
+
+def pooled_unaged(columns: Columns, config: Config) -> list[Fault]:
+    """Return the condition columns in which unaged files differ, which make one condition nevertheless.
+
+    Unaged rubber has no aging temperature and compression; what a test is made at is another matter.
+    """
+    days = columns.get("aging_days", ())
+    unaged = [i for i, value in enumerate(days) if value == 0]
+    faults = []
+    for name in [n for n in config.condition if n not in (*AGING_CONDITION, *config.rubber) and n in columns]:
+        values = sorted({_text(value) for i in unaged if (value := columns[name][i]) is not None})
+        if len(values) > 1:
+            reason = f"unaged files differ in it ({', '.join(values)}), and are one condition."
+            fix = "Take it out of the config's condition, so that the loop tests it, or put it into rubber."
+            faults.append(Fault("unaged_pooled", reason, column=name, fix=fix, **KEPT))
+    return faults
 
 
 def disagreements(entries: list[Entry], columns: Columns, conditions: list[str]) -> list[Fault]:

@@ -291,7 +291,7 @@ def computed_force(inputs: Collection[str]) -> list[Fault]:
     if not inputs:
         return []
     reason = f"is computed from {', '.join(sorted(inputs))}: the search for effects leaves these columns out."
-    fix = "List them as drop_columns under [trace]; a column that is not in the list is searched."
+    fix = "To search one of them, list the others as drop_columns under [trace]."
     return [Fault("computed_force", reason, column="force_N", fix=fix, **KEPT)]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -243,6 +244,40 @@ def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
     turned = "-force_N" if computed is None else f"-({computed})"
     fix = f'Change its sign in the config: force_N = "{turned}" under [trace.compute].'
     return [Fault("turned_sign", reason, column="force_N", value=friction, fix=fix)]
+
+
+# Of a column that was set: most values, the largest share by which files of one value differ, and the share
+# of the runs whose repeats have several values from which on it is named.
+MOST_SETTINGS, SAME_SETTING, MOST_RUNS = 6, 0.02, 0.8
+
+
+def settings_within_runs(steady: pd.DataFrame, known: Collection[str]) -> list[Fault]:
+    """Return the columns with a few set values that differ between the repeats of most runs.
+
+    Such files are no repeats: what the setting does would count as scatter. `known` are columns that are no
+    settings, or that make runs.
+    """
+    run = steady.groupby("file", sort=False)["run_id"].first()
+    faults = []
+    for name in steady.columns.drop([*known], errors="ignore"):
+        if steady[name].dtype.kind not in "fi":
+            continue
+        ordered = steady.groupby("file", sort=False)[name].mean().dropna().sort_values()
+        code = (ordered.diff() > SAME_SETTING * ordered.abs().max()).cumsum()
+        settings = ordered.groupby(code)
+        if not 2 <= settings.ngroups <= MOST_SETTINGS or settings.size().min() < 2:
+            continue
+        if (settings.max() - settings.min() > SAME_SETTING * ordered.abs().max()).any():
+            continue
+        own = run[code.index]
+        repeated = own.groupby(own).transform("size") > 1
+        counts = code[repeated].groupby(own[repeated]).nunique()
+        if len(counts) and (counts > 1).mean() >= MOST_RUNS:
+            values = ", ".join(f"{value:.4g}" for value in settings.mean())
+            reason = f"differs between the repeats of {(counts > 1).sum()} of {len(counts)} runs: {values}."
+            fix = "If it was set, put it into the config's condition, or give these files a run_id each."
+            faults.append(Fault("setting_in_run", reason, column=name, fix=fix, **KEPT))
+    return faults
 
 
 def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, list[Fault]]:

@@ -50,6 +50,7 @@ from sealfit.ingest.derived_columns import (
     in_our_units,
     of_its_kind,
     out_of_range,
+    pooled_unaged,
     swapped_columns,
     to_values,
     with_computed,
@@ -243,7 +244,7 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     # One specimen per condition where none is named.
     specimens = over(columns.get("specimen_id", [None] * len(entries)), conditions)
     columns = add_repeats(columns | {"specimen_id": specimens})
-    faults += disagreements(entries, columns, conditions)
+    faults += disagreements(entries, columns, conditions) + pooled_unaged(columns, config)
     _stop_at_errors(faults, campaign, files)
     cut = cut_files(campaign, [file for file in files if kind_of(file, config.trace) == "csv"])
     return Listing(files, _set_speed(columns), conditions, cut), faults

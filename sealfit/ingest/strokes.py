@@ -318,6 +318,9 @@ def _flat_parts(
     return [*before, *found, *behind]
 
 
+WHOLE = 0.01  # largest distance of a whole number of steps from one, of numbers written with few digits
+
+
 def displacement_noise_mm(displacement_mm: np.ndarray, order: int = 2) -> float:
     """Return the standard deviation of one displacement sample of a trace, noise and resolution together.
 
@@ -340,6 +343,24 @@ def displacement_noise_mm(displacement_mm: np.ndarray, order: int = 2) -> float:
     if steps[single].sum() > 0.5 * steps.sum():
         noise = max(noise, np.median(steps[single]) / np.sqrt(12.0))
     return float(noise)
+
+
+def resolution_mm(displacement_mm: np.ndarray) -> float:
+    """Return the step of a displacement that moves by whole numbers of one step; 0 if it does not.
+
+    Examples
+    --------
+    >>> resolution_mm(np.round(np.arange(50) * 0.197, 1))
+    0.1
+    """
+    steps = np.abs(np.diff(displacement_mm))
+    bends = np.abs(np.diff(displacement_mm, 2))
+    bends = bends[bends > 1e-6 * steps.max(initial=0.0)]
+    if not bends.size:
+        return 0.0
+    step = float(bends.min())
+    whole = np.abs(steps / step - np.round(steps / step)).max() < WHOLE
+    return round(step, 12) if whole else 0.0
 
 
 def turning_rows(smooth_mm: np.ndarray, travel_mm: float) -> list[int]:

@@ -1,12 +1,15 @@
 """What spreadsheets, recorders and people do to files and tables, as exports of rigs show it."""
 
+import itertools
+
 import numpy as np
 import numpy.testing as npt
 import pytest
 from nptdms import ChannelObject, TdmsWriter
 from trace_helpers import DAYS, HEADER, ROWS, campaign, channels, config, csv_of, faults, read, refused, trace
 
-from sealfit.errors import ConfigError
+from sealfit.errors import CampaignError, ConfigError
+from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.file_names import TraceRef
@@ -209,3 +212,57 @@ def test_a_speed_in_the_name_of_a_column_is_its_unit():
     assert Units().of("feed_mm_s") == "mm/s"
     assert Units().of("v_m_s") == "m/s"
     assert Units().label("feed_mm_s") == "feed (mm/s)"
+
+
+# ---------------------------------------------------------------- what a config does not say
+def rows_of(folder, file, speed, force, pressure, reverse=False):
+    time = 0.01 * np.arange(400)
+    x = speed * np.where(time < 2, time, 4 - time)
+    way = np.where(time < 2, 1.0, -1.0)
+    shown = np.abs(force * way) if reverse else force * way
+    noise = np.random.default_rng(list(file.encode())).normal(0, 0.02, 400)
+    lines = [f"{t:.2f},{a:.4f},{f:.4f},{pressure}" for t, a, f in zip(time, x, shown + noise, strict=True)]
+    (folder / file).write_text("\n".join([f"{HEADER},pressure_bar", *lines]))
+
+
+@pytest.fixture
+def pressures(tmp_path):
+    """A campaign at two days, two speeds and two pressures, which only the traces have."""
+    table = ["file,aging_days,speed_mm_s"]
+    for day, speed, pressure in itertools.product((0, 4), (5, 20), (50, 150)):
+        file = f"d{day}_v{speed}_p{pressure}.csv"
+        rows_of(tmp_path, file, speed, 0.1 * pressure, pressure)
+        table.append(f"{file},{day},{speed}")
+    (tmp_path / "runs.csv").write_text("\n".join(table) + "\n")
+    return tmp_path
+
+
+def test_a_setting_that_differs_between_repeats_is_named(pressures):
+    quality = ingest_campaign(pressures, config(DAYS)).tables["quality"]
+    (found,) = quality[quality["check"] == "setting_in_run"].to_dict("records")
+    assert found["column"] == "pressure_bar"
+    assert "4 of 4 runs: 50, 150." in found["reason"]
+
+
+def test_unaged_files_that_differ_in_a_setting_of_the_test_are_named(pressures):
+    table = [line.split(",") for line in (pressures / "runs.csv").read_text().split()]
+    rows = [[*cells, cells[0].partition("_p")[2].removesuffix(".csv")] for cells in table[1:]]
+    text = "\n".join(",".join(cells) for cells in [[*table[0], "pressure_bar"], *rows])
+    (pressures / "runs.csv").write_text(text + "\n")
+    text = 'condition = ["pressure_bar", "aging_days"]\n'
+    _, found = list_traces(pressures, config(text))
+    (fault,) = (fault for fault in found if fault.check == "unaged_pooled")
+    assert fault.column == "pressure_bar"
+    assert "(150, 50)" in fault.reason
+    assert not [f for f in list_traces(pressures, config(text + 'rubber = ["pressure_bar"]'))[1] if f.column]
+
+
+def test_a_force_that_is_a_magnitude_is_no_friction_of_turned_sign(tmp_path):
+    for speed in (5, 20):
+        rows_of(tmp_path, f"v{speed}.csv", speed, 8.0, 50, reverse=True)
+    text = f'{LOT}files.glob = "*.csv"\nruns.constants = {{lot = "A"}}\n'
+    with pytest.raises(CampaignError) as caught:
+        ingest_campaign(tmp_path, config(text))
+    (fault,) = (fault for fault in caught.value.faults if fault.check == "turned_sign")
+    assert "as a magnitude has" in fault.reason
+    assert "sign(SPEED)" in fault.fix

@@ -11,6 +11,7 @@ from sealfit.fit.dynamic.starts import strokes_along
 from sealfit.fit.joint.rows import merge_directions, nesting_run, records
 from sealfit.fit.steady.uncertainty import run_means
 from sealfit.ingest.campaign import ingest_campaign
+from sealfit.ingest.strokes import displacement_noise_mm, resolution_mm
 from sealfit.ingest.window import acceleration
 
 ONE = 'condition = ["lot"]\nfiles.glob = "*.csv"\nruns.constants = {lot = "A", run_id = "A"}\n'
@@ -177,3 +178,11 @@ def test_the_mass_is_in_units_of_the_rig():
     assert config(mass + metres).mass == pytest.approx(2.0)
     with pytest.raises(ConfigError, match=r"rig\.moving_mass_kg"):
         config(mass + '[quantities]\nforce = {quantity = "torque", unit = "N m"}\n')
+
+
+@pytest.mark.parametrize("speed", [100.0, 197.0, 300.0])
+def test_the_inertia_of_a_motion_in_steps_of_the_encoder_is_smooth(speed):
+    time = 1e-3 * np.arange(1000)
+    x = np.round(speed * time, 1)
+    noise = max(displacement_noise_mm(x, order=4), resolution_mm(x) / np.sqrt(12.0))
+    assert np.abs(acceleration(time, x, noise, 500.0)).max() < 5000.0  # a step is 0.1 mm / (1 ms)^2 = 1e5
