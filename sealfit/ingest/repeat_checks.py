@@ -248,7 +248,7 @@ def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
 
 # Of a column that was set: most values, the largest share by which files of one value differ, and the share
 # of the runs whose repeats have several values from which on it is named.
-MOST_SETTINGS, SAME_SETTING, MOST_RUNS = 6, 0.02, 0.8
+MOST_SETTINGS, SAME_SETTING, MOST_RUNS = 6, 0.05, 0.8
 
 
 def settings_within_runs(steady: pd.DataFrame, known: Collection[str]) -> list[Fault]:
