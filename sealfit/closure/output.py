@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from pandas.api.typing import SeriesGroupBy
 
-from sealfit.closure.channels import Channel, scatter_level, unit_of
+from sealfit.closure.channels import Channel, scatter_level, settings, unit_of
 from sealfit.closure.errors_and_intervals import (
     degrees_of_freedom,
     mean_half_width,
@@ -170,6 +170,7 @@ def _fitting(term: Term, values: Mapping[str, float]) -> Term:
 
 GROUPS = 12  # Groups of a numeric channel in the residual plot.
 POINTS = 60  # Points of a plotted curve.
+MOST_LOADS = 4  # Loads that have curves of their own.
 ROUNDING = 1e-9  # Relative difference that rounding errors make.
 PERIODS = 4  # Periods of a periodic effect that are drawn.
 
@@ -369,14 +370,19 @@ def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
 
 
 def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
-    """Return force against speed per condition, before and after, other channels at their means."""
+    """Return force against speed per condition, before and after, other channels at their means.
+
+    Each of a few loads has curves of its own.
+    """
     rows = after.rows
     channels = {name for term in (*before.model.terms, *after.model.terms) for name in term.channels}
     read = [name for name in rows.table.columns if name in {*CURVES.names(), *channels}]
     own = {name: rows.values(name) for name in open_columns(rows.table)}
     moving = rows.speed != 0
+    loads = settings(rows.load)
+    loads = loads if np.unique(loads).size <= MOST_LOADS else np.zeros_like(loads)
     # Arrays, as a channel may have any name; forward strokes first.
-    keys = [rows.condition[moving], -np.sign(rows.speed[moving])]
+    keys = [rows.condition[moving], -np.sign(rows.speed[moving]), loads[moving]]
     groups = pd.DataFrame({**rows.table, **own})[moving].groupby(keys)
     points = pd.DataFrame({name: _averaged(groups[name]) for name in read})
     low, high = pd.Series(np.abs(rows.speed[moving])).groupby(keys).agg(["min", "max"]).to_numpy().T

@@ -38,7 +38,7 @@ def draft(folder: Path) -> Draft:
     notes = Notes()
     tables = read_tables(found)
     roles = find_roles(columns_of(found.dialect, list(tables.values())))
-    if roles.time is None and roles.force is None:
+    if roles.time is None and roles.force is None and roles.coefficient is None:
         tables = f"{len(found.traces)} files hold tables of numbers, such as {found.traces[0]}"
         fix = "Give the folder that holds traces: time, displacement and force in columns."
         raise RequestError(f"{tables}, but no time and no force.", file=folder, fix=f"{fix} {VALUES}")

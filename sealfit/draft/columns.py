@@ -195,6 +195,7 @@ class Roles:
     signs_differ: bool = False
     signed_files: int = 0
     strength: float = 0.0  # how well the force follows, of the best file that moves both ways
+    coefficient: TraceColumn | None = None  # of friction, beside a load: where there is no force
 
     def dimension(self, role: str) -> str:
         """Return what the unit of a role's column measures; "" where there is no column or no unit."""
@@ -258,9 +259,12 @@ def find_roles(columns: Sequence[TraceColumn]) -> Roles:
     velocities = _velocities(time, displacement, speed)
     force = _best(rest, "force", lambda column: _as_force(column, velocities)) if velocities else None
     rest = [column for column in rest if column is not force]
-    load = _load(rest) if force is not None else None
+    coefficient = next((c for c in rest if c.role == "coefficient"), None) if force is None else None
+    load = _load(rest) if force is not None or coefficient is not None else None
+    coefficient = coefficient if load is not None else None
     taken = (time, displacement, force, load, speed)
-    found = Roles(*taken, tuple(column for column in columns if column not in taken))
+    others = tuple(column for column in columns if column not in (*taken, coefficient))
+    found = Roles(*taken, others, coefficient=coefficient)
     return _with_sign(found, velocities) if force is not None else found
 
 

@@ -173,6 +173,13 @@ def column_keys(
             notes.guess(f"trace.compute.{slot}", f"-{name}", NEGATED[role])
             helpers.append(name)
         _column_doubts(column, role, f"trace.columns.{name}", roles, notes)
+    if roles.coefficient is not None:
+        evidence = f"{roles.coefficient.place}: by its name; there is no column of force"
+        notes.guess("trace.columns.coefficient", roles.coefficient.key, evidence)
+        notes.guess(
+            "trace.compute.force_N", "coefficient * load_N", "a coefficient of friction times the load"
+        )
+        helpers.append("coefficient")
     if roles.displacement is None and roles.speed is not None:
         helpers.append(_integrated(roles.speed, notes))
     clock = _clock_or_rate(found, notes) if roles.time is None else None
@@ -278,7 +285,8 @@ def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:
         "force": "no column follows the motion: there is no force.",
     }
     for role, reason in wanted.items():
-        other = {"displacement": roles.speed is not None, "time": has_clock}.get(role, False)
+        instead = {"displacement": roles.speed, "force": roles.coefficient}
+        other = has_clock if role == "time" else instead[role] is not None
         if getattr(roles, role) is None and not other:
             fix = f"Name it as {SLOTS[role]}, by the file's name of the column or by its position."
             fix += " Or give the rows per second as rate_Hz under [trace]." if role == "time" else ""

@@ -48,8 +48,8 @@ STRONG, WEAK = 3, 1  # a word that says it, a single letter that may
 
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 _COLUMN_WORDS = (
-    ("none", r"\bcof\b|\bmue?\b|coefficient|reibwert|reibungszahl|reibzahl|\bindex\b|\bscan\b|\bsample\b"
-             r"|\bnr\b|\bno\b|count|segment|cycle|zyklus|comment|kommentar|alarm"
+    ("coefficient", r"\bcof\b|\bmue?\b|coefficient|reibwert|reibungszahl|reibzahl"),
+    ("none", r"\bindex\b|\bscan\b|\bsample\b|\bnr\b|\bno\b|count|segment|cycle|zyklus|comment|kommentar|alarm"
              r"|\bsoll|set ?point|command|target|demand|stress|strain|spannung|dehnung|volt|\braw\b"),
     ("temperature", r"temp(?!s\b|o\b)"),
     ("humidity", r"humid|feucht"),
@@ -86,7 +86,7 @@ def column_role(name: str) -> tuple[str, int]:
     Examples
     --------
     >>> column_role("Traversenweg"), column_role("F"), column_role("COF"), column_role("MX440B_CH 1")
-    (('displacement', 3), ('force', 1), ('none', 3), ('', 0))
+    (('displacement', 3), ('force', 1), ('coefficient', 3), ('', 0))
     """
     words = plain(name)
     for role, pattern in _COLUMN_WORDS:

@@ -40,6 +40,17 @@ def test_curves_go_both_ways_over_the_speeds_of_each_condition_at_its_mean_load(
         assert (curve["force_after_lo95_N"] < curve["force_after_N"]).all()
 
 
+def test_each_of_two_loads_has_curves_of_its_own():
+    table = bins_helpers.make_bins(repeats=2, bins=4, temperatures=(60.0,))
+    heavy = table["repeat"] == 2
+    table.loc[heavy, ["load_N", "force_N"]] *= 2
+    rows = make_rows(table, has_aging=True)
+    fitted = fit(start_model(rows), rows, turns=1)
+    curves = curve_table(fitted, fitted)
+    loads = curves.groupby("condition")["load_N"].unique()
+    assert all(len(own) == 2 and own[1] == pytest.approx(2 * own[0]) for own in loads)
+
+
 def test_a_mean_residual_names_the_run_that_is_farthest_from_the_model():
     bins = bins_helpers.make_bins(repeats=2, bins=4, temperatures=(60.0,), setup=0.0005)
     far = bins["run_id"].iloc[-1]

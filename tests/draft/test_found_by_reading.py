@@ -2,11 +2,14 @@
 
 import exports
 import numpy as np
+import numpy.testing as npt
 import pytest
 
 from sealfit.config import parse_config
 from sealfit.draft import draft
 from sealfit.errors import RequestError
+from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
 
 HEADER = "Time [s],Displacement [mm],Force [N]\n"
@@ -102,6 +105,21 @@ def test_a_speed_in_names_that_is_not_the_measured_one_is_a_doubt(tmp_path):
 def test_temperatures_in_degrees_have_no_unit_of_their_own(tmp_path):
     made = draft(folder(tmp_path, {"T70C_d1.csv": "", "T90C_d1.csv": ""}))
     assert "degC" not in made.text
+
+
+def test_a_coefficient_beside_a_load_gives_the_force(tmp_path):
+    for day in (1, 2):
+        rows = [line.split(",") for line in strokes().splitlines()]
+        lines = [f"12:00:{float(t):06.3f};{x};{float(force) / 20:.4f};20.1" for t, x, force in rows]
+        text = "\n".join(["Uhrzeit;Weg [mm];Reibwert [-];Normalkraft [N]", *lines])
+        (tmp_path / f"d{day}.csv").write_text(text + "\n")
+    made = draft(tmp_path)
+    trace = config(made).trace
+    assert trace.compute == {"force_N": "coefficient * load_N"}
+    assert trace.columns["coefficient"].name == "Reibwert [-]"
+    read = read_trace(tmp_path, TraceRef("d1.csv", {}), config(made))
+    npt.assert_allclose(np.abs(read.columns["force_N"]), 0.5 * 20.1, rtol=1e-3)
+    assert not [doubt for doubt in made.doubts if "no force" in doubt.reason]
 
 
 # ---------------------------------------------------------------- tables and other files
