@@ -85,7 +85,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 times = search.smallest(own[0], effect)
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
                 stated = float(max(TO_BE_ADDED * times, criteria.SIZE_MARGIN * criteria.LEAST_SIZE))
-                smallest = force * stated if times < 1 else None
+                smallest = force * stated if stated < 1 else None
             if smallest is not None:
                 needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
             elif name in in_model:

@@ -338,10 +338,15 @@ def power_clause(closure: Mapping, units: Units) -> str:
     """
     known = [s for s in closure["sensitivity"] if s["smallest_N"] is not None]
     texts = [
-        f"{s['smallest_pct']:.2g} % for {units.label(s['variable'])} {level_words(s['level'])}"
+        f"{_two_digits(s['smallest_pct'])} % for {units.label(s['variable'])} {level_words(s['level'])}"
         for s in sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
     ]
     return f"the largest detection limits, in percent of the force, are {', '.join(texts)}" if texts else ""
+
+
+def _two_digits(value: float) -> str:
+    """Return a number with two significant digits and no exponent: 41, 0.5, 150000."""
+    return f"{float(f'{value:.2g}'):.12g}"
 
 
 def untold_clause(closure: Mapping, units: Units) -> str:
@@ -364,8 +369,8 @@ def untold_clause(closure: Mapping, units: Units) -> str:
             size, more = "no effect is detectable", f"; at least {files} files are needed"
         else:
             size, more = (
-                f"detection limit {smallest:.2g} % of the force",
-                f"; 1 % needs about {float(f'{files:.2g}'):.0f} files",
+                f"detection limit {_two_digits(smallest)} % of the force",
+                f"; 1 % needs about {_two_digits(files)} files",
             )
         variable = f"{units.label(entry['variable'])} {level_words(entry['level'])}"
         texts.append(f"{variable} ({size}{more if files else ''})")
