@@ -27,7 +27,7 @@ FAR_BELOW = 0.25
 # inside the window.
 SHORT = 0.01
 # Share of the stroke in which the fall of an overshoot comes down by 63 %, at most.
-SOON = 0.03
+SOON = 0.05
 # The same for a peak that is `LARGE`.
 HIGH = 1.0 / 3.0
 # Share of the whole change of the force since rest from which a rise or fall on the plateau of the speed is

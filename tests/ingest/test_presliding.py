@@ -148,6 +148,12 @@ def test_a_stroke_that_ends_before_it_is_steady_says_so_and_is_used(tmp_path):
     assert short["presliding_N"].iloc[0] < 1.5 * short["presliding_N"].iloc[-1] < 0
 
 
+@pytest.mark.parametrize("ratio", [22.0, 25.0, 30.0])
+def test_a_small_overshoot_after_a_reversal_is_over_too(ratio):
+    _, corrected = steady_forces(ratio, begin=-LEVEL, damping=2.3 * LEVEL)
+    assert corrected.mean() == pytest.approx(LEVEL, rel=3e-4)
+
+
 @pytest.mark.parametrize("ratio", [40.0, 100.0, 300.0])
 @pytest.mark.parametrize("damping", [1.5, 3.0, 6.0])
 def test_damped_bristles_that_overshoot_are_over_too(ratio, damping):
