@@ -167,8 +167,9 @@ def body_of(text: bytes, layout: FileLayout, settings: TraceFormat) -> bytes:
 
 def width_of(body: bytes, delimiter: str) -> int:
     """Return how many cells the first line that is not blank has."""
-    blank = len(body) - len(body.lstrip(b"\n \t"))
-    first = body[body.rfind(b"\n", 0, blank) + 1 :].partition(b"\n")[0]
+    begin = body.rfind(b"\n", 0, len(body) - len(body.lstrip(b"\n \t"))) + 1
+    end = body.find(b"\n", begin)
+    first = body[begin : None if end < 0 else end]
     return len(split_line(first.decode("utf-8", "replace"), delimiter))
 
 

@@ -92,15 +92,13 @@ def lifetime(
     """
     place = _place(law, temperature_C, compression_ratio_pct)
     days = _days(law, law.x, goal, place)
-    if (
-        not 0 < days < FOREVER
-    ):  # the value may lie on the other side of the threshold, or the limit of the law
-        low, high = (float(end) for end in np.quantile(_drawn(law, goal, place), ENDS, method=OF_DRAWS))
-    else:
+    if 0 < days < FOREVER:
         with np.errstate(divide="ignore", invalid="ignore"):  # the lifetime may be 0 or inf nearby
             slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
         half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
+    else:  # the start or the limit of the law may lie on the other side of the threshold
+        low, high = (float(end) for end in np.quantile(_drawn(law, goal, place), ENDS, method=OF_DRAWS))
     low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
     asked = days * float(law.factors(place)[0][0])
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
