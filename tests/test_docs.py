@@ -140,7 +140,12 @@ def test_the_verdicts_that_a_page_quotes_are_said_so():
         },
         "closed": {"effects": [{"candidate": False}], "fit_quality": above, "sensitivity": []},
     }
-    others = {"refused": [], "outlier_files": [], "noise_floor_N": None, "left": {"significant": False}}
+    others = {
+        "refused": [],
+        "outlier_files": [],
+        "noise_floor_N": None,
+        "left": {"significant": False, "p_value": None},
+    }
     text = (DOCS / "how-to" / "verdict.md").read_text("utf-8")
     shown = dict(re.findall(r"^    verdict     (\w+): (.*)$", text, re.MULTILINE))
     for verdict, closure in found.items():
