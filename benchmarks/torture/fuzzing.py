@@ -254,10 +254,10 @@ def remember_computations() -> None:
 def _remembered(real: Callable) -> Callable:
     known: dict[str, object] = {}
 
-    def call(*given, on_progress=None, workers=1):
-        key = "\0".join(map(_key, given))
+    def call(*given, on_progress=None, workers=1, **more):
+        key = "\0".join(map(_key, (*given, *more.values())))
         if key not in known:
-            known[key] = real(*given)
+            known[key] = real(*given, **more)
         return known[key]
 
     return call

@@ -131,10 +131,11 @@ def read_table(
     lines, columns, found = _rows(below, names, delimiter, table, needed)
 
     def with_point(cell: str) -> str:
-        thousands = delimiter == "," and re.fullmatch(r"[^,]*(,\d{3})+", cell.strip())
-        return cell if thousands or as_number(cell, ",") is None else cell.replace(",", ".")
+        return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
 
-    columns = {name: mapped(column, with_point) for name, column in columns.items()}
+    # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
+    if delimiter != ",":
+        columns = {name: mapped(column, with_point) for name, column in columns.items()}
     for name in columns.keys() - {needed}:
         columns[name] = mapped(columns[name], _unless_missing)
     return lines, columns, faults + found

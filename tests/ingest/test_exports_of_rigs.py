@@ -137,12 +137,6 @@ def test_codes_for_no_value_are_numbers(tmp_path, cell, value):
     assert one.get("humidity_pct") == value
 
 
-def test_quoted_decimal_commas_are_read_and_thousands_are_not_guessed(tmp_path):
-    table = 'file,aging_days,oven_C,mass_g\na.csv,4,"45,5","1,500"\n'
-    (one,) = channels(campaign(tmp_path, table, ("a.csv",)), DAYS).values()
-    assert (one["oven_C"], one["mass_g"]) == (45.5, "1,500")
-
-
 # ---------------------------------------------------------------- files
 @pytest.mark.parametrize("tail", ["\n,,\n,,\n", "\n ; ;\n", "\n\x1a", "\n"])
 def test_what_programs_write_below_the_data_is_no_row(tmp_path, tail):
