@@ -103,9 +103,9 @@ def glob_names(folder: Path, files: Files) -> list[str]:
 
 
 def found_by_glob(folder: Path, glob: str) -> list[str]:
-    """Return what a glob finds in `folder`, but folders, hidden files and results of sealfit."""
+    """Return what a glob finds in `folder`, but folders, hidden files and results of sealfit below it."""
     found = [path.relative_to(folder) for path in folder.glob(glob) if not path.is_dir()]
-    parents = {parent for path in found for parent in path.parents}
+    parents = {parent for path in found for parent in path.parents} - {Path()}
     results = {parent for parent in parents if (folder / parent / STATE).is_file()}
     return [
         path.as_posix()

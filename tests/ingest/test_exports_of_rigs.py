@@ -183,6 +183,13 @@ def test_hidden_files_and_results_are_not_found_by_a_glob(tmp_path):
     assert list(found) == ["a/T70_d1.csv"]
 
 
+def test_a_campaign_that_holds_results_itself_keeps_its_traces(tmp_path):
+    trace(tmp_path, "a/T70_d1.csv")
+    (tmp_path / "state.json").write_text("{}")
+    found = channels(tmp_path, f'{DAYS}files.glob = "**/*.csv"\nruns.constants = {{aging_days = 4}}')
+    assert list(found) == ["a/T70_d1.csv"]
+
+
 @pytest.mark.parametrize("glob", ["/data/*.csv", "../*.csv", ""])
 def test_a_glob_that_leads_outside_is_a_fault_of_the_config(glob):
     with pytest.raises(ConfigError, match=r"files\.glob"):
