@@ -9,13 +9,11 @@ import numpy as np
 
 from sealfit.ingest.segments import strong_wave
 
-# Rise lengths after which a rise is over: 1/50000 of it is left. 1/5000 still showed in means over a
-# campaign.
+# Rise lengths after which a rise is over: 1/50000 is left. 1/5000 still showed in means over a campaign.
 SETTLED = np.log(50000.0)
 # Rise lengths after a speed ramp: the bristles follow the changing speed over one of them.
 AFTER_RAMP = 3.0
-# Rise lengths after which a rise is over where `SETTLED` would take more than a third of the stroke: 1 % is
-# left.
+# The same where `SETTLED` would take more than a third of the stroke: 1 % is left.
 ENOUGH = np.log(100.0)
 # Share of the stroke at which a rise ends at the latest where what is left of it is known.
 LATEST = 0.5
@@ -23,26 +21,17 @@ LATEST = 0.5
 HALF_WAY = 0.75
 # Share of its level below which a force begins far from it: only a rise comes up from there, however long.
 FAR_BELOW = 0.25
-# Distance of `HALF_WAY`, as a share of the stroke. A longer climb is an effect (run-in, warming) and stays
-# inside the window.
+# Distance of `HALF_WAY`, as a share of the stroke. A longer climb is an effect (run-in, warming).
 SHORT = 0.01
-# Share of the stroke in which the fall of an overshoot comes down by 63 %, at most.
-SOON = 0.05
-# The same for a peak that is `LARGE`.
-HIGH = 1.0 / 3.0
-# Share of the whole change of the force since rest from which a rise or fall on the plateau of the speed is
-# large: damping explains it, and nothing that changes slowly along a stroke.
-LARGE = 0.25
-# The same from which the law of the bristles is asked on the plateau. It must explain the rise there.
-PART = 0.1
-# Share of the variance of the force on the plateau that the law of the bristles must explain there, and the
-# number of means of which that variance is taken.
-EXPLAINED = 0.9
-MEANS = 24
-# Share of the distance between which the plateau is read: near the rise, and past any ordinary rise.
-EARLY = (0.05, 0.5)
-# The same where the rise takes so long that half of the stroke may still be part of it.
-LATE = (0.6, 0.95)
+# Share of the stroke in which the fall of an overshoot, and of one that is `LARGE`, comes down by 63 %.
+SOON, HIGH = 0.05, 1.0 / 3.0
+# Share of the change of the force since rest from which a rise or fall on the plateau of the speed is large:
+# damping explains it, and nothing that changes slowly. From `PART` on the bristles' law is asked there.
+LARGE, PART = 0.25, 0.1
+# Share of the variance of so many means of the force on the plateau that this law must explain.
+EXPLAINED, MEANS = 0.9, 24
+# Share of the distance between which the plateau is read: past any ordinary rise, and past a long one.
+EARLY, LATE = (0.05, 0.5), (0.6, 0.95)
 # Share of the stroke beyond which a rise to 63 % is long: the stroke is hardly longer than its pre-sliding.
 LONG = 0.1
 # Rise lengths that are tried, as multiples of the distance to 63 %.
@@ -55,19 +44,17 @@ REFINED = 1.06 ** np.arange(-16, 17)
 REACH = 16.0
 # Rise lengths from which a slope beside the rise can be told from the rise itself.
 SLOPED = 8.0
-# Powers p of the rivals (1 - x / k)^p: a straight rise (elasticity of the rig, fretting), and a rounded one.
-POWERS = (1, 2)
-# Lengths k of the rivals that are tried, as multiples of the rise length.
-ENDS = np.geomspace(0.8, 8.0, 14)
+# Rivals (1 - x / k)^p: a straight rise (elasticity of the rig, fretting) and a rounded one: their powers p,
+# and the lengths k that are tried, as multiples of the rise length.
+POWERS, ENDS = (1, 2), np.geomspace(0.8, 8.0, 14)
 # Twice the log likelihood by which a rival must be better. It is then no bristle, and nothing is taken out.
 UNLIKELY = 10.0
-# Factor by which the rise on the plateau of the speed must be longer than that from rest to be the bristles'.
-# The lengths that are tried reach three times as far as the force's arrival.
+# Factor by which the rise on the plateau must be longer than that from rest to be the bristles': the lengths
+# that are tried reach three times as far as the force's arrival.
 LONGER = 3.0
-# Rise lengths on the plateau of the speed after which the law is asked again where it did not hold.
-SKIPPED = (1.0, 2.0)
-# Rows that this takes at least: twice as many as the law has parameters.
-LEAST_ROWS = 8
+# Rise lengths on the plateau after which the law is asked again where it did not hold, and the rows that
+# this takes at least: twice as many as the law has parameters.
+SKIPPED, LEAST_ROWS = (1.0, 2.0), 8
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0
 
@@ -75,8 +62,7 @@ FAR = 200.0
 class MotionStart(NamedTuple):
     """How a stretch of motion starts, and the row at which the speed has reached its plateau.
 
-    The distance from standstill in mm never falls. The force in N is positive against the motion. Both have
-    shape (n,).
+    Distance from standstill, never falling, and force, positive against the motion; both of shape (n,).
     """
 
     distance_mm: np.ndarray
@@ -111,21 +97,17 @@ def rise_of(start: MotionStart) -> Rise:
     """Return where the pre-sliding rise of a start is over (0 mm without one), and what is left of it there.
 
     A bristle at constant speed follows dz/dx = 1 - z / z_ss (LuGre, Eq. 2 divided by v), so the force comes
-    up as F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. For every
-    x_0 on a grid the rest is linear least squares; the x_0 with the smallest sum of squares is taken, and the
-    rise ends where 1/50000 of it is left. A rig that comes up along a straight line (its own elasticity) is
-    over well before.
+    up as F(x) = A + B x - C exp(-x / x_0); A + B x stands for whatever changes slowly beside it. The x_0 is
+    found by least squares on a grid, and the rise ends where 1/50000 of it is left.
 
     Where that would take more than a third of the stroke, the rise ends earlier; where it takes more than a
     tenth of the stroke to come up by 63 %, it ends where the force first arrives in the band of the late
-    plateau. What is left of it then is known from the same law, fitted once more to the rows of constant
-    speed.
+    plateau. What is left then follows from the same law, fitted to the rows of constant speed.
 
-    Only a force that begins below everything the plateau later shows is a rise: the trough of a ripple, or a
-    force that warming lets fall, is not. With much damping of the bristles (sigma_1) a fast stroke's force
-    comes up at once, to more than its level, and falls to it by the same law; then the fall from its peak is
-    what has to be over. A strong wave, such as a ripple, is taken out of a stroke if the rise takes more than
-    a third of it.
+    Only a force that begins below everything the plateau later shows is a rise. With much damping of the
+    bristles (sigma_1) a fast stroke's force comes up at once, to more than its level, and falls to it by the
+    same law; then the fall has to be over. A strong wave is taken out if the rise takes more than a third of
+    the stroke.
 
     Notes
     -----
@@ -173,18 +155,15 @@ def _turned(start: MotionStart) -> tuple[MotionStart, float] | None:
     peak = int(force[:half].argmax())
     if peak >= half - 1 or distance[peak] > start.plateau_mm + SOON * distance[-1]:
         return None
-    level = np.median(force[max(early, peak) : half])
-    fall = MotionStart(
-        distance[peak:] - distance[peak], 2.0 * level - force[peak:], max(start.ramp_end - peak, 0)
-    )
+    turned = 2.0 * np.median(force[max(early, peak) : half]) - force[peak:]
+    fall = MotionStart(distance[peak:] - distance[peak], turned, max(start.ramp_end - peak, 0))
     return fall, float(distance[peak])
 
 
 def _by_damping(start: MotionStart, turned: MotionStart, fall: Rise) -> bool:
-    """Return whether a peak may be the bristles' damping.
+    """Return whether a peak may be the bristles' damping: reached while the speed rises, and over soon.
 
-    Such a peak is reached while the speed rises. It falls within a share of the stroke, as a peak of
-    break-away falls over a longer distance, unless it is too high for a break-away or for warming.
+    A peak of break-away falls over a longer distance, unless it is too high for a break-away or for warming.
     """
     length, level, peak_N = float(start.distance_mm[-1]), _level_N(turned), float(start.force_N.max())
     # The fall is as large in the turned force, whose level is the same.
@@ -197,14 +176,12 @@ def _by_damping(start: MotionStart, turned: MotionStart, fall: Rise) -> bool:
 def _rise(start: MotionStart) -> Rise:
     """Return the rise of a start whose force comes up, and none of any other.
 
-    Where a fast stroke starts, damping brings up a part of the force at once, and the bristles the rest. If
-    that rest is at least a tenth of the whole, the rise is that on the plateau of the speed: if it is longer
-    than the one found from rest, or if it alone follows the law of the bristles.
+    At the start of a fast stroke damping brings up a part of the force at once, and the bristles the rest. If
+    that is at least a tenth, the rise is that on the plateau of the speed where it is longer than the one
+    from rest, or alone follows the law of the bristles.
     """
     rise = _rise_from_rest(start)
-    moving = start._replace(
-        ramp_end=max(start.ramp_end, 1)
-    )  # the first row is of rest, or of the motion before
+    moving = start._replace(ramp_end=max(start.ramp_end, 1))  # the row before is of rest, or another motion
     ramp, plateau = moving.plateau_mm, _on_plateau(moving)
     level = _level_N(plateau) if rise.length_mm > 0.0 else None
     if level is None or level - plateau.force_N[0] < PART * (level - start.force_N[0]):
@@ -255,8 +232,7 @@ def _rise_from_rest(start: MotionStart) -> Rise:
 def _left_over(start: MotionStart, length_mm: float) -> tuple[float, float]:
     """Return C and x_0 of F = A + B x + C exp(-x / x_0) of a start, from its rows of constant speed.
 
-    C is 0 where the force does not follow that law: where a rise that is over at some distance fits better.
-    The first rise lengths may still follow the changing speed; without them the law has to fit better itself.
+    C is 0 where a rival fits better. Without the first rise lengths the law has to fit better itself.
     """
     left_N, found, better = _law_on(_on_plateau(start), length_mm)
     if better > -UNLIKELY:
@@ -281,11 +257,11 @@ def _law_on(plateau: MotionStart, length_mm: float) -> tuple[float, float, float
     x, beside = plateau.distance_mm[:n], _Beside(plateau.distance_mm[:n], sloped)
     force = beside.free(plateau.force_N[:n])
     left, squares = beside.fitted(_shape(x, length), force)
-    ends = [_rise_length_mm(plateau, reach, length * ENDS, sloped, power) for power in POWERS]
-    rival = min(
-        beside.fitted(_shape(x, end, power), force)[1] for power, end in zip(POWERS, ends, strict=True)
-    )
-    return left, length, n * math.log(max(rival, 1e-300) / max(squares, 1e-300))
+    rivals = []
+    for power in POWERS:
+        end = _rise_length_mm(plateau, reach, length * ENDS, sloped, power)
+        rivals.append(beside.fitted(_shape(x, end, power), force)[1])
+    return left, length, n * math.log(max(min(rivals), 1e-300) / max(squares, 1e-300))
 
 
 def _before(left_N: float, lengths: float) -> float:
@@ -333,12 +309,10 @@ def _level_N(start: MotionStart) -> float | None:
 
 def _settled_mm(start: MotionStart, level_N: float, fitted_mm: float) -> float:
     """Return the distance at which a rise of that length is over."""
-    distance = start.distance_mm
-    length = float(distance[-1])
+    length, ramp = float(start.distance_mm[-1]), start.plateau_mm
     if float(start.force_N[0]) > HALF_WAY * level_N and fitted_mm > SHORT * length:
         return 0.0
     reestimated = min(SETTLED * fitted_mm, max(length / 3.0, ENOUGH * fitted_mm))
-    ramp = start.plateau_mm
     return float(max(reestimated, ramp + AFTER_RAMP * fitted_mm if ramp > 0.0 else 0.0))
 
 
@@ -346,9 +320,9 @@ def _below(plateau_N: np.ndarray, begin_N: float) -> bool:
     """Return whether the force begins below everything that the plateau shows, its noise included."""
     if len(plateau_N) < 2:
         return False
-    steps = np.abs(plateau_N[1:] - plateau_N[:-1])
     to_noise = 1.0 / (0.6745 * math.sqrt(2.0))
-    return begin_N < np.quantile(plateau_N, 0.01) - 4.0 * (np.median(steps) * to_noise)
+    noise = np.median(np.abs(np.diff(plateau_N))) * to_noise
+    return begin_N < np.quantile(plateau_N, 0.01) - 4.0 * noise
 
 
 def _arrival_mm(start: MotionStart) -> float:
@@ -361,10 +335,7 @@ def _arrival_mm(start: MotionStart) -> float:
 
 
 def _scale_mm(start: MotionStart, level_N: float | None) -> float:
-    """Return the distance over which the force first comes up by 63 %, between samples; 0 if it does not.
-
-    The distance is counted from where the force begins to come up.
-    """
+    """Return the distance over which the force first comes up by 63 %, between samples; 0 if it does not."""
     if level_N is None:
         return 0.0
     distance = start.distance_mm
@@ -389,9 +360,8 @@ def _rise_length_mm(
 ) -> float:
     """Return x_0 of F = A + B x - C exp(-x / x_0) by least squares on a grid of lengths, refined.
 
-    What A + B x explains is the same for every x_0. So both are taken out of the force and of each
-    exponential, and the best x_0 is the one whose exponential's rest explains most of the force's rest. B is
-    0 where the start is not `sloped`; with a `power`, the exponential is that of `_shape`.
+    A + B x is taken out of the force and of each exponential; the best x_0 explains most of the force's rest.
+    B is 0 where the start is not `sloped`; with a `power`, the exponential is that of `_shape`.
     """
     n = _rows_within(start, reach_mm)
     beside = _Beside(start.distance_mm[:n], sloped)
@@ -407,10 +377,9 @@ def _rise_length_mm(
 
 
 def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> float:
-    """Return the length at which most is explained.
+    """Return the length at which most is explained: the vertex of a parabola over the logarithm.
 
-    It is the vertex of the parabola, over the logarithm, through the best of the lengths and the two beside
-    it. It moves without a jump from one length to the next.
+    The parabola goes through the best of the lengths and the two beside it, so the length never jumps.
 
     Examples
     --------

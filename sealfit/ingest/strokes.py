@@ -1,11 +1,9 @@
 """Strokes of a trace, and in each the window in which it slides steadily: found from the data.
 
 A stroke runs from one turning point of the smoothed displacement to the next. Each steady speed of a motion
-with several, and each turn of a rotation, is a stroke of its own. Its steady window begins when
-the speed has reached its plateau and the force has ended its pre-sliding rise, and ends before the platform
-slows down; rests in between are left out with what follows them until sliding is steady again. Nothing that
-changes slowly (warming, drift, a ripple, a Stribeck curve) is taken for a rise: only a force below everything
-it later shows counts as one.
+with several, and each turn of a rotation, is a stroke of its own. Its steady window begins when the speed has
+reached its plateau and the pre-sliding rise of the force is over, and ends before the platform slows down;
+rests are left out with what follows them until sliding is steady again.
 """
 
 from __future__ import annotations
@@ -27,18 +25,14 @@ from sealfit.ingest.window import SAME_SPEED, SPEED_NOISE, STANDSTILL, slope, sp
 # (`_bounds`), so that no creep is one; 1, 3, 10 and 30 mm/s for equal times cover 2 % and more.
 LEAST_TRAVEL = 0.01
 # Share of the rows within twice the tolerance of a steady speed that may be slower by more than half of the
-# tolerance, and share that may be faster. Of those of a ramp 38 % are slower and 38 % faster, of those at the
-# top of a sine wave 33 and 24 %.
-OFF_SPEED = 0.2
-# The same where the stretch is so short that its smoothed ends are a large part of it.
-MOST_OFF_SPEED = 0.3
-# Samples of a steady speed among several, at least. One with fewer than `min_samples` is left out as a stroke
-# of its own, and is no part of the stroke before it. With 6, steady speeds are found on ramps of 50 samples.
+# tolerance, and share that may be faster; the same where smoothed ends are a large part of a short stretch.
+# Of those of a ramp 38 % are slower and 38 % faster, of those at the top of a sine wave 33 and 24 %.
+OFF_SPEED, MOST_OFF_SPEED = 0.2, 0.3
+# Samples of a steady speed among several, at least. With 6, some are found on ramps of 50 samples.
 FEWEST_SAMPLES = 10
 # Share of a turn below which what comes before the first or after the last whole turn is no turn of its own.
 PART_OF_TURN = 0.05
-# Ratio of measured speeds from which they are two settings. The speed of rigs without speed control varies by
-# nearly so much.
+# Ratio of measured speeds from which they are two settings. Without speed control they vary nearly as much.
 SPEEDS_APART = 1.25
 
 
@@ -47,14 +41,12 @@ class Stroke:
     """One stroke: rows `start` to `stop` (exclusive) of its trace.
 
     `origin` is the row where its motion begins, from which its distance counts (and, in a file of several
-    strokes, its time): the first row, unless rows of rest come before the file's first stroke. A steady speed
-    or a turn that is not the first of its motion has the origin of the first. `speed_mm_s`
-    is in displacement units per time unit, signed. Arrays are of shape (stop - start,): `steady` marks the
-    rows of the window, `sliding` those in which it moves; `presliding_N` is what is left of the pre-sliding
-    rise in the window, with the sign of the force, 0 elsewhere; `speed_along_mm_s` is the speed at every row,
-    where it is seen to differ from the stroke's. `short` says why the window is too short to be used; None if
-    it is long enough. `settles` is false where the speed has no plateau; `several_speeds` is true for a
-    steady speed of a motion with several.
+    strokes, its time); a steady speed or a turn has that of the first of its motion. `speed_mm_s` is in
+    displacement units per time unit, signed. Arrays are of shape (stop - start,): `steady` marks the rows of
+    the window, `sliding` those in which it moves; `presliding_N` is what is left of the pre-sliding rise in
+    the window, with the sign of the force, 0 elsewhere; `speed_along_mm_s` is the speed at every row. `short`
+    says why the window is too short to be used. `settles` is false where the speed has no plateau;
+    `several_speeds` is true for a steady speed of a motion with several.
     """
 
     number: int
@@ -91,16 +83,8 @@ def find_strokes(
 ) -> list[Stroke]:
     """Return the strokes of one trace in order; none where nothing moves.
 
-    Parameters
-    ----------
-    time_s, displacement_mm, force_N : ndarray, shape (n,)
-        A trace in the rig's own units, finite, time rising (steps may differ, and hide gaps); displacement
-        without spikes.
-
-    Returns
-    -------
-    list of Stroke
-        Strokes shorter than `min_travel_mm` are part of their neighbours' ends.
+    The arrays, shape (n,), are in the rig's own units, finite, time rising, displacement without spikes.
+    Strokes shorter than `min_travel_mm` are part of their neighbours' ends.
     """
     if len(time_s) < 3 or not np.ptp(displacement_mm) > 0.0:
         return []
@@ -147,23 +131,12 @@ def _stroke(
     window = steady_window(time_s, along, way * force_N, max(origin - begin, 0), noise, tolerance)
     before = np.zeros(begin - rows.start)  # it slides there, at another speed
     steady, sliding = np.r_[before > 0.0, window.steady], np.r_[before == 0.0, window.sliding]
+    left_N = way * np.r_[before, window.left_N]
     time_s, displacement_mm = (values[rows] for values in motion[:2])
-    along = way * displacement_mm
     speed = slope(time_s, displacement_mm, steady)
-    return Stroke(
-        1,
-        rows.start,
-        rows.stop,
-        origin,
-        way,
-        speed,
-        steady,
-        sliding,
-        way * np.r_[before, window.left_N],
-        speed_along(time_s, displacement_mm, steady, window.rise_mm, speed, noise),
-        _too_short(along, steady, settings),
-        window.settles,
-    )
+    along = speed_along(time_s, displacement_mm, steady, window.rise_mm, speed, noise)
+    short, ends = _too_short(way * displacement_mm, steady, settings), (rows.start, rows.stop)
+    return Stroke(1, *ends, origin, way, speed, steady, sliding, left_N, along, short, window.settles)
 
 
 def _turns(
@@ -200,11 +173,10 @@ def steady_speeds(
 ) -> list[tuple[slice, int]]:
     """Return one motion cut into its steady speeds: the rows of each, and the row where it begins.
 
-    The speed at a row is that over a distance, wide enough for the noise at every speed. A steady speed is
-    the longest stretch within twice the tolerance of the speed at which most of the way is slid, if most of
-    it is within half of the tolerance; then the same of what is left before and after it. A cut lies at the
-    slowest row in between. A steady speed begins after the ramp to it, but after a standstill with the ramp,
-    where the force rises. A motion with one steady speed, or none, is not cut.
+    A steady speed is the longest stretch within twice the tolerance of the speed at which most of the way is
+    slid, if most of it is within half of the tolerance; then the same of what is left before and after it. A
+    cut lies at the slowest row in between. A steady speed begins after the ramp to it, but after a standstill
+    with the ramp. A motion with one steady speed, or none, is not cut.
 
     The arrays, shape (n,), are one motion in one direction, displacement rising with it; `noise_mm` is the
     standard deviation of a displacement sample.
@@ -215,9 +187,8 @@ def steady_speeds(
     half = np.sqrt(0.5) * noise_mm / (SPEED_NOISE * tolerance)
     least = LEAST_TRAVEL * (x[-1] - x[0]) if settings.min_travel_mm is None else settings.min_travel_mm
     least = max(least, 4.0 * half)  # over half of that the speed is taken, of a rest, too
-    whole = [(slice(0, n), 0)]
     if n < 2 * settings.min_samples or x[-1] - x[0] < 2.0 * least:
-        return whole
+        return [(slice(0, n), 0)]
     row = np.arange(n)
     low = np.clip(x.searchsorted(x - half, "right") - 1, 0, np.maximum(row - 1, 0))
     high = np.clip(x.searchsorted(x + half), np.minimum(row + 1, n - 1), n - 1)
@@ -229,14 +200,13 @@ def steady_speeds(
             found[-1] = slice(found[-1].start, rows.stop)
         else:
             found.append(rows)
-    if len(found) < 2:
-        return whole
-    cuts = [a.stop - 1 + int(speed[a.stop - 1 : b.start + 1].argmin()) for a, b in pairwise(found)]
-    begins = []
-    for cut, rows in zip(cuts, found[1:], strict=True):
+    cuts, begins = [0], [0]
+    for before, rows in pairwise(found):
+        cut = before.stop - 1 + int(speed[before.stop - 1 : rows.start + 1].argmin())
         rested = speed[cut] < STANDSTILL * np.median(speed[rows])
+        cuts.append(cut)
         begins.append(cut if rested else rows.start)
-    return list(zip(map(slice, [0, *cuts], [*cuts, n]), [0, *begins], strict=True))
+    return list(zip(map(slice, cuts, [*cuts[1:], n]), begins, strict=True))
 
 
 def several_speeds(speeds: Sequence[float]) -> list[float]:
@@ -327,9 +297,8 @@ def displacement_noise_mm(displacement_mm: np.ndarray, order: int = 2) -> float:
     Second differences of a steady motion hold noise only: their variance is six times that of a sample.
     Fourth differences are free of the acceleration along ramps, too, with 70 times the variance. The 90th
     percentile is blind to gaps, stops and spikes. Where most of the way is covered by single steps between
-    rows that hardly differ, these are the resolution, whose rounding error is uniform: step / sqrt(12). A
-    rest before or after the motion is no such step, be its rows equal or not. 0 of no more than `order`
-    samples.
+    rows that hardly differ, these are the resolution, whose rounding error is uniform: step / sqrt(12).
+    0 of no more than `order` samples.
     """
     if len(displacement_mm) <= order:
         return 0.0
@@ -366,8 +335,7 @@ def resolution_mm(displacement_mm: np.ndarray) -> float:
 def turning_rows(smooth_mm: np.ndarray, travel_mm: float) -> list[int]:
     """Return the rows where the motion begins, turns and ends: extremes more than `travel_mm` apart.
 
-    A turn counts once the displacement has come back by `travel_mm`, so neither noise nor a small backlash is
-    one. Fewer than two rows where nothing moves that far.
+    Noise and a small backlash are no turns. Fewer than two rows where nothing moves that far.
     """
     step = np.sign(np.diff(smooth_mm))
     moving = np.flatnonzero(step)

@@ -15,30 +15,23 @@ from sealfit.ingest.segments import stretches, transient_rows, weighted_median
 REST = 0.5
 # Share of the plateau speed below which the platform stands still: it does not move yet, or no more.
 STANDSTILL = 0.05
-# A straight ramp: its time to 90 % of the plateau speed over that to 50 % (0.9 / 0.5), and how much of the
-# ramp is left out after 90 %, as a share. The ramp itself takes 0.11 more.
+# A straight ramp: its time to 90 % of the plateau speed over that to 50 % (0.9 / 0.5), and the share of it
+# that is left out after 90 %. The ramp itself takes 0.11 more.
 STRAIGHT = (1.8, 0.25)
 # The same of a first-order lag, ln(10) / ln(2) and ln(1000) / ln(10) - 1, after which 99.9 % are reached.
-# Between the two shapes the share is interpolated.
 LAG = (3.3, 2.0)
 # Share of the braking time by which an S-shaped stop leaves the plateau earlier than a straight one, at most.
 BEFORE_STOP = 0.5
-# Share of the rise below which a force is at rest.
-ONSET = 0.05
-# Share of the rise above which a force has come up.
-HALF_UP = 0.5
-# Pieces of a steady window whose speeds are compared: at least, and at most.
-SPEED_PIECES = (8, 64)
-# Rows of such a piece, at least.
-LEAST_ROWS = 8
+# Shares of the rise below which a force is at rest, and above which it has come up.
+ONSET, HALF_UP = 0.05, 0.5
+# Pieces of a steady window whose speeds are compared, at least and at most, and rows of one at least.
+SPEED_PIECES, LEAST_ROWS = (8, 64), 8
 # Share by which speeds may differ without a finding. Errors of screws and scales are of that size.
 SAME_SPEED = 0.002
 # Range of the displacement about a straight line over time, in units of its largest second difference, below
-# which the speed does not change. Beats between the steps of a position sensor and the sampling reach half of
-# it, also where the last digits scatter (300 strokes: 0.53 at most).
+# which the speed does not change. Beats of a sensor's steps with the sampling reach 0.53 (300 strokes).
 DEPARTURE = 1.0
-# P-value below which the speeds of pieces differ. It is small because campaigns have thousands of strokes,
-# and one stroke with a change of speed that is noise can outweigh the differences between runs.
+# P-value below which the speeds of pieces differ. It is small because campaigns have thousands of strokes.
 CLEAR = 1e-6
 # Noise of the local speed, as a share of the tolerance. A false exit from the plateau then takes four SDs.
 SPEED_NOISE = 0.25
@@ -50,9 +43,9 @@ LEAST_SAMPLES = 4
 class Window:
     """The steady window of one stroke; arrays of shape (n,).
 
-    `steady` marks its rows, `sliding` those in which the stroke moves at all; `left_N` is what is left in the
-    window of the pre-sliding rise, positive against the motion, 0 outside; `rise_mm` is the length of that
-    rise, 0 without one. `settles` is false where the speed on the plateau changes by more than the tolerance.
+    `steady` marks its rows, `sliding` those that move at all; `left_N` is what is left there of the
+    pre-sliding rise, positive against the motion, and `rise_mm` its length, 0 without one. `settles` is false
+    where the speed on the plateau changes by more than the tolerance.
     """
 
     steady: np.ndarray
@@ -70,18 +63,11 @@ def steady_window(
     noise_mm: float,
     tolerance: float,
 ) -> Window:
-    """Return the steady window of one stroke.
+    """Return the steady window of one stroke, which may move from row `origin` on.
 
-    Parameters
-    ----------
-    time_s, along_mm, force_N : ndarray, shape (n,)
-        The stroke; displacement rising with the motion, force positive against it.
-    origin : int
-        Row from which it may move.
-    noise_mm : float
-        Standard deviation of a displacement sample.
-    tolerance : float
-        Share by which the speed may be off its plateau.
+    The arrays have shape (n,); displacement rises with the motion, force is positive against it. `noise_mm`
+    is the standard deviation of a displacement sample, `tolerance` the share by which the speed may be off
+    its plateau.
     """
     n = len(time_s)
     steady, sliding, left, length = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n), 0.0
@@ -130,8 +116,7 @@ def steady_window(
 def _distance(time_s: np.ndarray, along_mm: np.ndarray, ramp_end: int, averaged: int) -> np.ndarray:
     """Return the distance from standstill, never falling, in mm; free of noise on the plateau of the speed.
 
-    There it is a straight line over time, and what the displacement is off that line, averaged: noise of the
-    displacement would be noise of the rise's share that is left. With `averaged` 0 time says all of it.
+    There it is a straight line over time and the averaged deviation from it; with `averaged` 0 only the line.
     """
     rows = slice(ramp_end, None)
     middle, now = along_mm[rows].mean(), time_s[rows].mean()
@@ -153,17 +138,13 @@ def local_speed(
 ) -> tuple[np.ndarray, int, bool]:
     """Return the speed over `half` rows to either side of each row, `half`, and whether rests may be hidden.
 
-    `half` is wide enough for the noise. The last value says whether a rest or a ramp shorter than that cannot
-    be seen.
-
-    Differences of displacement over differences of time: a gap does no harm. Of single samples, or, where
-    these would have to be more than a quarter of the stroke apart, of the means of all samples to either
-    side.
+    `half` is wide enough for the noise. Differences are of single samples, or, where these would have to be
+    more than a quarter of the stroke apart, of means of all samples to either side: then a shorter rest or
+    ramp cannot be seen.
     """
     n = len(time_s)
     mean_step = abs(along_mm[-1] - along_mm[0]) / (n - 1)
-    # The speed's SD is sqrt(2) noise over the width, wanted below SPEED_NOISE * tolerance of the speed
-    # itself.
+    # The speed's SD is sqrt(2) noise over the width, wanted below SPEED_NOISE * tolerance of the speed.
     wanted = np.sqrt(2.0) * noise_mm / max(2.0 * SPEED_NOISE * tolerance * mean_step, 1e-300)
     most = max(n // 8, 1)
     if wanted > most:
@@ -183,13 +164,12 @@ def local_speed(
 def acceleration(
     time_s: np.ndarray, displacement_mm: np.ndarray, noise_mm: float, wanted: float
 ) -> np.ndarray:
-    """Return the acceleration at every row of a trace, shape (n,), per time unit squared.
+    """Return the acceleration at every row of a trace of three rows or more, shape (n,).
 
-    It is the change from the mean speed over `half` rows before the row to that over `half` rows after it.
-    As for the speed of the window (`local_speed`), `half` is as wide as the noise asks for: here, that of the
-    acceleration is `wanted`, or `half` a sixteenth of the trace. Near the ends it is that of the nearest row
-    which has so many. The trace has three rows or more. `noise_mm` is the standard deviation of a
-    displacement sample, `wanted` that of the acceleration.
+    It is the change from the mean speed over `half` rows before the row to that over `half` rows after it;
+    near the ends, that of the nearest row with so many. `half` is as wide as the noise asks for, at most a
+    sixteenth of the trace: `noise_mm` and `wanted` are the standard deviations of a displacement sample and
+    of the acceleration.
     """
     n = len(time_s)
     # The SD of a second difference over `half` steps is sqrt(6) noise / (half step)^2.
@@ -223,8 +203,7 @@ def first_motion(force_N: np.ndarray, since: int) -> int:
 def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -> float:
     """Return the slope of displacement over time by least squares, one for all pieces of a steady window.
 
-    Each piece (between rests) has its own intercept, so a rest does not count as slow sliding. NaN without
-    samples.
+    Each piece (between rests) has an intercept, so a rest is no slow sliding. NaN without samples.
     """
     product = square = 0.0
     for first, stop in stretches(steady):
@@ -236,10 +215,9 @@ def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -
 
 
 def _settles(time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, tolerance: float) -> bool:
-    """Return whether the speed stays within the tolerance of one value.
+    """Return whether the speed, a parabola fitted over time, stays within the tolerance of one value.
 
-    It is a parabola over time, the slope of a cubic of the displacement by least squares: ripples of the
-    speed do not count. Of a sine wave the parabola changes by 24 % where it is above 0.9 of its plateau.
+    Ripples of the speed do not count. A sine wave changes by 24 % where it is above 0.9 of its plateau.
     """
     n = len(time_s)
     if n < 2 * LEAST_SAMPLES:
@@ -263,13 +241,10 @@ def speed_along(
 ) -> np.ndarray:
     """Return the speed that the friction at every row of a steady window follows, shape (n,).
 
-    It is the stroke's speed, and how it changes along the stroke, a rise length before: bristles follow a
-    slow change by the length of their rise behind (Eq. 2).
-
-    The window is cut into pieces of equal time, each with a slope by least squares; where these differ
-    clearly, the speed is straight between their middles. `speed` is that of the stroke; it is returned as it
-    is elsewhere, and where the window is short or has rests. `noise_mm` of a displacement sample decides how
-    many pieces it has.
+    It is that a rise length before: bristles follow a slow change by the length of their rise behind (Eq. 2).
+    The window is cut into pieces of equal time, as many as `noise_mm` of a displacement sample allows, each
+    with a slope by least squares. Where these differ clearly, the speed is straight between their middles;
+    elsewhere, and where the window is short or has rests, it is `speed`, that of the stroke.
     """
     made, parts = np.full(len(time_s), speed), stretches(steady)
     if len(parts) != 1 or not abs(speed) > 0.0 or parts[0][1] - parts[0][0] < SPEED_PIECES[0] * LEAST_ROWS:
@@ -277,8 +252,7 @@ def speed_along(
     window = slice(*parts[0])
     time_s, displacement_mm = time_s[window], displacement_mm[window]
     n, error = len(time_s), SAME_SPEED * abs(speed)
-    # k slopes of n / k samples over 1/k of the time have errors of sqrt(12 k^3 / n) noise over the whole of
-    # it.
+    # k slopes of n / k samples over 1/k of the time have errors of sqrt(12 k^3 / n) noise over all of it.
     noise = max(noise_mm / (time_s[-1] - time_s[0]), 1e-9 * error)
     least, most = SPEED_PIECES
     pieces = int(min(max((n * (error / noise) ** 2 / 12.0) ** (1.0 / 3.0), least), most, n // LEAST_ROWS))
@@ -289,8 +263,7 @@ def speed_along(
     square = (t * t).sum(axis=1)
     slope = (t * x).sum(axis=1) / square
     residual = x - slope[:, None] * t
-    # Neighbours that err alike (steps of a coarse sensor) count as one: a sign lasts for two of independent
-    # ones.
+    # Neighbours that err alike (steps of a coarse sensor) count as one; a sign lasts for two of independent.
     alike = residual.size / max(2 * np.count_nonzero(np.diff(np.sign(residual), axis=1)), 1)
     variance = (residual**2).mean() * max(alike, 1.0) / square + error**2
     scatter = float(((slope - slope.mean()) ** 2 / variance).sum())
@@ -326,8 +299,7 @@ class _StrokeMotion:
     def moving(self, moves: np.ndarray) -> list[tuple[int, int]]:
         """Return first and last (exclusive) row of every motion, from where it is faster than a rest.
 
-        Slow samples are a rest only if they cost more time than the width over which the speed is taken:
-        noise does not.
+        Slow samples are a rest only if they cost more time than the width over which the speed is taken.
         """
         joined: list[tuple[int, int]] = []
         time_s, along_mm, half = self.time_s, self.along_mm, self.half
@@ -369,12 +341,11 @@ class _StrokeMotion:
         fast = _last(self.fast[first:last])
         if fast is None:
             return first
-        time_s, left = self.time_s, first + fast
-        n = len(time_s)
-        if left == n - 1:
-            return n - 1  # where the stroke ends: it may have stopped since the sample before
+        time_s, left, end = self.time_s, first + fast, len(self.time_s) - 1
+        if left == end:
+            return end  # it may have stopped since the sample before
         still = _first(self.slow[left:])
-        stopped = left + still if still is not None else n - 1
+        stopped = left + still if still is not None else end
         step = float(time_s[last - 1] - time_s[first]) / max(last - 1 - first, 1)
         brake = max(float(time_s[stopped] - time_s[left]) - 1.7 * self.half * step, 0.0)
         return int(time_s.searchsorted(time_s[left] - BEFORE_STOP * brake)) - self.half // 3
