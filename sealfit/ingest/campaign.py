@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -16,27 +15,11 @@ from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.columns import condition_columns, force_inputs
-from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, PartitionResult, plan_parts, shaped
 from sealfit.ingest.quality import computed_force, improbable_loads, incomplete_columns, quality_table
-from sealfit.ingest.repeat_checks import (
-    constant_strokes,
-    copied_strokes,
-    outlying_files,
-    reversed_strokes,
-    settings_within_runs,
-    turned_sign,
-)
+from sealfit.ingest.repeat_checks import judged, outlying_files, settings_within_runs, turned_sign
 from sealfit.ingest.runs import FIX, list_traces
-from sealfit.ingest.stored_parts import (
-    agrees,
-    common_columns,
-    load_part,
-    make_part,
-    part_key,
-    seen_by_parts,
-    stored_strokes,
-)
+from sealfit.ingest.stored_parts import asked_again, load_parts, make_part, stored_strokes
 from sealfit.progress import timed
 from sealfit.store.manifest import Fingerprint, Fingerprints, fingerprint
 from sealfit.store.parquet import as_words
@@ -49,31 +32,29 @@ from sealfit.tables import CALENDAR, RUNS, STEADY
 def inputs_table(
     campaign: Path,
     marks: Fingerprints,
-    plan: Sequence[np.ndarray],
-    parts: Sequence[PartitionResult],
+    counts: np.ndarray,
     used: np.ndarray,
     faults: Sequence[Fault],
 ) -> tuple[pd.DataFrame, Fingerprints]:
     """Return table `inputs`, every trace file of the campaign and those not used, and their fingerprints.
 
-    `marks` are those of the listing's files, `plan` the numbers of each part's files in the listing, and
-    `used` says which of them have a stroke that is used. Faults name the files that are not in the listing.
+    `marks` are those of the listing's files, `counts` their rows and strokes, and `used` says which of them
+    have a stroke that is used. Faults name the files that are not in the listing.
     """
     others: dict[str, str] = {}  # files that are not in the listing, and their status
     for fault in faults:
         if fault.file is not None and fault.file not in marks and fault.action == "file left out":
             others.setdefault(fault.file, "left out" if fault.severity == "error" else "not matched")
     marks |= {file: fingerprint(campaign / file) for file in others}
-    counts = np.zeros((2, len(marks)), np.int64)
-    counts[:, np.concatenate(plan)] = np.concatenate([[part.rows, part.found] for part in parts], axis=1)
+    rows, strokes = np.pad(counts, ((0, 0), (0, len(others))))
     table = pd.DataFrame(
         {
             "file": pd.array(list(marks), "str"),
             "size": pd.array([mark.size for mark in marks.values()], "Int64"),
             "mtime_ns": pd.array([mark.mtime_ns for mark in marks.values()], "Int64"),
             "sha256": pd.array([mark.sha256 for mark in marks.values()], "str"),
-            "rows": counts[0],
-            "strokes": counts[1],
+            "rows": rows,
+            "strokes": strokes,
             "status": pd.array([*np.where(used, "used", "left out").tolist(), *others.values()], "str"),
         }
     )
@@ -145,13 +126,16 @@ def ingest_campaign(
     with timed("listing trace files") as part:
         listing, faults = list_traces(campaign, config)
         marks = {file: place.marks.get(file, Fingerprint()) for file in listing.files}
-        plan = _plan(campaign, listing, marks)
+        # 0 of a file that cannot be read: reading it will say why.
+        sizes = [marks[file].size or file_size(f"{campaign}/{file}") or 0 for file in listing.files]
+        numbers = plan_parts(listing.conditions, listing.columns["run_id"], sizes)
+        plan = [np.array(files) for files in numbers]
         part.rows, part.of = len(listing), "files"
     make = partial(make_part, campaign=campaign, config=config, folder=place.folder)
     read = partial(_read, make=make, workers=workers, on_file=on_file)
     listings = [listing.take(rows) for rows in plan]
     with timed("reading trace files") as part:
-        made = _known_parts(listings, marks, place, config)
+        made = load_parts(listings, marks, place.known, config)
         asked = {i: Asked(own) for i, own in enumerate(listings) if i not in made}
         made |= read(asked)
         part.rows, part.of = sum(len(one.refs) for one in asked.values()), "files"
@@ -179,13 +163,15 @@ def ingest_campaign(
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)
     strokes = strokes.assign(used=used)
-    again = read(_asked_again(listings, parts, strokes))
+    again = read(asked_again(listings, parts, strokes))
     parts = [again.get(i, part) for i, part in enumerate(parts)]
     used = np.zeros(len(listing), bool)
     used[files[strokes["used"].to_numpy(bool)]] = True
     for part in parts:
         marks |= part.marks
-    inputs, marks = inputs_table(campaign, marks, plan, parts, used, faults)
+    counts = np.zeros((2, len(listing)), np.int64)
+    counts[:, np.concatenate(plan)] = np.concatenate([[part.rows, part.found] for part in parts], axis=1)
+    inputs, marks = inputs_table(campaign, marks, counts, used, faults)
     tables = {
         "inputs": inputs,
         "runs": shaped(strokes, RUNS, drop=(*STEADY_ONLY, *OF_SAMPLES)),
@@ -194,32 +180,10 @@ def ingest_campaign(
     }
     if place.folder is None:
         for name in SAMPLED:
-            tables[name] = _stacked([part.tables[name] for part in parts if name in part.tables])
+            own = pa.concat_tables(part.tables[name] for part in parts if name in part.tables)
+            tables[name] = own.replace_schema_metadata().to_pandas()
     stored = {name: size for part in parts for name, size in part.stored.items()}
     return Ingested(tables, [fault for fault in faults if fault.severity != "info"], marks, stored)
-
-
-def _plan(campaign: Path, listing: Listing, marks: Fingerprints) -> list[np.ndarray]:
-    """Return the files of each part, by their numbers in the listing."""
-    sizes = [
-        marks[file].size or file_size(f"{campaign}/{file}") or 0  # 0: reading it will say why
-        for file in listing.files
-    ]
-    plan = plan_parts(listing.conditions, listing.columns["run_id"], sizes)
-    return [np.array(files) for files in plan]
-
-
-def _known_parts(
-    listings: Sequence[Listing], marks: Fingerprints, place: Place, config: Config
-) -> dict[int, PartitionResult]:
-    """Return the parts that are stored, by their numbers in the plan."""
-    made, seen = {}, seen_by_parts(config)
-    for i, listing in enumerate(listings if place.known else ()):
-        hashes = [marks[file].sha256 for file in listing.files]
-        path = place.known.get(part_key(listing, hashes, seen) or "")
-        if path is not None:
-            made[i] = load_part(path)
-    return made
 
 
 def _read(
@@ -240,23 +204,6 @@ def _read(
     return made
 
 
-def _asked_again(
-    listings: Sequence[Listing], parts: Sequence[PartitionResult], strokes: pd.DataFrame
-) -> dict[int, Asked]:
-    """Return the parts to make again: the whole campaign omits other strokes or has other columns."""
-    # A stroke whose own file shows something wrong is left out by its part anyway.
-    gone = strokes[~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)]
-    of_file = defaultdict(list)
-    for file, stroke in zip(gone["file"], gone["stroke"].tolist(), strict=True):
-        of_file[file].append((file, stroke))
-    columns, again = common_columns(parts), {}
-    for i, (own, part) in enumerate(zip(listings, parts, strict=True)):
-        out = frozenset(stroke for file in own.files for stroke in of_file.get(file, ()))
-        if part.unused != out or not agrees(part, columns):
-            again[i] = Asked(own, out, columns)
-    return again
-
-
 def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
     """Return the strokes of all parts in one table; a column with words in one part has words in all."""
     whole = [part for part in parts if part.num_rows] or parts[:1]
@@ -269,21 +216,6 @@ def strokes_of(parts: Sequence[pa.Table]) -> pd.DataFrame:
         worded.append(part)
     table = pa.concat_tables(worded, promote_options="permissive").to_pandas()
     return table.assign(by_itself=table["used"])
-
-
-def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
-    """Return the strokes with `used` false where a comparison with others rules them out, and findings."""
-    faults: list[Fault] = []
-    for rule in (constant_strokes, copied_strokes, reversed_strokes):
-        if strokes["used"].any():
-            keep, found = rule(strokes)
-            strokes = strokes.assign(used=strokes["used"].to_numpy(bool) & keep)
-            faults += found
-    return strokes, faults
-
-
-def _stacked(tables: Sequence[pa.Table]) -> pd.DataFrame:
-    return pa.concat_tables(tables).replace_schema_metadata().to_pandas()
 
 
 def _nothing_left(faults: Sequence[Fault], files: int) -> list[Fault]:

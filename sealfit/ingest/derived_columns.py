@@ -13,16 +13,7 @@ import numpy as np
 from sealfit.config import AGING_CONDITION, Config
 from sealfit.errors import KEPT, NOTED, CampaignError, ConfigError, Fault
 from sealfit.ingest.cells import OVERLOAD
-from sealfit.ingest.columns import (
-    UNAGED,
-    Column,
-    Columns,
-    known,
-    mapped,
-    overlaid,
-    put,
-    where,
-)
+from sealfit.ingest.columns import UNAGED, Column, Columns, known, mapped, overlaid, put, where
 from sealfit.ingest.expression import evaluate, parse, require_columns
 from sealfit.ingest.file_names import TEXT_COLUMNS
 from sealfit.ingest.files import as_number
@@ -34,8 +25,6 @@ from sealfit.units import Conversion
 NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
 COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
 _MOSTLY = 0.5  # a column with more numbers than this is one of numbers, and the rest of its cells are slips
-
-
 UNAGED_WORDS = ("unaged", "fresh", "new", "rt")  # RT: kept at room temperature
 _AGED_ONLY = ("temperature_C", "compression_ratio_pct")  # of unaged rubber nobody reads them
 
@@ -43,8 +32,8 @@ _AGED_ONLY = ("temperature_C", "compression_ratio_pct")  # of unaged rubber nobo
 def with_day_0(columns: Columns, config: Config) -> Columns:
     """Return the columns with the days of unaged rubber as 0, and with none of its words where numbers stand.
 
-    Unaged is what has 0, or one of `UNAGED_WORDS`, in its days; or, where no days are given, such a word in
-    another condition column. Its temperature and compression may hold any word.
+    Unaged is what has 0, or one of `UNAGED_WORDS`, in its days; or, without days, such a word in another
+    condition column. Its temperature and compression may hold any word.
 
     Examples
     --------
@@ -80,9 +69,8 @@ def with_constants(columns: Columns, rows: int, config: Config) -> Columns:
 
 
 def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
-    """Return the columns with the config's computed columns, and faults of these.
+    """Return the columns with the config's computed columns, without helpers ("_name"), and faults.
 
-    Helpers, columns whose name begins with "_", are left out.
     CampaignError if an expression reads a column that is not there, or words as numbers.
     """
 
@@ -109,11 +97,8 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
         fix = "Correct the cells that it reads, or the expression."
         wrong = np.flatnonzero(whole & ~np.isfinite(values)).tolist()
         faults += [entries[i].fault("not_finite", reason, name, fix=fix) for i in wrong]
-        good = (whole & np.isfinite(values)).tolist()
-        columns[name] = [
-            of_its_kind(name, value) if fine else None
-            for value, fine in zip(values.tolist(), good, strict=True)
-        ]
+        good = np.where(whole & np.isfinite(values), values, None).tolist()
+        columns[name] = mapped(good, partial(of_its_kind, name))
     return {name: column for name, column in columns.items() if not name.startswith("_")}, faults
 
 
@@ -136,8 +121,8 @@ def of_its_kind(name: str, value: float) -> float | str:
 def to_values(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
     """Return the columns as numbers or as labels, and faults of cells that are neither.
 
-    A column of numbers is one whose name says so, one of the config's condition columns or a channel where
-    more than half of the cells are numbers, and any where all are.
+    Numbers are columns whose names say so, condition columns and channels with numbers in more than half of
+    the cells, and any with numbers in all.
     """
     made = {name: _column(name, cells, entries, config) for name, cells in columns.items()}
     faults = [fault for _, found in made.values() for fault in found]
@@ -190,11 +175,11 @@ def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Col
 
 def empty_cells(entries: list[Entry], name: str, rows: np.ndarray) -> list[Fault]:
     """Return the faults of files, by their numbers, that lack a value in a condition column."""
-    about = {"value": "", "fix": "Fill it: it is one of the config's condition columns."}
-    return [
-        entries[i].fault("empty_cell", "holds no value: empty, n/a or the like.", name, **about)
-        for i in rows.tolist()
-    ]
+    reason, fix = (
+        "holds no value: empty, n/a or the like.",
+        "Fill it: it is one of the config's condition columns.",
+    )
+    return [entries[i].fault("empty_cell", reason, name, value="", fix=fix) for i in rows.tolist()]
 
 
 ABSOLUTE_ZERO_C = -273.15
@@ -226,7 +211,7 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
 def swapped_columns(entries: list[Entry], columns: Columns) -> list[Fault]:
     """Return that unaged rubber has 100 degrees and a compression other than 100, as if these were swapped.
 
-    Day 0 may have temperature and compression of an aged condition: nobody reads them there.
+    Day 0 may have temperature and compression of an aged condition.
     """
     none = [None] * len(entries)
     days, *others = (columns.get(name, none) for name in ("aging_days", *_AGED_ONLY))
@@ -256,8 +241,8 @@ def _text(value: float | str) -> str:
 def as_set(columns: Columns) -> Columns:
     """Return the columns with commanded speeds and loads that differ by rounding only taken as one setting.
 
-    Values within `SETTING` of the smallest of them become the one that most files have. A controller's
-    readback, or a change of units, leaves such differences, and runs must not fall apart over them.
+    Values within `SETTING` of the smallest of them become the one that most files have: a controller's
+    readback, or a change of units, must not make runs fall apart.
     """
     there = [name for name in ("speed_mm_s", "load_N") if name in columns]
     return columns | {name: _one_setting(columns[name]) for name in there}
@@ -281,9 +266,8 @@ def add_runs(
     """Return the columns with a `run_id` for every file, and what is to be said of it.
 
     Where none is given there is one per condition, commanded speed, load (of several) and (named) specimen.
-    Without a commanded speed it is that `measured`, in `unit` (nan where one is commanded): files within 5 %
-    share a run. So do files with several speeds each (nan), and strokes there and back of one record, a file
-    each, as the column `stroke` tells them.
+    Without a commanded speed, files share a run within 5 % of the `measured` one, in `unit`, with several
+    speeds each (nan), or as strokes there and back of one record, as the column `stroke` tells them.
     """
     none = [None] * len(conditions)
     given = columns.get("run_id", none)
@@ -345,8 +329,6 @@ def add_repeats(columns: Columns) -> Columns:
     run = columns["run_id"]
     none = [None] * len(run)
     given, hours, stroke = (columns.get(name, none) for name in ("repeat", "elapsed_h", "stroke"))
-    if None not in given:
-        return columns
     runs = defaultdict(list)
     for i, key in enumerate(zip(run, stroke, strict=True)):
         runs[key].append(i)
@@ -361,12 +343,8 @@ def add_repeats(columns: Columns) -> Columns:
 
 
 def pooled_unaged(columns: Columns, config: Config) -> list[Fault]:
-    """Return the condition columns in which unaged files differ, which make one condition nevertheless.
-
-    Unaged rubber has no aging temperature and compression; what a test is made at is another matter.
-    """
-    days = columns.get("aging_days", ())
-    unaged = [i for i, value in enumerate(days) if value == 0]
+    """Return the condition columns in which unaged files differ, which make one condition nevertheless."""
+    unaged = [i for i, value in enumerate(columns.get("aging_days", ())) if value == 0]
     faults = []
     for name in [n for n in config.condition if n not in (*AGING_CONDITION, *config.rubber) and n in columns]:
         values = sorted({_text(value) for i in unaged if (value := columns[name][i]) is not None})
@@ -382,8 +360,7 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
     none = [None] * len(entries)
     run, repeat, specimen = (columns[name] for name in ("run_id", "repeat", "specimen_id"))
     stroke = columns.get("stroke", none)
-    told = {"speed_mm_s": columns.get("speed_mm_s", none), "load_N": columns.get("load_N", none)}
-    told["condition"] = conditions
+    told = {name: columns.get(name, none) for name in ("speed_mm_s", "load_N")} | {"condition": conditions}
     first: dict[object, int] = {}  # file of each run, and of each repeat
     faults = []
     for i, entry in enumerate(entries):
@@ -394,8 +371,9 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
             fix = "Give every file of a run its own repeat number, files of different runs a run_id each, "
             fix += "or each stroke of a repeat its number."
             if conditions[i].startswith(UNAGED):
-                fix += " Pieces of unaged rubber that were tested with several series "
-                fix += "need a specimen_id each."
+                fix += (
+                    " Pieces of unaged rubber that were tested with several series need a specimen_id each."
+                )
             faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], fix=fix))
         for name, column in told.items():
             mine, theirs = column[i], column[j]
@@ -406,10 +384,13 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
                 value = "none" if mine is None else mine
                 faults.append(entry.fault("run_disagrees", reason, name, value=value, fix=fix))
         if specimen[i] != specimen[j] and told["speed_mm_s"][i] == told["speed_mm_s"][j]:
-            scatter = "their scatter counts as that of repeats"
-            reason = f"run '{run[i]}' has repeats on several specimens; {scatter}."
-            about = {"value": specimen[i], "fix": "Give each specimen a run_id of its own.", **KEPT}
-            faults.append(entry.fault("run_specimens", reason, "specimen_id", **about))
+            reason = (
+                f"run '{run[i]}' has repeats on several specimens; their scatter counts as that of repeats."
+            )
+            fix = "Give each specimen a run_id of its own."
+            faults.append(
+                entry.fault("run_specimens", reason, "specimen_id", value=specimen[i], fix=fix, **KEPT)
+            )
     return faults
 
 

@@ -33,27 +33,18 @@ class _Judged(NamedTuple):
 def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
     """Return the repeats that disagree with their runs beyond the pooled scatter.
 
-    Parameters
-    ----------
-    means : DataFrame
-        As `scatter.repeat_means` returns it.
-    level : float
-        Chance that any repeat at all is flagged in a campaign without outliers.
-
-    Returns
-    -------
-    DataFrame
-        Rows of `means` with `run_mean_N` (the run's mean without it), `t`, `p` (adjusted over the campaign)
-        and `alone` (true where two repeats disagree and which of them is wrong cannot be known: both are
-        returned).
+    They are rows of `means` (`scatter.repeat_means`) with `run_mean_N` (the run's mean without it), `t`, `p`
+    (adjusted over the campaign) and `alone` (true where two repeats disagree and which of them is wrong
+    cannot be known: both are returned). `level` is the chance that any repeat at all is flagged in a campaign
+    without outliers.
 
     Notes
     -----
     The generalized extreme studentized deviate procedure (Rosner 1983, Technometrics 25(2), 165-172,
     doi:10.1080/00401706.1983.10487848), on residuals within runs: the most extreme repeat is taken out,
     scatter and pattern are estimated without it, and so on; the outliers are those up to the last one that
-    exceeds its limit. So neither does an outlier widen the scale it is judged by, nor do two hide each other.
-    The limit is Sidak's for the repeats left, on Student's t with the pooled degrees of freedom.
+    exceeds its limit. The limit is Sidak's for the repeats left, on Student's t with the pooled degrees of
+    freedom.
     """
     layout = RepeatCodes.of(means)
     force = means["force_N"].to_numpy(float)
@@ -76,12 +67,10 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
             break
         fit = apart
     last = max((number for number, one in enumerate(found, start=1) if one.p < level), default=0)
-    none = means.iloc[:0].assign(run_mean_N=0.0, t=0.0, p=0.0, alone=False)
-    each = [
-        means.iloc[one.rows].assign(run_mean_N=one.mean_N, t=one.t, p=one.p, alone=len(one.rows) == 2)
-        for one in found[:last]
-    ]
-    return pd.concat([none, *each])
+    each = [means.iloc[:0].assign(run_mean_N=0.0, t=0.0, p=0.0, alone=False)]
+    for rows, t, p, mean_N in found[:last]:
+        each.append(means.iloc[rows].assign(run_mean_N=mean_N, t=t, p=p, alone=len(rows) == 2))
+    return pd.concat(each)
 
 
 def _judged(fit: ScatterFit, apart: ScatterFit, rows: np.ndarray, tests: int, tiny: float) -> _Judged:
@@ -97,21 +86,29 @@ def _judged(fit: ScatterFit, apart: ScatterFit, rows: np.ndarray, tests: int, ti
 
 # ---------------------------------------------------------------- peers
 
-# Share of its peers' force by which a force against its motion is of the wrong sign, not an offset.
-AGAINST = -0.5
+AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign
 # What is the same to the last digit only in copies of a stroke.
 SAMPLES = ["n", "force_N", "force_sd_N", "displacement_from_mm", "displacement_to_mm"]
-# A smaller force was not measured; the square of its square would be 0.
-NOTHING = 1e-24
+NOTHING = 1e-24  # a smaller force was not measured; the square of its square would be 0
+
+
+def judged(strokes: pd.DataFrame) -> tuple[pd.DataFrame, list[Fault]]:
+    """Return the strokes with `used` false where a comparison with others rules them out, and findings."""
+    faults: list[Fault] = []
+    for rule in (constant_strokes, copied_strokes, reversed_strokes):
+        if strokes["used"].any():
+            keep, found = rule(strokes)
+            strokes = strokes.assign(used=strokes["used"].to_numpy(bool) & keep)
+            faults += found
+    return strokes, faults
 
 
 def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     """Return which strokes to keep, shape (n,), and findings on force signs that contradict the motion.
 
-    Friction opposes the motion, so force times direction is positive. Where one stroke of a run has it
-    negative against its peers (the other strokes of its run, else those of the same direction), it is left
-    out: a sensor or a sign was turned round. Where most strokes of a direction have it negative, an offset or
-    the sign convention is the cause: said once per file, and kept.
+    Friction opposes the motion, so force times direction is positive. Where it is negative against the peers
+    of a stroke (the others of its run, else those of its direction), a sensor or a sign was turned round, and
+    the stroke is left out. Where most are negative, it is an offset or the sign convention: said, and kept.
     """
     keep = np.ones(len(strokes), bool)
     force = (strokes["force_N"] * strokes["direction"]).to_numpy(float)
@@ -160,8 +157,8 @@ def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     """Return which strokes to keep, shape (n,), and findings on forces constant in the steady window.
 
     Where the other strokes show noise larger than the sensor's steps, the sensor is dead, or at the end of
-    its range if the value is the largest of the stroke (`extreme`). Where they do not, it is coarse (or
-    without noise), and they are kept. `equal` is the share of samples equal to the one before.
+    its range (`extreme`); else it is coarse, and they are kept. `equal` is the share of samples equal to the
+    one before.
     """
     used = strokes["used"].to_numpy(bool)
     nothing = np.abs(strokes["force_N"].to_numpy(float)) < NOTHING
@@ -178,8 +175,7 @@ def _constant(row: pd.Series, dead: bool) -> Fault:
     check, reason = "coarse", "and other strokes show no noise either: its steps are larger than the noise."
     fix = "Use a finer range if the sensor has one."
     if dead:
-        check, reason = "stuck", "unlike in other strokes."
-        fix = MEASURE_AGAIN
+        check, reason, fix = "stuck", "unlike in other strokes.", MEASURE_AGAIN
     if abs(row["force_N"]) < NOTHING:
         reason = "so it was not measured."
     if dead and row["extreme"]:
@@ -194,8 +190,7 @@ def copied_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     """Return which strokes to keep, shape (n,), and findings on files that hold the samples of another.
 
     Two measurements never have the same mean, scatter and positions to the last digit, or the same samples
-    from their start on. A copy, a copy without its last rows, or a second link to one file, would count one
-    measurement twice; the first is kept.
+    from their start on. The first of such files is kept.
     """
     own = strokes[strokes["used"].to_numpy(bool) & (strokes["force_sd_N"] > 0.0)]
     first = own.groupby(SAMPLES)["file"].transform("first")
@@ -221,20 +216,18 @@ MAGNITUDE = 0.05
 def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
     """Return a fault if the friction of a whole campaign has the direction of the motion, or no sign at all.
 
-    An offset of the sensor larger than the friction turns the sign in one direction only; with strokes in
-    both, the mean over the directions is the friction. A magnitude has the same size in both.
+    With strokes in both directions, the mean over them is the friction: an offset of the sensor cancels out.
     """
     used = strokes[strokes["used"].to_numpy(bool)]
     against = used["force_N"] * used["direction"]
     ways = against.groupby(used["direction"] > 0).median()
     friction = float(ways.mean())
     if len(ways) == 2 and ways.min() < 0.0 and abs(friction) < MAGNITUDE * ways.max():
-        reason = (
-            "the force has one sign and one size in both directions, as a magnitude has; friction opposes "
-        )
+        reason = "the force has one sign and one size in both directions, as a magnitude has; "
+        reason += "friction opposes the motion."
         fix = "Export the signed force. If a signed speed is recorded, give the force its sign: "
         fix += 'force_N = "force_N * sign(SPEED)" under [trace.compute].'
-        return [Fault("turned_sign", f"{reason}the motion.", column="force_N", value=friction, fix=fix)]
+        return [Fault("turned_sign", reason, column="force_N", value=friction, fix=fix)]
     if not friction < 0.0:
         return []
     count = int((against < 0.0).sum())
@@ -254,8 +247,7 @@ MOST_SETTINGS, SAME_SETTING, MOST_RUNS = 6, 0.05, 0.8
 def settings_within_runs(steady: pd.DataFrame, known: Collection[str]) -> list[Fault]:
     """Return the columns with a few set values that differ between the repeats of most runs.
 
-    Such files are no repeats: what the setting does would count as scatter. `known` are columns that are no
-    settings, or that make runs.
+    Such files are no repeats. `known` are columns that are no settings, or that make runs.
     """
     run = steady.groupby("file", sort=False)["run_id"].first()
     faults = []
@@ -283,8 +275,7 @@ def settings_within_runs(steady: pd.DataFrame, known: Collection[str]) -> list[F
 def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, list[Fault]]:
     """Return `steady` with `outlier` and `used`, and a finding per repeat that disagrees with its run.
 
-    Flagged always, left out of the fits only where the config says `quality.drop_outliers`; and never where
-    only two repeats disagree, since which of them is wrong cannot be known.
+    It is left out of the fits only where the config says so, and never where only two repeats disagree.
     """
     flagged = outlying_repeats(repeat_means(steady), config.quality.outlier_p)
     outlier, dropped, found = np.zeros(len(steady), bool), np.zeros(len(steady), bool), []

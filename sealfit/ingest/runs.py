@@ -21,6 +21,7 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault, nearest
+from sealfit.ingest import derived_columns as derived
 from sealfit.ingest.averages import with_strokes
 from sealfit.ingest.columns import (
     RESERVED,
@@ -38,24 +39,6 @@ from sealfit.ingest.columns import (
     suggestion,
     taken,
     where,
-)
-from sealfit.ingest.derived_columns import (
-    COUNTS,
-    NUMBERS,
-    add_repeats,
-    add_runs,
-    as_set,
-    disagreements,
-    empty_cells,
-    in_our_units,
-    of_its_kind,
-    out_of_range,
-    pooled_unaged,
-    swapped_columns,
-    to_values,
-    with_computed,
-    with_constants,
-    with_day_0,
 )
 from sealfit.ingest.expression import parse, read_by
 from sealfit.ingest.file_names import Listing, TraceRef, channels_of, fits_up_to, name_parts, unmatched
@@ -89,14 +72,14 @@ def join_date_and_time(entries: list[Entry], columns: Columns, config: Config) -
         return columns, []
     file = entries[0].table if entries[0].line is not None else None
     missing = [name for name in (two.date, two.time) if name not in columns]
-    if missing:
-        reason = "there is no such column, but files.started_at names it."
-        return columns, [
-            Fault("missing_column", reason, column=name, fix=suggestion(name, list(columns)), file=file)
-            for name in missing
-        ]
     joined: Column = []
     faults = []
+    for name in missing:
+        reason = "there is no such column, but files.started_at names it."
+        fix = suggestion(name, list(columns))
+        faults.append(Fault("missing_column", reason, column=name, fix=fix, file=file))
+    if missing:
+        return columns, faults
     for i, cells in enumerate(zip(columns[two.date], columns[two.time], strict=True)):
         if (cells[0] is None) != (cells[1] is None):
             empty, other = (two.date, two.time) if cells[0] is None else (two.time, two.date)
@@ -112,9 +95,8 @@ def join_date_and_time(entries: list[Entry], columns: Columns, config: Config) -
 def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
     """Return the columns with `run_order` and `elapsed_h` where files have start times; faults of bad times.
 
-    Times in one of the config's formats, and Excel's serial numbers, become ISO 8601. Equal times share the
-    order of the first of them. A time with a zone is an instant; one without is taken as it stands, and as
-    UTC beside others with zones, so that one campaign with and without zones keeps one order.
+    Times in one of the config's formats, and Excel's serial numbers, become ISO 8601. Equal times share their
+    order. A time with a zone is an instant; one without is UTC beside others with zones.
     """
     if "started_at" not in columns:
         return columns, []
@@ -142,10 +124,9 @@ def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[C
     if not moments.notna().any():
         return columns, faults
     hours = (moments - moments.min()) / pd.Timedelta(hours=1)
-    derived = {"run_order": moments.rank(method="min"), "elapsed_h": hours}
-    return columns | {
-        name: values.astype(object).where(values.notna(), None).tolist() for name, values in derived.items()
-    }, faults
+    for name, values in (("run_order", moments.rank(method="min")), ("elapsed_h", hours)):
+        columns[name] = values.astype(object).where(values.notna(), None).tolist()
+    return columns, faults
 
 
 def time_of(text: str, formats: Sequence[str] = ()) -> datetime | None:
@@ -164,10 +145,7 @@ def _read(reader: Callable[..., datetime], *given: str) -> datetime | None:
 
 
 def excel_time(text: str) -> datetime | None:
-    """Return the time of a day's serial number, or of a day's and a share's: 45352.395833, 45352 0.395833.
-
-    None for other texts.
-    """
+    """Return the time of a serial number of Excel, 45352.395833 or 45352 0.395833; None for other texts."""
     numbers = [as_number(part) for part in text.split()]
     if not numbers or None in numbers or not EXCEL_DAYS[0] <= sum(numbers) < EXCEL_DAYS[1]:
         return None
@@ -189,11 +167,11 @@ def usual_formats(texts: Sequence[str]) -> list[str]:
 
 def _fix(text: str) -> str:
     """Return a fix: the formats that a date is in, by the usual ones, or how it should be written."""
-    likely = usual_formats([text])
-    if likely:
+    if likely := usual_formats([text]):
         return f"Set date_format = {' or '.join(likely)} under [files] in the rig config."
-    fix = "Write it as 2024-03-01T09:30:00, or give its format: "
-    return fix + "date_format = '%d.%m.%Y %H:%M' under [files]."
+    return (
+        "Write it as 2024-03-01T09:30:00, or give its format: date_format = '%d.%m.%Y %H:%M' under [files]."
+    )
 
 
 # ---------------------------------------------------------------- runs
@@ -213,14 +191,14 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     kept, named, found = _named(entries, config)
     faults += found
     entries, cells = _kept(kept, entries, cells)
-    cells = in_our_units(cells, config.conversions("runs"))
+    cells = derived.in_our_units(cells, config.conversions("runs"))
     columns = in_order(overlaid(_headers(campaign, entries, config), named, cells))
     columns, found = join_date_and_time(entries, columns, config)
     faults += found
-    columns = with_day_0(with_constants(columns, len(entries), config), config)
-    columns, found = to_values(entries, columns, config)
+    columns = derived.with_day_0(derived.with_constants(columns, len(entries), config), config)
+    columns, found = derived.to_values(entries, columns, config)
     faults += found
-    columns, found = with_computed(entries, columns, config)
+    columns, found = derived.with_computed(entries, columns, config)
     faults += found
     of_config = [name for name in columns if name not in cells]
     faults += misspelt(of_config, columns, config, {"file": f"config '{config.name}'"})
@@ -230,21 +208,21 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
         raise CampaignError([*faults, *found, NOTHING_LEFT])
     entries, columns = _kept(kept, entries, columns)
     columns, measured = in_order(columns), [measured[i] for i in kept]
-    faults += found + _missing(entries, columns, config) + out_of_range(entries, columns)
-    faults += swapped_columns(entries, columns)
+    faults += found + _missing(entries, columns, config) + derived.out_of_range(entries, columns)
+    faults += derived.swapped_columns(entries, columns)
     columns, found = add_order(entries, columns, config)
     faults += found
     files = [entry.file for entry in entries]
     _stop_at_errors(faults, campaign, files)
-    columns = as_set(columns)
+    columns = derived.as_set(columns)
     of_conditions = {name: columns.get(name, [None] * len(entries)) for name in condition_columns(config)}
     conditions = keys_of(of_conditions, len(entries), config)["condition"]
-    columns, found = add_runs(columns, conditions, measured, config.units.unit("speed"))
+    columns, found = derived.add_runs(columns, conditions, measured, config.units.unit("speed"))
     faults += found
     # One specimen per condition where none is named.
     specimens = over(columns.get("specimen_id", [None] * len(entries)), conditions)
-    columns = add_repeats(columns | {"specimen_id": specimens})
-    faults += disagreements(entries, columns, conditions) + pooled_unaged(columns, config)
+    columns = derived.add_repeats(columns | {"specimen_id": specimens})
+    faults += derived.disagreements(entries, columns, conditions) + derived.pooled_unaged(columns, config)
     _stop_at_errors(faults, campaign, files)
     cut = cut_files(campaign, [file for file in files if kind_of(file, config.trace) == "csv"])
     return Listing(files, _set_speed(columns), conditions, cut), faults
@@ -258,9 +236,8 @@ def _set_speed(columns: Columns) -> Columns:
     """Return the columns with the commanded speed under its own name, as a magnitude."""
     if "speed_mm_s" not in columns:
         return columns
-    renamed = dict(columns)
-    renamed["speed_set_mm_s"] = mapped(renamed.pop("speed_mm_s"), abs)
-    return renamed
+    rest = {name: column for name, column in columns.items() if name != "speed_mm_s"}
+    return rest | {"speed_set_mm_s": mapped(columns["speed_mm_s"], abs)}
 
 
 def _stop_at_errors(faults: Sequence[Fault], campaign: Path | None = None, files: Sequence[str] = ()) -> None:
@@ -332,8 +309,7 @@ def _from_traces(
 ) -> tuple[Columns, list[float], set[int], list[Fault]]:
     """Return the columns with what constant columns of traces add, reading only files that lack something.
 
-    Also the measured speed of each file read (nan of the others, and with several speeds), the files to leave
-    out, and their faults.
+    Also the measured speed of each file (nan if not read, or of several), files to leave out, and faults.
     """
     none = [None] * len(entries)
     refs = Listing([entry.file for entry in entries], _set_speed(columns), [])
@@ -385,15 +361,15 @@ def _constant(name: str, values: pd.Series, *, wanted: bool) -> float | str | No
         reason = f"varies within the file, {values.min()} to {values.max()}; a condition is one value."
         raise bad_file("condition_varies", reason, "Write the value that was set into runs.csv.", column=name)
     if not isinstance(value, str):
-        return of_its_kind(name, float(value))
-    if name in (*NUMBERS, *COUNTS):
+        return derived.of_its_kind(name, float(value))
+    if name in (*derived.NUMBERS, *derived.COUNTS):
         fix = "Export it as a number, or write it into runs.csv."
         raise bad_file("not_a_number", f"is '{value}', which is no number.", fix, column=name)
     return value
 
 
 def _says_more(campaign: Path, ref: TraceRef, columns: Columns, config: Config) -> bool:
-    """Return whether a file has a constant column of `FROM_TRACES` that nothing else gives."""
+    """Whether a file has a constant column of `FROM_TRACES` that nothing else gives."""
     try:
         rows = read_trace(campaign, ref, config).columns
     except BadFile:
@@ -408,7 +384,7 @@ def _missing(entries: list[Entry], columns: Columns, config: Config) -> list[Fau
     lacking = {name: np.flatnonzero(lack) for name, lack in _lacking(columns, len(entries), config).items()}
     for name, rows in sorted(lacking.items(), key=lambda one: one[1][:1].tolist()):
         if name in columns:
-            faults += empty_cells(entries, name, rows)
+            faults += derived.empty_cells(entries, name, rows)
         elif len(rows):
             reason = "there is no such column in runs.csv, file names, header lines or traces."
             fix = suggestion(name, list(columns)) + " Add it, or take it out of the config's condition."

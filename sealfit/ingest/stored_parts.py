@@ -20,6 +20,7 @@ from sealfit.errors import Fault, disk
 from sealfit.ingest.file_names import Listing
 from sealfit.ingest.partitions import SAMPLED, Asked, Columns, PartitionResult, read_part
 from sealfit.store import parquet
+from sealfit.store.manifest import Fingerprints
 from sealfit.store.staged_writes import PARQUET, sync
 
 # ---------------------------------------------------------------- trace access
@@ -73,10 +74,9 @@ def stroke_index(table: pd.DataFrame) -> pd.MultiIndex:
 
 
 def strokes_of(traces: pd.DataFrame, strokes: pd.MultiIndex) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each stroke's samples begin, the end of the last added, and which of `strokes` each is.
+    """Return `edges`, shape (n + 1,), and `own`, shape (n,), of the strokes of table `traces`.
 
-    Samples edges[k] to edges[k + 1] of table `traces` are one stroke, which is `strokes[own[k]]`, given by
-    its file and number; own[k] is -1 where it is not among them. Shapes are (n + 1,) and (n,).
+    Samples edges[k] to edges[k + 1] are one stroke: `strokes[own[k]]`; own[k] is -1 where it is not there.
     """
     file = traces["file"]
     if isinstance(file.dtype, pd.CategoricalDtype):
@@ -92,17 +92,14 @@ def strokes_of(traces: pd.DataFrame, strokes: pd.MultiIndex) -> tuple[np.ndarray
 def noise_from_bends(bends: np.ndarray) -> float:
     """Return the standard deviation of a sample from second differences of neighbours; 0 without any.
 
-    Their variance is six times a sample's; the median absolute deviation is blind to where the signal itself
-    bends.
+    Their variance is six times a sample's; the median is blind to where the signal itself bends.
     """
     return 1.4826 * np.median(np.abs(bends - np.median(bends))) / np.sqrt(6.0) if bends.size else 0.0
 
 
 # ---------------------------------------------------------------- stored parts
-# A part's files are named by what it was made from, so a process that does the work a second time (its first
-# answer was lost) writes the same names, and a part that is as it was keeps its files. Beside its tables a
-# part has a file of its strokes and findings: with it, the whole campaign can be judged anew without reading
-# the samples.
+# A part's files are named by what it was made from, so a part that is as it was keeps its files. Beside its
+# tables a part has a file of its strokes and findings: with it, the campaign is judged without the samples.
 
 PARTS = "parts"  # folder of OUT with the strokes of each part
 ARROW = ".arrow"
@@ -119,7 +116,9 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
     if folder is None:
         return part
     hashes = [part.marks[file].sha256 for file in asked.refs.files]
-    name = _file_name(part_key(asked.refs, hashes, seen_by_parts(config)), asked)
+    key = part_key(asked.refs, hashes, seen_by_parts(config)) or uuid.uuid4().hex[:20]
+    variant = json.dumps([sorted(asked.unused), asked.columns], sort_keys=True)
+    name = f"{key}-{hashlib.sha256(variant.encode()).hexdigest()[:8]}{PARQUET}"
     with disk(folder.parent):
         stored = {
             (file := f"{of}{PARQUET}/{name}"): _written(folder / file, table, parquet.write_arrow)
@@ -132,8 +131,7 @@ def make_part(asked: Asked, campaign: Path, config: Config, folder: Path | None)
         file = f"{PARTS}/{Path(name).with_suffix(ARROW)}"
         strokes = part.strokes.replace_schema_metadata(metadata)
         stored[file] = _written(folder / file, strokes, parquet.write_ipc)
-    # Its strokes are not sent: whoever asked finds them on the disk, and need not hold them while other parts
-    # are read.
+    # Its strokes are not sent: whoever asked need not hold them while other parts are read.
     return replace(part, strokes=None, tables={}, stored=stored)
 
 
@@ -160,17 +158,8 @@ def part_key(listing: Listing, hashes: Sequence[str | None], seen: str) -> str |
     return hashlib.sha256(about.encode("utf-8", "surrogatepass")).hexdigest()[:20]
 
 
-def _file_name(key: str | None, asked: Asked) -> str:
-    about = json.dumps([sorted(asked.unused), asked.columns], sort_keys=True)
-    variant = hashlib.sha256(about.encode()).hexdigest()
-    return f"{key or uuid.uuid4().hex[:20]}-{variant[:8]}{PARQUET}"
-
-
 def known_parts(out: Path, files: Iterable[str], is_whole: Callable[[str], bool]) -> dict[str, Path]:
-    """Return the stored parts that are whole, by their keys.
-
-    `files` are those that the last ingest left in the folder `out`; `is_whole` says whether one is as it was.
-    """
+    """Return the stored parts that are whole, by their keys; `files` are those of the last ingest in `out`."""
     whole = {Path(name).stem: out / name for name in files if name.startswith(f"{PARTS}/")}
     for name in files:
         if "/" in name and not is_whole(name):
@@ -178,17 +167,42 @@ def known_parts(out: Path, files: Iterable[str], is_whole: Callable[[str], bool]
     return {name.split("-", 1)[0]: path for name, path in whole.items()}
 
 
-def load_part(path: Path) -> PartitionResult:
-    """Return a part that was stored before, without its tables."""
-    strokes = parquet.read_ipc(path)
-    about = json.loads(strokes.schema.metadata[_ABOUT])
-    about["unused"] = frozenset((file, stroke) for file, stroke in about["unused"])
-    about["faults"] = tuple(Fault(**fault) for fault in about["faults"])
-    about["stored"][f"{PARTS}/{path.name}"] = path.stat().st_size
-    return PartitionResult(marks={}, strokes=strokes, **about)
+def load_parts(
+    listings: Sequence[Listing], marks: Fingerprints, known: Mapping[str, Path], config: Config
+) -> dict[int, PartitionResult]:
+    """Return the parts that are stored (`known_parts`), without their tables, by number in the plan."""
+    made, seen = {}, seen_by_parts(config)
+    for i, listing in enumerate(listings if known else ()):
+        path = known.get(part_key(listing, [marks[file].sha256 for file in listing.files], seen) or "")
+        if path is None:
+            continue
+        strokes = parquet.read_ipc(path)
+        about = json.loads(strokes.schema.metadata[_ABOUT])
+        about["unused"] = frozenset((file, stroke) for file, stroke in about["unused"])
+        about["faults"] = tuple(Fault(**fault) for fault in about["faults"])
+        about["stored"][f"{PARTS}/{path.name}"] = path.stat().st_size
+        made[i] = PartitionResult(marks={}, strokes=strokes, **about)
+    return made
 
 
-def common_columns(parts: Sequence[PartitionResult]) -> Columns:
+def asked_again(
+    listings: Sequence[Listing], parts: Sequence[PartitionResult], strokes: pd.DataFrame
+) -> dict[int, Asked]:
+    """Return the parts to make again: the whole campaign omits other strokes or has other columns."""
+    # A stroke whose own file shows something wrong is left out by its part anyway.
+    gone = strokes[~strokes["used"].to_numpy(bool) & strokes["by_itself"].to_numpy(bool)]
+    of_file = gone.groupby("file")["stroke"].agg(list).to_dict()
+    columns, again = _common_columns(parts), {}
+    for i, (own, part) in enumerate(zip(listings, parts, strict=True)):
+        out = frozenset((file, stroke) for file in own.files for stroke in of_file.get(file, ()))
+        has = {table: (part.wanted or part.columns)[table] for table in part.columns}
+        agrees = all(list(types.items()) == list(columns[table].items()) for table, types in has.items())
+        if part.unused != out or not agrees:
+            again[i] = Asked(own, out, columns)
+    return again
+
+
+def _common_columns(parts: Sequence[PartitionResult]) -> Columns:
     """Return the columns of each table over all parts; numbers beside words are words.
 
     Tables of one folder must agree: a reader takes the columns of the first file for those of all.
@@ -201,12 +215,6 @@ def common_columns(parts: Sequence[PartitionResult]) -> Columns:
                 if known != kind:
                     common[table][name] = "string" if "string" in (known, kind) else "double"
     return common
-
-
-def agrees(part: PartitionResult, columns: Columns) -> bool:
-    """Whether the stored tables of a part have these columns, in this order."""
-    has = {table: (part.wanted or part.columns)[table] for table in part.columns}
-    return all(list(types.items()) == list(columns[table].items()) for table, types in has.items())
 
 
 def _written(path: Path, table: pa.Table, write: Callable[[pa.Table, Path], None]) -> int:
