@@ -44,9 +44,8 @@ def standard_error(values: np.ndarray) -> float:
     """Return the standard error of the mean of a series, counting in the correlation of neighbouring samples.
 
     SE = s sqrt(2 tau / n), with the autocorrelation time tau = 1/2 + sum of rho(k) over lags up to the first
-    M that is at least 5 tau (Sokal's window): beyond, the sum adds noise only. A trend or a ripple within the
-    window is correlation too, and makes the standard error larger; correlation that would make it smaller is
-    not believed.
+    M that is at least 5 tau (Sokal's window). A trend or a ripple makes it larger; correlation that would
+    make it smaller is not believed.
 
     Notes
     -----
@@ -98,25 +97,14 @@ def _strokes_by_run(row: np.ndarray, run_id: Sequence[str]) -> list[list[tuple[i
 def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, np.ndarray]:
     """Return the steady window of every stroke cut along displacement, a row per bin.
 
-    All strokes of a run share the edges of their bins, which span the windows of all of them, so a pattern
-    along displacement falls into the same bins in every repeat. A run has `per_stroke` bins, or fewer where
-    its strokes have too few samples; the few bins that still hold less than `min_samples` are joined to their
-    neighbours.
+    All strokes of a run share the edges of their bins, which span the windows of all of them. A run has
+    `per_stroke` bins, or fewer where its strokes have too few samples; bins that still hold less than
+    `min_samples` are joined to their neighbours.
 
-    Parameters
-    ----------
-    samples : mapping of str to ndarray, shape (n,)
-        Samples of the steady windows, stroke after stroke, at least one: `row` (place in `strokes`),
-        displacement_mm, force_N and further columns, numbers or labels, whose means (or most frequent labels)
-        are wanted.
-    strokes : mapping of str to sequence, one value per stroke
-        `run_id`, `direction`.
-
-    Returns
-    -------
-    dict of str to ndarray
-        `row`, `bin` (from 0 in the direction of motion), `n`, `force_sd_N`, and the mean of every column of
-        `samples`.
+    `samples` are those of the steady windows, stroke after stroke, at least one: `row` (place in `strokes`),
+    displacement_mm, force_N and further columns, numbers or labels; `strokes` have `run_id` and `direction`.
+    Columns are `row`, `bin` (from 0 in the direction of motion), `n`, `force_sd_N`, and the mean, or the most
+    frequent label, of every column of `samples`.
     """
     row, x = samples["row"], np.asarray(samples["displacement_mm"])
     bins = np.zeros(len(row), int)
@@ -133,14 +121,10 @@ def bin_table(samples: Samples, strokes: Strokes, settings: Bins) -> dict[str, n
     bin_of_stroke, group = np.unique(row * settings.per_stroke + bins, return_inverse=True)
     n = np.bincount(group)
     made = {"row": bin_of_stroke // settings.per_stroke, "bin": bin_of_stroke % settings.per_stroke, "n": n}
-    for name in samples:
+    for name in (name for name in samples if name != "row"):
         values = np.asarray(samples[name])
-        if name == "row":
-            continue
-        if values.dtype.kind in "fiub":
-            made[name] = np.bincount(group, values) / n
-        else:
-            made[name] = common_by_group(values, group, len(n))
+        numbers = values.dtype.kind in "fiub"
+        made[name] = np.bincount(group, values) / n if numbers else common_by_group(values, group, len(n))
     square = np.bincount(group, (samples["force_N"] - made["force_N"][group]) ** 2)
     made["force_sd_N"] = np.sqrt(np.divide(square, n - 1.0, out=np.full(len(n), np.nan), where=n > 1))
     return made
@@ -169,30 +153,18 @@ def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
     """Return the mean over repeats on a displacement grid that the repeats of a run share.
 
     Cells are as wide as the usual step between samples, so the pre-sliding rise keeps its shape. The strokes
-    of one file are averaged first; mean and standard error are then those of the files of the run, each
-    weighing the same.
+    of one file are averaged first; mean and standard error are those of the files, each weighing the same.
 
-    Parameters
-    ----------
-    samples : mapping of str to ndarray, shape (n,)
-        Samples of sliding, stroke after stroke, at least one: `row` (place in `strokes`), displacement_mm,
-        force_N, steady.
-    strokes : mapping of str to sequence, one value per stroke
-        file, run_id, direction.
-
-    Returns
-    -------
-    dict of str to ndarray
-        What table `traces_mean` holds of numbers, and `row`, the first stroke of the run.
+    `samples` are those of sliding, stroke after stroke, at least one: `row` (place in `strokes`),
+    displacement_mm, force_N, steady; `strokes` have file, run_id and direction. Columns are those of table
+    `traces_mean` with numbers, and `row`, the first stroke of the run.
     """
     names = ("displacement_mm", "force_N", "steady")
     x, force, steady = (np.asarray(samples[name]) for name in names)
     made = []
     for run in _strokes_by_run(samples["row"], strokes["run_id"]):
         low, step, cells = _grid([x[own] for _, own in run])
-        each = [
-            _of_cells(((x[own] - low) / step).astype(int), force[own], steady[own], cells) for _, own in run
-        ]
+        each = [_of_cells((x[own] - low) / step, force[own], steady[own], cells) for _, own in run]
         back = np.array([strokes["direction"][stroke] < 0 for stroke, _ in run])
         of_strokes, steady_cell = (np.array(values) for values in zip(*each, strict=True))
         keep = _comparable(np.isfinite(of_strokes), steady_cell, back)
@@ -222,13 +194,13 @@ def _grid(places: Sequence[np.ndarray]) -> tuple[float, float, int]:
 
 
 def _of_cells(
-    cell: np.ndarray, force: np.ndarray, steady: np.ndarray, cells: int
+    place: np.ndarray, force: np.ndarray, steady: np.ndarray, cells: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a stroke's mean force in each cell, NaN if empty, and whether all samples there are steady.
 
     Short runs of empty cells are filled along a straight line.
     """
-    cell = np.minimum(cell, cells - 1)
+    cell = np.minimum(place.astype(int), cells - 1)
     count = np.bincount(cell, minlength=cells)
     with np.errstate(invalid="ignore"):
         mean = np.bincount(cell, force, cells) / count
@@ -247,9 +219,8 @@ def _of_cells(
 def _comparable(known: np.ndarray, steady: np.ndarray, back: np.ndarray) -> np.ndarray:
     """Return which cells of strokes may be averaged with others at their place, shape (strokes, cells).
 
-    Repeats need not start at the same place: where one slides steadily, another may just be starting, and its
-    pre-sliding rise would be a dip in the mean. So steady strokes are averaged where there are any, and
-    elsewhere those that have come equally far from their own start.
+    Where one slides steadily, another may just be starting. So steady strokes are averaged where there are
+    any, and elsewhere those that have come equally far from their own start.
     """
     cell = np.arange(known.shape[1])
     first, last = known.argmax(axis=1), len(cell) - 1 - known[:, ::-1].argmax(axis=1)
@@ -298,17 +269,17 @@ def read_strokes(ref: TraceRef, campaign: Path, config: Config) -> FileStrokes:
     except BadFile as error:
         return FileStrokes(ref.file, mark or fingerprint(campaign / ref.file), 0, error.faults)
     trace, strokes = with_strokes(trace, config)
-    made = FileStrokes(ref.file, mark, trace.rows_read, trace.faults)
-    if fault := motion_fault(trace, strokes, config):
-        made = replace(made, faults=(*trace.faults, fault))
-    elif (fault := speed_fault(trace, strokes, config)) and fault.action == "file left out":
-        made = replace(made, faults=(*trace.faults, fault), rows=0)
-    else:
+    fault = motion_fault(trace, strokes, config)
+    count, rows, samples = trace.rows_read, (), None
+    if fault is None:
+        fault = speed_fault(trace, strokes, config)
+        count = 0 if fault is not None and fault.action == "file left out" else count
+    faults = [*trace.faults, *([fault] if fault else [])]
+    if fault is None or fault.action == "kept":
         samples = _samples(trace, strokes, config)
-        rows, faults = _stroke_rows(ref.file, trace, strokes, samples, config)
-        found = (*trace.faults, *([fault] if fault else []), *faults)
-        made = replace(made, faults=found, strokes=rows, samples=samples)
-    return replace(made, faults=placed(made.faults, ref.file))
+        rows, found = _stroke_rows(ref.file, trace, strokes, samples, config)
+        faults += found
+    return FileStrokes(ref.file, mark, count, placed(faults, ref.file), rows, samples)
 
 
 def with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:

@@ -10,26 +10,16 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.errors import KEPT, CampaignError, Fault, nearest
+from sealfit.ingest import derived_columns as derived
 from sealfit.ingest.cells import LISTED
 from sealfit.ingest.columns import NO_COLUMN, Columns, keys_of, known, suggestion, where
-from sealfit.ingest.derived_columns import (
-    NUMBERS,
-    empty_cells,
-    in_our_units,
-    out_of_range,
-    to_values,
-    with_computed,
-    with_constants,
-    with_day_0,
-)
 from sealfit.ingest.listing import Entry, read_table, stopped
 from sealfit.store.manifest import BATCH
+from sealfit.tables import CALENDAR
 
 DAYS = "aging_days"
-# Columns of numbers that are no property.
-NO_PROPERTY = (*NUMBERS, "repeat", "stroke", "run_order", "elapsed_h")
-# Columns that are read as labels.
-LABELS = ("specimen_id", "run_id", "file", "started_at", BATCH)
+NO_PROPERTY = (*derived.NUMBERS, *derived.COUNTS, *CALENDAR)  # columns of numbers
+LABELS = ("specimen_id", "run_id", "file", "started_at", BATCH)  # columns that are read as labels
 
 
 def read_properties(
@@ -37,35 +27,24 @@ def read_properties(
 ) -> tuple[pd.DataFrame, list[Fault]]:
     """Return table `property_values`, and what was found that does not stop the fit.
 
-    Parameters
-    ----------
-    path : Path
-        The table: CSV, Excel or Parquet; a row per specimen with `aging_days`, the other condition columns
-        and a column per property.
-    config : Config
-        Names, units and computed columns are those of a table of runs. Condition columns that the table lacks
-        are not needed.
-    properties : sequence of str
-        Columns of the properties; by default the only column of numbers that is no condition.
-    batch : str
-        Column that names the batch of a specimen.
-
-    Raises
-    ------
-    CampaignError
-        With every fault at once: a table that cannot be read, a missing column, cells that are no numbers.
+    The table, CSV, Excel or Parquet, has a row per specimen with `aging_days`, the other condition columns
+    and a column per property; names, units and computed columns are those of a table of runs, and condition
+    columns that it lacks are not needed. `properties` are the columns of the properties, by default the only
+    column of numbers that is no condition; `batch` is the column that names the batch of a specimen.
+    CampaignError has every fault at once.
     """
     table = path.name
     lines, columns, faults = read_table(path.parent, table, config)
     if not lines and not faults:
         raise stopped("no_rows", "has a header but no rows.", "Write one row per specimen.", file=table)
     entries = [Entry(table, line, table) for line in lines]
-    columns = with_constants(in_our_units(columns, config.conversions("runs")), len(lines), config)
-    columns = with_day_0(columns, _of_table(config, columns))
+    columns = derived.in_our_units(columns, config.conversions("runs"))
+    columns = derived.with_constants(columns, len(lines), config)
+    columns = derived.with_day_0(columns, _of_table(config, columns))
     words = {name: columns.pop(name) for name in {*LABELS, batch} if name in columns}
-    columns, found = to_values(entries, columns, config)
+    columns, found = derived.to_values(entries, columns, config)
     faults += found
-    columns, found = with_computed(entries, columns, config)
+    columns, found = derived.with_computed(entries, columns, config)
     faults += found
     if DAYS not in columns:
         fix = suggestion(DAYS, [*columns, *words]) + " Name it in files.runs_columns of a --config."
@@ -81,7 +60,10 @@ def read_properties(
     if batch not in words and (close := nearest(batch, list(columns))):
         reason, fix = f"is not used; it looks like '{batch}'.", f"Write '{batch}' if that is meant."
         faults.append(Fault("column_name", reason, file=table, column=close, fix=fix, **KEPT))
-    faults += out_of_range(entries, columns) + _lacking(entries, columns, config)
+    faults += derived.out_of_range(entries, columns)
+    aged = ~where(columns[DAYS], lambda value: value == 0)
+    for name in config.condition:
+        faults += derived.empty_cells(entries, name, np.flatnonzero(aged & ~known(columns[name])))
     if stopping := [f for f in faults if f.severity == "error" and f.action == "stopped"]:
         raise CampaignError(stopping)
     made = pd.concat([_rows(columns, words, lines, config, name, batch) for name in chosen])
@@ -129,39 +111,22 @@ def _properties(table: str, columns: Columns, config: Config, named: Sequence[st
     raise stopped("missing_column", reason, fix, file=table)
 
 
-def _lacking(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:
-    """Return faults of aged specimens without a value in a condition column."""
-    aged = ~where(columns[DAYS], lambda value: value == 0)
-    lacking = {name: np.flatnonzero(aged & ~known(columns[name])) for name in config.condition}
-    return [fault for name, rows in lacking.items() for fault in empty_cells(entries, name, rows)]
-
-
 def _rows(
     columns: Columns, words: Columns, lines: list[int], config: Config, name: str, batch: str
 ) -> pd.DataFrame:
     """Return the rows of one property, values that are missing included."""
-    conditions = {key: columns[key] for key in config.condition}
-    keys = keys_of({**conditions, **{key: columns[key] for key in config.rubber}}, len(lines), config)
-    values = pd.Series(columns[name], dtype=float)
-    return pd.DataFrame(
-        {
-            **keys,
-            **conditions,
-            "quantity": name,
-            "value": values,
-            "unit": config.units.of(name),
-            "batch": words.get(batch, [None] * len(lines)),
-            "line": lines,
-        }
-    )
+    keys = keys_of(columns, len(lines), config)
+    made = pd.DataFrame({**keys, **{key: columns[key] for key in config.condition}, "quantity": name})
+    made["value"] = pd.Series(columns[name], dtype=float)
+    batches = words.get(batch, [None] * len(lines))
+    return made.assign(unit=config.units.of(name), batch=batches, line=lines)
 
 
 def _left_out(entries: list[Entry], rows: pd.DataFrame) -> list[Fault]:
     """Return a finding for every property that some rows have no value of: how many, and in which lines."""
     faults = []
     for name, lines in rows.groupby("quantity", sort=False)["line"]:
-        more = ", ..." if len(lines) > LISTED else ""
-        listed = ", ".join(map(str, lines.head(LISTED))) + more
+        listed = ", ".join(map(str, lines.head(LISTED))) + (", ..." if len(lines) > LISTED else "")
         reason = f"{len(lines)} rows have no value and are left out: {listed}."
         place = {"file": entries[0].table, "line": int(lines.iloc[0]), "column": name}
         done = {"severity": "warning", "action": "row left out"}

@@ -1,11 +1,9 @@
 """Type A: how far repeats of a run scatter, as a function of the force, pooled over runs.
 
-Three repeats say next to nothing about their own scatter: of a standard deviation with two degrees of
-freedom, the 95 % interval spans a factor of twelve. Scatter is therefore pooled over runs (GUM 4.2.4; ISO
-5725-2, 7.5: sr as a function of the level m), as sd^2 = s0^2 + (g F)^2: a part that every run has, and a part
-in proportion to the force. What all repeats have in common from first to last (run-in, Mullins) is no scatter
-and is taken out before. The sensor's accuracy (type B) is one unknown that all repeats share, so it is not in
-their scatter and is kept apart (`config.sensor`).
+Three repeats say next to nothing about their own scatter, so it is pooled over runs (GUM 4.2.4; ISO 5725-2,
+7.5: sr as a function of the level m), as sd^2 = s0^2 + (g F)^2. What all repeats have in common from first to
+last (run-in, Mullins) is no scatter and is taken out before. The sensor's accuracy (type B) is shared by all
+repeats, so it is not in their scatter and is kept apart (`config.sensor`).
 """
 
 from __future__ import annotations
@@ -15,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-# Square of the spread of x over that of its size, below which a constant and x cannot be told apart.
-ALIKE = 1e-12
-# Runs below which a common pattern of their repeats cannot be told from the scatter itself.
-PATTERN_RUNS = 3
+ALIKE = 1e-12  # square of the spread of x over that of its size, below which x is a constant
+PATTERN_RUNS = 3  # with fewer runs a common pattern of their repeats cannot be told from the scatter itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +59,8 @@ def repeat_scatter(steady: pd.DataFrame) -> RepeatScatter:
     scoring). The common pattern of the repeats costs one degree of freedom per repeat number but one.
     """
     means = repeat_means(steady)
-    return fit_scatter(
-        RepeatCodes.of(means), means["force_N"].to_numpy(float), np.ones(len(means), bool)
-    ).scatter
+    force_N, kept = means["force_N"].to_numpy(float), np.ones(len(means), bool)
+    return fit_scatter(RepeatCodes.of(means), force_N, kept).scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +92,7 @@ class ScatterFit:
     t: np.ndarray
 
     def df_at(self, force_N: float) -> float:
-        """Return the degrees of freedom of the variance at this force.
-
-        They are those of all runs only where one number describes them all.
+        """Return the degrees of freedom of the variance at this force, at most those of all runs.
 
         Welch-Satterthwaite: a variance with standard error u has 2 variance^2 / u^2 (GUM, G.4.1).
         """
@@ -113,15 +106,16 @@ def fit_scatter(layout: RepeatCodes, force_N: np.ndarray, kept: np.ndarray) -> S
     """Fit run means, the pattern and the scatter to the rows kept; residuals of every row."""
     count = np.bincount(layout.run[kept], minlength=layout.runs).astype(float)
     pattern, cost = np.zeros(len(layout.numbers)), 0
-    s0_2, g_2, covariance = _variance(layout, force_N, kept, count, pattern, 0)
+    flat = force_N
+    s0_2, g_2, covariance = _variance(layout, flat, kept, count, 0)
     repeated = count[layout.run] > 1
     present = np.bincount(layout.repeat[kept & repeated], minlength=len(layout.numbers)) >= PATTERN_RUNS
     if present.sum() >= 2 and (count > 1).sum() >= PATTERN_RUNS:
         cost = int(present.sum()) - 1
         for _ in range(3):  # weights of the pattern and the scatter need each other; both settle at once
             pattern = _pattern(layout, force_N, kept & repeated, present, s0_2, g_2)
-            s0_2, g_2, covariance = _variance(layout, force_N, kept, count, pattern, cost)
-    flat = force_N / (1.0 + pattern[layout.repeat])
+            flat = force_N / (1.0 + pattern[layout.repeat])
+            s0_2, g_2, covariance = _variance(layout, flat, kept, count, cost)
     mean = _run_mean(layout, flat, kept, count)[layout.run]
     residual = flat - mean
     share = np.where(count[layout.run] > 1, 1.0 - 1.0 / np.maximum(count[layout.run], 1.0), 0.0)
@@ -166,16 +160,10 @@ def _pattern(
 
 
 def _variance(
-    layout: RepeatCodes,
-    force_N: np.ndarray,
-    kept: np.ndarray,
-    count: np.ndarray,
-    pattern: np.ndarray,
-    cost: int,
+    layout: RepeatCodes, flat: np.ndarray, kept: np.ndarray, count: np.ndarray, cost: int
 ) -> tuple[float, float, np.ndarray]:
-    """Return s0^2 and g^2 of the rows kept, and their covariance."""
+    """Return s0^2 and g^2 of the rows kept, and their covariance; `flat` is the force without the pattern."""
     none = np.zeros((2, 2))
-    flat = force_N / (1.0 + pattern[layout.repeat])
     mean = _run_mean(layout, flat, kept, count)
     square = np.bincount(layout.run[kept], (flat[kept] - mean[layout.run[kept]]) ** 2, minlength=layout.runs)
     repeated = count > 1

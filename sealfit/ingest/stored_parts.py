@@ -159,7 +159,7 @@ def part_key(listing: Listing, hashes: Sequence[str | None], seen: str) -> str |
 
 
 def known_parts(out: Path, files: Iterable[str], is_whole: Callable[[str], bool]) -> dict[str, Path]:
-    """Return the stored parts that are whole, by their keys; `files` are those of the last ingest in `out`."""
+    """Return the stored parts that are whole, by their keys; `files` are those of the last ingest."""
     whole = {Path(name).stem: out / name for name in files if name.startswith(f"{PARTS}/")}
     for name in files:
         if "/" in name and not is_whole(name):
