@@ -1,8 +1,7 @@
 """What is wrong with a stroke by itself, with its fix; and the table of all that was found in a campaign.
 
-Every rule is scaled by the trace itself (its noise, its resolution, its sampling), so a coarse sensor is not
-taken for a stuck one, nor a slow rig for a gappy one. Single samples and the commanded speed are judged in
-`trace_checks.py`, and what needs other traces for comparison in `repeat_checks.py`.
+Every rule is scaled by the trace itself (its noise, its resolution, its sampling). Single samples and the
+commanded speed are judged in `trace_checks.py`, and what needs other traces in `repeat_checks.py`.
 """
 
 from __future__ import annotations
@@ -23,13 +22,11 @@ from sealfit.units import Conversion, conversion
 
 LEAST_DIFFERENT = 10  # forces at the beginning of a stroke that tell it from others
 LOAD_TOLERANCE = 0.1  # dead weights are better than that, and a wrong plate is worse
-# Of a load: standard deviation over mean, along a trace. Friction follows its load, so a force that varies by
-# less than the second times as much may be the load itself. In 25 files (exports of tests, microtribo) the
-# force varies 66 times as much as the load or more; swapped, 0.015 times or less.
+# Of a load: standard deviation over mean, along a trace, and the share of it below which that of the force
+# shows that the two are swapped. In 25 files the force varies 66 times as much as the load or more.
 VARIES, STEADIER = 0.05, 0.2
 # Seals on a full film of oil slide at about 0.01, soft dry rubber at up to about 4. Dry rubber at 0.6 to 1 is
-# above with its load in kg, which makes mu 9.81 times too large, and below with its load in g: 102 times too
-# small.
+# above with its load in kg (mu 9.81 times too large), and below with its load in g (102 times too small).
 MU_RANGE = (0.01, 5.0)
 # A load in kg makes the ratio 40 at most (of soft rubber), a force in mN 100 or more unless mu is below 0.1.
 IN_MN = 100.0
@@ -42,11 +39,9 @@ _LIGHTER = (
     'under [files.runs_columns], or force_N = {name = "..", unit = "kgf"} under [trace.columns].'
 )
 FINE = 0.3  # share of equal neighbours below which noise is plainly larger than the sensor's steps
-# Above this share (noise of a third of a step) a reading that rests in the middle of a step, as long as the
-# force does, cannot be told from a stuck one.
+# Above this share (noise of a third of a step) a reading that rests on a step cannot be told from a dead one.
 COARSE = 0.6
-FEW_LEVELS = 5
-NEXT_LEVELS = 30
+FEW_LEVELS, NEXT_LEVELS = 5, 30
 BY_CHANCE = 1e-4  # that so many samples lie at the extreme; few strokes come so far that it is asked
 # Share of the force that may be missing where a stroke ends: more, and it was never steady.
 STILL_RISING = 0.01
@@ -61,11 +56,10 @@ def stroke_faults(
     number: np.ndarray,
     settings: Quality,
 ) -> list[Fault]:
-    """Return what is wrong with one stroke by itself: too short, gappy, saturated, stuck.
+    """Return what is wrong with one stroke by itself, without its file: short, gappy, saturated, stuck.
 
-    Findings of this module do not say which file and stroke they belong to; whoever asks adds that. The
-    arrays, shape (n,), are the whole trace, the line in the file of each of its rows, and the number of each
-    before the config's `keep`: rows that it filters out are no gap.
+    The arrays, shape (n,), are the whole trace, the line in the file of each of its rows, and the number of
+    each before the config's `keep`: rows that it filters out are no gap.
     """
     if stroke.short is not None:
         reason, samples = stroke.short, float(len(stroke.rows))
@@ -89,8 +83,7 @@ def stroke_faults(
 def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
     """Return that a stroke ends before its friction is steady, if it does.
 
-    `left_N` is what is left of the pre-sliding rise where the steady window ends, `force_N` the mean force
-    without it.
+    `left_N` is what is left of the pre-sliding rise in the end, `force_N` the mean force without it.
     """
     if not abs(left_N) > STILL_RISING * abs(force_N):
         return []
@@ -120,9 +113,8 @@ def _gaps(time_s: np.ndarray, line: np.ndarray, number: np.ndarray, settings: Qu
 def beginnings(force_N: np.ndarray, displacement_mm: np.ndarray) -> dict[str, str | None]:
     """Return hashes of the first samples of a stroke, which a copy without its last rows has in common.
 
-    They are of the largest power of two of its samples, and of half as many; None with few different forces,
-    which two measurements may have in common. Of two strokes of which one is at most twice as long, one such
-    number is the same.
+    They are of the largest power of two of its samples, and of half as many, so a copy of at least half of
+    the rows has one in common; None with few different forces, which two measurements may share.
     """
     most, found = 1 << (len(force_N).bit_length() - 1) if len(force_N) else 0, {}
     for name, count in (("begins", most), ("begins_half", most // 2)):
@@ -155,13 +147,11 @@ def _saturated(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list
 def _piled_up(size_N: np.ndarray) -> bool:
     """Return whether more samples lie at the very extreme than chance puts there.
 
-    Samples thin out towards their extreme. So of those at the extreme and at the k levels next to it no more
-    than a share of 1 / (k + 1) is expected at the extreme; a binomial tail says how many more chance may make
-    it.
+    Samples thin out towards their extreme: of those there and at the k levels next to it a share of no more
+    than 1 / (k + 1) is expected there, and a binomial tail says how many more chance may make it.
     """
     away = np.rint((size_N.max() - size_N) / resolution(size_N))  # levels below the extreme
     levels = np.arange(NEXT_LEVELS + 1)
-    # Samples at the extreme and the k levels next to it.
     near = np.searchsorted(np.sort(away), levels, side="right")
     return bool(bdtrc(near[0] - 1, near[1:], 1 / (levels[1:] + 1)).min() < BY_CHANCE)
 
@@ -181,8 +171,9 @@ def _stuck(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fau
         return []
     first, count = place
     value = float(force_N[first])
-    reason = f"{count} samples in a row are exactly {value:g} while the platform moves; "
-    reason += "elsewhere they change."
+    reason = (
+        f"{count} samples in a row are exactly {value:g} while the platform moves; elsewhere they change."
+    )
     return [_broken("stuck", reason, line[first], value, MEASURE_AGAIN)]
 
 
@@ -193,10 +184,9 @@ def _broken(check: str, reason: str, line: int, value: float, fix: str) -> Fault
 def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
     """Return place and length of a run of equal samples that this sensor would not show by itself, or None.
 
-    The run must be `samples` long, five times as long as the long ones among the others, and longer than as
-    many samples with this share of equal neighbours would show by chance (1e-6); and the sensor must show its
-    noise, or a reading that rests on one of its coarse steps would be called stuck. A stroke that is constant
-    all along has no others: see `repeat_checks.constant_strokes`.
+    The run must be `samples` long, five times as long as the long ones among the others, and longer than by
+    chance (1e-6); and the sensor must show its noise, or a reading that rests on a coarse step would be
+    called stuck. A stroke that is constant all along: see `repeat_checks.constant_strokes`.
     """
     edges = np.concatenate(([0], np.flatnonzero(np.diff(force_N) != 0.0) + 1, [len(force_N)]))
     lengths = np.diff(edges)
@@ -211,9 +201,7 @@ def stuck_samples(force_N: np.ndarray, samples: int) -> tuple[int, int] | None:
         return None
     apart = np.ones(len(force_N), bool)
     apart[edges[longest] : edges[longest + 1]] = False
-    if not _shows_noise(force_N, apart, COARSE):
-        return None
-    return int(edges[longest]), run
+    return (int(edges[longest]), run) if _shows_noise(force_N, apart, COARSE) else None
 
 
 def speed_column_faults(measured: float, column: float, config: Config) -> list[Fault]:
@@ -236,10 +224,7 @@ def load_faults(measured: float, declared: float, unit: str) -> list[Fault]:
 
 
 def swapped_faults(force_N: np.ndarray, load_N: np.ndarray, config: Config) -> list[Fault]:
-    """Return that the load varies along a trace and the force does not, as if their columns were swapped.
-
-    The arrays have shape (n,).
-    """
+    """Return that the load varies along a trace, shape (n,), and the force does not, as if swapped."""
     with np.errstate(all="ignore"):  # no scatter of numbers beyond 1e154: inf or nan, and no finding
         of_force, of_load = (np.std(values) / np.mean(np.abs(values)) for values in (force_N, load_N))
     if not (VARIES < of_load < np.inf and of_force < STEADIER * of_load):
@@ -254,8 +239,8 @@ def swapped_faults(force_N: np.ndarray, load_N: np.ndarray, config: Config) -> l
 def improbable_loads(steady: pd.DataFrame, config: Config) -> list[Fault]:
     """Return that friction force over load is no coefficient of friction, in some files or in all.
 
-    Rows of `steady` with `used` false, and those without a load, are left out. Where force and load are not
-    of one dimension (a torque over a load), nothing is said.
+    Rows of `steady` that are not used, and those without a load, are left out. Nothing is said where force
+    and load are not of one dimension (a torque over a load).
     """
     if "load_N" not in steady:
         return []
@@ -313,15 +298,14 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
 
 # ---------------------------------------------------------------- incomplete
 
-# Share of the files that have a value, from which the search for effects still looks at a column.
-LEAST_KNOWN = 0.8
+LEAST_KNOWN = 0.8  # share of files with a value from which the search for effects still looks at a column
 NO_VALUE = "(no value)"  # level of a category in files without one
 
 
 def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) -> list[Fault]:
     """Return, for every column that some files have no value of, how many, what that does, and the fix.
 
-    Rows of `steady` with `used` false are left out. Unaged rubber need not have the columns `aged_only`.
+    Rows of `steady` that are not used are left out. Unaged rubber need not have the columns `aged_only`.
     """
     used = steady[steady["used"].to_numpy(bool)]
     aged = used["aging_days"] != 0 if aged_only else True
@@ -337,8 +321,8 @@ def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) ->
             fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."
             if NO_VALUE in follows:
                 fix += " If it holds remarks, list it under loop.ignore_channels."
-            value = float(missing)
-            faults.append(Fault("incomplete_column", reason, column=name, value=value, fix=fix, **KEPT))
+            about = {"column": name, "value": float(missing), "fix": fix, **KEPT}
+            faults.append(Fault("incomplete_column", reason, **about))
     return faults
 
 

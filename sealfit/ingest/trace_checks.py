@@ -19,15 +19,10 @@ from sealfit.units import Units, conversion
 
 # ---------------------------------------------------------------- spikes
 
-# Samples of the running median. Five are blind to one or two wrong ones, and exact on any slope.
-NEIGHBOURS = 5
-# Share of the samples that are usual.
-USUAL = 0.95
-# A spike is so many times as far off as all usual samples (of noise: 7.8 SDs); else it is one of many bursts.
-APART = 4.0
-# Usual steps by which a spike of displacement is off, at least: see `displacement_spikes`.
-STEPS = 5.0
-FIX = "Correct the cell if the true value is known."
+NEIGHBOURS = 5  # samples of the running median: blind to one or two wrong ones, and exact on any slope
+# A spike is so many times as far off as this share of the samples (of noise: 7.8 SDs); else it is a burst.
+APART, USUAL = 4.0, 0.95
+STEPS = 5.0  # usual steps by which a spike of displacement is off, at least
 
 
 def displacement_spikes(
@@ -62,10 +57,10 @@ def force_spikes(
 ) -> tuple[np.ndarray, list[Fault]]:
     """Return which rows to keep, shape (n,): no single force far off its neighbours; a finding for each.
 
-    "Far" is `spike_sigma` robust standard deviations of what the samples of the steady windows are off the
-    median of their neighbours, and apart from the bulk of these. Outside the windows, where a break-away peak
-    may be as sharp, a spike must also reach beyond the rest of the trace by half of its range. More than
-    `max_bad_rows` spikes are the nature of the signal: said, and kept.
+    "Far" is `spike_sigma` robust standard deviations of what steady samples are off the median of their
+    neighbours, and apart from the bulk of these. Outside the windows, where a break-away peak may be as
+    sharp, a spike must also reach beyond the rest of the trace by half of its range. More than `max_bad_rows`
+    spikes are the nature of the signal: said, and kept.
     """
     keep = np.ones(len(force_N), bool)
     if len(force_N) < 4 * NEIGHBOURS:
@@ -91,13 +86,9 @@ def force_spikes(
         fix = "Look for stick-slip or electrical noise; filter the signal if it is the latter."
         return keep, [Fault("spikes", reason, column="force_N", value=float(count), fix=fix, **KEPT)]
     keep[spikes] = False
-    starts = np.array([stroke.start for stroke in strokes])
-    several = len(strokes) > 1
-    found = []
-    for i in spikes:
-        number = int(np.searchsorted(starts, i, side="right")) if several else None
-        found.append(_spike(number, "force_N", force_N[i], off[i], line[i]))
-    return keep, found
+    number = np.searchsorted([stroke.start for stroke in strokes], spikes, side="right").tolist()
+    of = number if len(strokes) > 1 else [None] * count
+    return keep, [_spike(n, "force_N", force_N[i], off[i], line[i]) for n, i in zip(of, spikes, strict=True)]
 
 
 def resolution(values: np.ndarray) -> float:
@@ -109,7 +100,8 @@ def resolution(values: np.ndarray) -> float:
 def _spike(stroke: int | None, column: str, value: float, off: float, line: int) -> Fault:
     reason = f"a single sample, {abs(off):.4g} off its neighbours."
     place = {"stroke": stroke, "line": int(line), "column": column, "value": float(value)}
-    return Fault("spike", reason, severity="warning", action="row left out", fix=FIX, **place)
+    done = {"severity": "warning", "action": "row left out"}
+    return Fault("spike", reason, fix="Correct the cell if the true value is known.", **place, **done)
 
 
 # ---------------------------------------------------------------- motion
@@ -136,16 +128,14 @@ def motion_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fau
 
 # ---------------------------------------------------------------- speed check
 
-# Factor beyond which the file contradicts itself and is left out. Below it the commanded speed may be
-# nominal.
-GROSS = 1.5
+GROSS = 1.5  # factor beyond which a file contradicts itself; below it the commanded speed may be nominal
 
 
 def measured_speeds(trace: Trace, strokes: Sequence[Stroke], units: Units) -> tuple[float, float]:
     """Return the mean speed of a trace, rests included, and the usual one of its strokes; magnitudes.
 
-    In stick-slip the speed that was set is the mean, in a stroke with rests it is that of the stroke;
-    elsewhere the two agree. Without steady sliding both are nan.
+    The speed that was set is the first in stick-slip, and the second in a stroke with rests. Without steady
+    sliding both are nan.
     """
     speed = np.abs([stroke.speed_mm_s for stroke in strokes])
     rows = np.array([len(stroke.rows) for stroke in strokes])[np.isfinite(speed)]
@@ -158,12 +148,11 @@ def measured_speeds(trace: Trace, strokes: Sequence[Stroke], units: Units) -> tu
 
 
 def speed_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fault | None:
-    """Return a fault if time and displacement of a trace disagree with the commanded speed.
+    """Return a fault if time and displacement of a trace disagree with the commanded speed; else None.
 
-    None if they agree or no speed is commanded. They agree if the commanded speed lies between the measured
-    mean and that of the strokes, or misses them by no more than `quality.speed_disagreement`. Up to a factor
-    of 1.5 the file is kept with a warning: every table holds the measured speed. Beyond, the file is left
-    out, and the fix names the mix-up that fits the factor.
+    They agree if the commanded speed lies between the measured mean and that of the strokes, or misses them
+    by no more than `quality.speed_disagreement`. Up to a factor of 1.5 the file is kept: every table holds
+    the measured speed. Beyond, it is left out, and the fix names the mix-up that fits the factor.
     """
     commanded = trace.channels.get("speed_set_mm_s")
     if not isinstance(commanded, int | float) or not commanded > 0:
@@ -181,11 +170,8 @@ def speed_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Faul
     if 1 / GROSS <= ratio <= GROSS:
         fix = "Check the commanded speed, or slip in the drive."
         return Fault("speed_disagreement", reason, fix=fix, **place, **KEPT)
-    declared = [
-        f"{name} in {config.trace.columns[name].unit}"
-        for name in ("time_s", "displacement_mm")
-        if name in config.trace.columns and config.trace.columns[name].unit
-    ]
+    columns = [(name, config.trace.columns.get(name)) for name in ("time_s", "displacement_mm")]
+    declared = [f"{name} in {column.unit}" for name, column in columns if column and column.unit]
     first = f"Is the unit in the rig config right ({', '.join(declared)})? " if declared else ""
     fix = first + _mix_up(ratio, trace.columns["time_s"], trace.columns["displacement_mm"], config)
     return Fault("speed_disagreement", reason, action="file left out", fix=fix, **place)
