@@ -25,9 +25,8 @@ class Trace:
 
     `columns` are float64 arrays, or object arrays of text (None where empty), by our names; `line` is the
     1-based line in the file of every row; `bad` marks rows that are still to be left out; `rows_read` is the
-    number of data rows in the file. `faults` are what was found; `channels` is what is known of the whole
-    file; `number` is that of every row before the config's `keep` filtered them, None before that; `clock`
-    says that the times are times of day.
+    number of data rows in the file. `channels` is what is known of the whole file; `number` is that of every
+    row before the config's `keep` filtered them, None before that; `clock` says that times are times of day.
     """
 
     columns: Mapping[str, np.ndarray]
@@ -103,10 +102,7 @@ def _row_faults(check: str, name: str, rows: Trace, wrong: np.ndarray) -> list[F
 
 
 def _begins_anew(time_s: np.ndarray) -> int:
-    """Return the row at which time first falls back to where it began.
-
-    It is 0 if there is none, or if few rows come before, as those before a trigger do.
-    """
+    """Return the row at which time first falls back to where it began; 0 if none, or after few rows only."""
     since = time_s - time_s[0]
     anew = 1 + np.flatnonzero((np.diff(since) < 0) & (since[1:] <= ANEW * since[:-1]))
     rows = np.diff(np.r_[0, anew, len(time_s)])
@@ -114,10 +110,7 @@ def _begins_anew(time_s: np.ndarray) -> int:
 
 
 def _out_of_order(time_s: np.ndarray) -> np.ndarray:
-    """Return a mask of the rows outside a longest rising subsequence of the times (patience sorting).
-
-    So one wrong time that lies far ahead costs one row and not all that follow.
-    """
+    """Return a mask of the rows outside a longest rising subsequence of the times (patience sorting)."""
     if len(time_s) < 2 or (np.diff(time_s) > 0).all():
         return np.zeros(len(time_s), bool)
     tails: list[float] = []
@@ -178,7 +171,7 @@ def read_cells(
 ) -> Trace:
     """Return the data of a text file, whose data lines are `body` (`body_of`); the others as `checked_cells`.
 
-    Arrow reads the lines if all is as it should be; what it cannot read is split line by line.
+    Arrow reads the lines if it can; else they are split one by one.
     """
     rows = body.count(b"\n") + 1
     numeric = [i for i, name in ours.items() if name in must]
@@ -186,11 +179,10 @@ def read_cells(
     if columns is not None:
         line = np.arange(layout.first_line, layout.first_line + rows)
         return checked_cells(columns, line, ours, must, settings.decimal)
-    lines = list(enumerate(body.decode("utf-8", "replace").split("\n"), start=layout.first_line))
-    line = np.array([number for number, text in lines if text.strip()], dtype=np.int64)
-    cells = [
-        split_line(without_strays(text, settings), settings.delimiter) for _, text in lines if text.strip()
-    ]
+    every = enumerate(body.decode("utf-8", "replace").split("\n"), start=layout.first_line)
+    lines = {number: text for number, text in every if text.strip()}
+    line = np.array(list(lines), dtype=np.int64)
+    cells = [split_line(without_strays(text, settings), settings.delimiter) for text in lines.values()]
     count = np.array([len(row) for row in cells])
     width = len(layout.names) or count.max(initial=0)
     columns = {
@@ -198,7 +190,18 @@ def read_cells(
     }
     trace = checked_cells(columns, line, ours, must, settings.decimal, count)
     beyond = np.array([any(cell.strip() for cell in row[width:]) for row in cells], dtype=bool)
-    found = _beyond_faults(np.flatnonzero(beyond & ~trace.bad), cells, line, width)
+
+    def make(i: int) -> Fault:
+        value = " ".join(cell.strip() for cell in cells[i][width:] if cell.strip())
+        reason = f"the line has {len(cells[i])} cells where {width} are named."
+        fix = "Move it to a column with a name of its own, or delete the line."
+        if len(cells[i]) == 2 * width:
+            fix = "Decimal commas between commas? Export with another separator, or with decimal points."
+        place = {"line": int(line[i]), "value": value, "action": "row left out"}
+        return Fault("too_many_cells", reason, fix=fix, **place)
+
+    more = "lines with cells beyond the last named column."
+    found = listed(np.flatnonzero(beyond & ~trace.bad), make, "too_many_cells", more)
     return replace(trace, bad=trace.bad | beyond).with_faults(found)
 
 
@@ -212,9 +215,9 @@ def checked_cells(
 ) -> Trace:
     """Return columns of cells, by position (from 0), by our names; `must` are those that must hold numbers.
 
-    A column holds numbers, text as objects, or datetime64: times of day are seconds since the first where a
-    number is needed, and else text in ISO 8601. A row without a needed number is bad, and is named. `count`
-    is the number of cells of each line of a text, in which None stands for a cell beyond its end.
+    A column holds numbers, text as objects, or datetime64: seconds since the first where a number is needed,
+    else text in ISO 8601. A row without a needed number is bad. `count` is the number of cells of each line
+    of a text, in which None stands for a cell beyond its end.
     """
     bad, made, faults, clock = np.zeros(len(line), bool), {}, [], False
     for i, name in ours.items():
@@ -222,7 +225,7 @@ def checked_cells(
             continue
         values = columns[i]
         if values.dtype.kind == "M":
-            values = _seconds(values) if name in must else _iso(values)
+            values = _from_dates(values, name in must)
         if name in must:
             numbers = seconds_of_day(values) if name == "time_s" and values.dtype.kind == "O" else None
             clock |= numbers is not None
@@ -241,14 +244,12 @@ def checked_cells(
     return Trace(made, line, bad, len(line), tuple(faults), clock=clock)
 
 
-def _seconds(times: np.ndarray) -> np.ndarray:
-    known = times[~np.isnat(times)]
-    return (times - (known[0] if len(known) else times[0])) / np.timedelta64(1, "s")
-
-
-def _iso(times: np.ndarray) -> np.ndarray:
+def _from_dates(times: np.ndarray, as_seconds: bool) -> np.ndarray:
+    unknown = np.isnat(times)
+    if as_seconds:  # since the first that is known
+        return (times - times[unknown.argmin()]) / np.timedelta64(1, "s")
     texts = np.datetime_as_string(times).astype(object)
-    texts[np.isnat(times)] = None
+    texts[unknown] = None
     return texts
 
 
@@ -260,11 +261,11 @@ def _fast(
     table = _arrow(body, settings, types)
     if table is None or table.num_rows != rows:  # blank lines, or line ends inside quotes
         return None
-    written = [
-        i for i, kind in enumerate(table.schema.types) if not (_numeric(kind) or pa.types.is_string(kind))
-    ]
-    if written:  # TRUE, a date or 08:30, which Arrow would write in another way
-        table = _arrow(body, settings, types | dict.fromkeys(written, pa.string()))
+    for i, kind in enumerate(table.schema.types):
+        if not (_numeric(kind) or pa.types.is_string(kind)):
+            types[i] = pa.string()  # TRUE, a date or 08:30, which Arrow would write in another way
+    if len(types) > len(numeric):
+        table = _arrow(body, settings, types)
     columns = {i: _column(column) for i, column in enumerate(table.columns)}
     for i in range(len(layout.names), len(columns)) if layout.names else ():
         beyond = columns.pop(i)
@@ -283,18 +284,12 @@ def _arrow(body: bytes, settings: TraceFormat, types: Mapping[int, pa.DataType])
     width = width_of(body, delimiter)
     if width <= max(types, default=0) or len(mark.encode()) != 1:
         return None
-    names = [str(i) for i in range(width)]
+    names, size = [str(i) for i in range(width)], max(len(body) + 1, 1024)
+    kinds = {names[i]: kind for i, kind in types.items()}
+    read = pacsv.ReadOptions(column_names=names, use_threads=False, block_size=size)
+    convert = pacsv.ConvertOptions(decimal_point=settings.decimal, column_types=kinds)
     try:
-        return pacsv.read_csv(
-            pa.BufferReader(body),
-            read_options=pacsv.ReadOptions(
-                column_names=names, use_threads=False, block_size=max(len(body) + 1, 1024)
-            ),
-            parse_options=pacsv.ParseOptions(delimiter=mark),
-            convert_options=pacsv.ConvertOptions(
-                decimal_point=settings.decimal, column_types={names[i]: kind for i, kind in types.items()}
-            ),
-        )
+        return pacsv.read_csv(pa.BufferReader(body), read, pacsv.ParseOptions(delimiter=mark), convert)
     except pa.ArrowInvalid:
         return None
 
@@ -312,7 +307,7 @@ def _column(column: pa.ChunkedArray) -> np.ndarray:
 def seconds_of_day(cells: Sequence[str | None]) -> np.ndarray | None:
     """Return seconds since the first of the times of day in cells, shape (n,); None if most hold none.
 
-    A date before the time is not read: where the time falls by more than half a day, midnight has passed.
+    Dates are not read: where the time falls by more than half a day, midnight has passed.
 
     Examples
     --------
@@ -355,11 +350,10 @@ def cell_faults(
     place = {"column": name, "action": "row left out"}
 
     def make(i: int) -> Fault:
-        cell = cells[i]
-        if cell is None and count is not None:
+        if cells[i] is None and count is not None:
             reason, fix = f"the line ends after {count[i]} cells.", "Complete or delete the line."
             return Fault("too_few_cells", reason, line=int(line[i]), fix=fix, **place)
-        cell = "" if pd.isna(cell) else str(cell)  # as text: JSON has no inf
+        cell = "" if pd.isna(cells[i]) else str(cells[i])  # as text: JSON has no inf
         value = cell.strip()
         check, reason = "not_a_number", "is not a number."
         fix = decimal_fix(cell, decimal) or "Put a number there or delete the line."
@@ -378,22 +372,9 @@ def cell_faults(
 
 def decimal_fix(cell: str, decimal: str) -> str:
     """Return the fix for a number with the other decimal mark or one of thousands; "" if it has neither."""
-    if decimal == "." and as_number(cell, ",") is not None:
-        return 'Use a decimal point, or set decimal = "," in the rig config.'
-    if decimal == "," and as_number(cell, ".") is not None:
-        return 'Use a decimal comma, or set decimal = "." in the rig config.'
-    if as_number(cell.replace("," if decimal == "." else ".", ""), decimal) is not None:
+    other, name = (",", "point") if decimal == "." else (".", "comma")
+    if as_number(cell, other) is not None:
+        return f'Use a decimal {name}, or set decimal = "{other}" in the rig config.'
+    if as_number(cell.replace(other, ""), decimal) is not None:
         return "Export it again without marks between thousands."
     return ""
-
-
-def _beyond_faults(at, rows, line, width) -> list[Fault]:
-    def make(i: int) -> Fault:
-        value = " ".join(cell.strip() for cell in rows[i][width:] if cell.strip())
-        reason = f"the line has {len(rows[i])} cells where {width} are named."
-        fix = "Move it to a column with a name of its own, or delete the line."
-        if len(rows[i]) == 2 * width:
-            fix = "Decimal commas between commas? Export with another separator, or with decimal points."
-        return Fault("too_many_cells", reason, line=int(line[i]), value=value, fix=fix, action="row left out")
-
-    return listed(at, make, "too_many_cells", "lines with cells beyond the last named column.")

@@ -24,7 +24,7 @@ Columns = dict[str, Column]
 LONGEST_LIST = 400  # characters of the names of columns that a message lists
 NO_COLUMN = "there is no such column."
 SLOTS = ("time_s", "displacement_mm", "force_N", "load_N")  # always numbers
-# Columns that our tables make themselves: a channel of that name in a trace file gets another, `stroke_file`.
+# Columns that our tables make themselves: a channel of that name gets another, `stroke_file`.
 RESERVED = {*BINS.names(), *RUNS.names(), "line", "steady"} - set(SLOTS)
 
 
@@ -85,8 +85,7 @@ def in_order(columns: Columns) -> Columns:
 
 
 # ---------------------------------------------------------------- conditions
-# The keys `condition`, `series` and `rubber` of a table, built from its condition columns; the one place that
-# spells them.
+# The keys `condition`, `series` and `rubber` of a table are spelled here only.
 
 UNAGED = "unaged"
 ALL = "all"  # the series of a rig whose only condition is its age
@@ -103,9 +102,8 @@ def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
 
     A condition is spelled "temperature_C=60, compression_ratio_pct=80, aging_days=4"; a series is the
     condition without days ("all" when no other column is left). Rows with aging_days = 0 are "unaged" in both
-    ("unaged, <rubber>" where the config names rubber columns), whatever stands in their other condition
-    cells. Without days, series and condition are equal. A row with an empty condition cell has null for both,
-    unless it is unaged. SealfitError if one of the config's condition or rubber columns is missing.
+    ("unaged, <rubber>" where the config names rubber columns). Other rows with an empty condition cell have
+    null for both. SealfitError if one of the config's condition or rubber columns is missing.
 
     Examples
     --------
@@ -118,10 +116,9 @@ def add_keys(table: pd.DataFrame, config: Config) -> pd.DataFrame:
     columns = condition_columns(config)
     missing = [name for name in columns if name not in table.columns]
     if missing:
-        raise SealfitError(
-            f"condition column {', '.join(repr(name) for name in missing)} is missing.",
-            fix="Add it, or name other columns in the config's condition and rubber.",
-        )
+        reason = f"condition column {', '.join(repr(name) for name in missing)} is missing."
+        fix = "Add it, or name other columns in the config's condition and rubber."
+        raise SealfitError(reason, fix=fix)
     keys = keys_of({name: table[name].tolist() for name in columns}, len(table), config)
     return table.assign(**{key: pd.array(words, dtype="str") for key, words in keys.items()})
 
@@ -140,11 +137,8 @@ def keys_of(
         others = [own for name, own in words.items() if name != "aging_days"]
         series = _joined(others, rows) if others else [ALL] * rows
         unaged = _joined([[UNAGED] * rows, *([rubber] if config.rubber else [])], rows)
-        aged = [days != "0" for days in texts["aging_days"]]
-        condition, series = (
-            [own if old else new for own, new, old in zip(known, unaged, aged, strict=True)]
-            for known in (condition, series)
-        )
+        new = {i: unaged[i] for i, days in enumerate(texts["aging_days"]) if days == "0"}
+        condition, series = put(condition, new), put(series, new)
     return {"condition": condition, "series": series, "rubber": rubber}
 
 
@@ -179,10 +173,7 @@ def numeric_names(settings: TraceFormat) -> set[str]:
 
 
 def force_inputs(config: Config) -> set[str]:
-    """Return the columns that `force_N` is computed from and that are no channels; none with `drop_columns`.
-
-    An effect of one of them would give the force back that was computed from it.
-    """
+    """Return the columns that `force_N` is computed from, no channels among them; none with `drop_columns`."""
     settings = config.trace
     if settings.drop_columns is not None:
         return set()
@@ -196,9 +187,8 @@ def force_inputs(config: Config) -> set[str]:
 def locate(layout: FileLayout, width: int, settings: TraceFormat) -> dict[int, str]:
     """Return our name for each position (from 0) of a file with `width` columns.
 
-    Columns that the config does not list keep the file's name (`column_4` where it has none), or a name
-    beside it where the config gives that name to another column. BadFile if a column is missing or its name
-    stands twice; the nearest name is suggested.
+    Columns that the config does not list keep the file's name (`column_4` where it has none), or one beside
+    it where that is taken. BadFile if a column is missing or its name stands twice.
     """
     found: dict[int, str] = {}
     faults = []
@@ -261,12 +251,11 @@ INSTEAD = {
 def required(table: Mapping[str, object], layout: FileLayout, names: Sequence[str] = SLOTS[:3]) -> None:
     """Raise `BadFile` if, after everything is computed, a column that a trace needs is not there."""
     found = []
-    for name in names:
-        if name not in table:
-            fix = "Name it under [trace.columns], or compute it under [trace.compute]."
-            if other := INSTEAD.get(name):
-                fix = f"Name it under [trace.columns], compute it under [trace.compute], or {other}."
-            found.append(missing_column(name, layout, fix))
+    for name in (name for name in names if name not in table):
+        fix = "Name it under [trace.columns], or compute it under [trace.compute]."
+        if other := INSTEAD.get(name):
+            fix = f"Name it under [trace.columns], compute it under [trace.compute], or {other}."
+        found.append(missing_column(name, layout, fix))
     if found:
         raise BadFile(*found)
 
@@ -282,24 +271,25 @@ def header_units(layout: FileLayout, settings: TraceFormat, units: Units, clock:
 
     With `clock` the times are times of day, whatever the header says.
     """
-    faults = []
+    faults, names = [], layout.names
     row = split_line(layout.header[-1], settings.delimiter) if settings.units_row and layout.header else []
     for ours in SLOTS[1:] if clock else SLOTS:
         column = settings.columns.get(ours)
-        if column is None or column.name not in (*layout.names, *range(1, len(layout.names) + 1)):
+        if column is None or column.name not in (*names, *range(1, len(names) + 1)):
             continue
-        at = column.name - 1 if isinstance(column.name, int) else layout.names.index(column.name)
+        at = column.name - 1 if isinstance(column.name, int) else names.index(column.name)
         cell = row[at].strip(" []") if at < len(row) else ""
-        said = cell if cell[:1].isalpha() else layout.names[at].rpartition("[")[2].rpartition("]")[0].strip()
+        said = cell if cell[:1].isalpha() else names[at].rpartition("[")[2].rpartition("]")[0].strip()
         taken = column.unit or units.of(ours)
         unit = other_unit(said, taken)
-        if unit is not None:
-            fix = f'set {ours} = {{name = {column.name!r}, unit = "{unit}"}} under [trace.columns].'
-            if not unit:
-                fix = f"name the column otherwise under [trace.columns], and compute {ours} from it."
-            reason = f"the header says '{said}', and the config takes the numbers in {taken}."
-            place = {"line": layout.names_line, "column": layout.names[at]}
-            faults.append(Fault("unit", reason, fix=f"If the header is right, {fix}", **place, **KEPT))
+        if unit is None:
+            continue
+        fix = f'set {ours} = {{name = {column.name!r}, unit = "{unit}"}} under [trace.columns].'
+        if not unit:
+            fix = f"name the column otherwise under [trace.columns], and compute {ours} from it."
+        reason = f"the header says '{said}', and the config takes the numbers in {taken}."
+        place = {"line": layout.names_line, "column": names[at]}
+        faults.append(Fault("unit", reason, fix=f"If the header is right, {fix}", **place, **KEPT))
     return faults
 
 
@@ -316,10 +306,10 @@ def _missing(ours: str, layout: FileLayout, width: int, settings: TraceFormat) -
             fix += f" Name it under [trace.columns], or {INSTEAD[ours]}."
     if len(layout.names) <= 1 and layout.names_line is not None:
         line = layout.header[layout.names_line - 1]
-        for mark, word in ((";", ";"), ("\t", "tab"), (",", ","), ("|", "|"), (" ", "whitespace")):
-            if len(split_line(line, mark)) >= 2 and mark != settings.delimiter:
-                fix = f'The header looks separated otherwise: set delimiter = "{word}" in the rig config.'
-                break
+        marks = ((";", ";"), ("\t", "tab"), (",", ","), ("|", "|"), (" ", "whitespace"))
+        likely = [w for mark, w in marks if len(split_line(line, mark)) >= 2 and mark != settings.delimiter]
+        if likely:
+            fix = f'The header looks separated otherwise: set delimiter = "{likely[0]}" in the rig config.'
     return missing_column(theirs, layout, fix)
 
 
@@ -332,9 +322,9 @@ MAX_LABELS = 20
 def channel_columns(rows: Trace, config: Config) -> Trace:
     """Return the rows with the columns that are of use, and what was found in the channels.
 
-    A channel with a few cells missing costs these rows; one with more than `quality.max_bad_rows` of them
-    missing is left out itself, and the file stays. Text is a label; where most cells are numbers, the others
-    are faults; where most cells are empty, the rest are remarks, and each is named.
+    A channel with a few cells missing costs these rows; one with more than `quality.max_bad_rows` of them is
+    left out itself. Text is a label, or remarks where most cells are empty; where most cells are numbers, the
+    others are faults.
     """
     kept, drop, faults, good = dict(rows.columns), np.zeros(len(rows.line), bool), [], ~rows.bad
     said = {fault.column for fault in rows.faults}
@@ -346,9 +336,8 @@ def channel_columns(rows: Trace, config: Config) -> Trace:
             full = np.array([cell is not None for cell in values])
             numbers = numbers_of(values, config.trace.decimal)
             if full.any() and np.isfinite(numbers).sum() <= 0.5 * full.sum():
-                found = _label_faults(name, values, full, rows.line)
-                faults += found
-                if found:
+                if found := _label_faults(name, values, full, rows.line):
+                    faults += found
                     del kept[name]
                 continue
             kept[name] = numbers
