@@ -173,7 +173,7 @@ def numeric_names(settings: TraceFormat) -> set[str]:
 
 
 def force_inputs(config: Config) -> set[str]:
-    """Return the columns that `force_N` is computed from, no channels among them; none with `drop_columns`."""
+    """Return the columns that `force_N` is computed from and no channels; none with `drop_columns`."""
     settings = config.trace
     if settings.drop_columns is not None:
         return set()

@@ -21,7 +21,6 @@ from sealfit.store.manifest import Fingerprint, fingerprint_of
 
 # ---------------------------------------------------------------- folder
 
-_BLANK = b" \t\r\n\0"
 LINE_ENDS = b"\r\n\x1a"  # the last is DOS's end of a file
 MOST_CUT = 0.25  # Largest share of text files without a line end that are taken for cut: one of four.
 
@@ -41,8 +40,7 @@ def inside(campaign: Path, file: str) -> Path | None:
 
 def read_marked(campaign: Path, file: str) -> tuple[bytes, Fingerprint]:
     """Return the file's bytes, and the fingerprint of these very bytes; raises as `read_bytes`."""
-    with in_file(file):
-        raw, status = _read(campaign, file)
+    raw, status = _read(campaign, file)
     return raw, fingerprint_of(raw, status)
 
 
@@ -51,15 +49,13 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
 
     BadFile if it is missing, outside the campaign, no file, not readable or empty.
     """
-    with in_file(file):
-        return _read(campaign, file, HEAD_BYTES if head else -1)[0]
+    return _read(campaign, file, HEAD_BYTES if head else -1)[0]
 
 
 def cut_files(campaign: Path, texts: Sequence[str]) -> frozenset[str]:
-    """Return those of some text files that do not end with a line end although most do.
+    """Return those of some text files that do not end with a line end although most do: copies broken off.
 
-    A copy that was broken off ends anywhere, and the part of a number is a number. Some programs write no
-    line end after the last line; all of their files lack it.
+    The part of a number is a number. Of a program that writes no last line end, all files lack it.
     """
     lacking = [file for file in texts if not _ends_a_line(os.path.join(campaign, file))]
     return frozenset(lacking if len(lacking) <= MOST_CUT * len(texts) else ())
@@ -87,33 +83,6 @@ def whole_lines(text: bytes) -> tuple[bytes, Fault]:
     return text[:end], Fault("cut_file", reason, line=line, fix=fix, **done)
 
 
-def _read(campaign: Path, file: str, size: int = -1) -> tuple[bytes, os.stat_result]:
-    path = inside(campaign, file)
-    if path is None:
-        fix = "Copy it into the folder of runs.csv."
-        raise bad_file("path_outside", "lies outside the campaign folder.", fix)
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for
-            raise bad_file("unreadable_file", "is not a file.", "Check the path.")
-        with path.open("rb") as opened:
-            status, raw = os.fstat(opened.fileno()), opened.read(size)
-    except FileNotFoundError:
-        reason, fix = "does not exist.", did_you_mean(path, Path.is_file)
-        if path.is_symlink():
-            reason = f"is a link to '{path.readlink()}', which does not exist."
-            fix = "Copy the file itself into the campaign."
-        fix = fix or "Paths are relative to the folder of runs.csv."
-        raise bad_file("missing_file", reason, fix) from None
-    except OSError as error:
-        reason = f"cannot be read ({error.strerror})."
-        raise bad_file("unreadable_file", reason, "Check its rights.") from error
-    marks = [len(mark) for mark, _ in _BOMS if raw.startswith(mark)]
-    if not raw[max(marks, default=0) :].strip(_BLANK):
-        fix = "Export it again, or leave it out: of runs.csv, or by files.exclude in the rig config."
-        raise bad_file("empty_file", "is empty.", fix)
-    return raw, status
-
-
 def bad_file(check: str, reason: str, fix: str, **place) -> BadFile:
     """Return the error of a file that is left out; the path is added by `in_file`."""
     return BadFile(Fault(check, reason, action="file left out", fix=fix, **place))
@@ -131,6 +100,34 @@ def in_file(file: str) -> Iterator[None]:
         yield
     except BadFile as error:
         raise BadFile(*placed(error.faults, file)) from error
+
+
+def _read(campaign: Path, file: str, size: int = -1) -> tuple[bytes, os.stat_result]:
+    with in_file(file):
+        path = inside(campaign, file)
+        if path is None:
+            fix = "Copy it into the folder of runs.csv."
+            raise bad_file("path_outside", "lies outside the campaign folder.", fix)
+        try:
+            if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for
+                raise bad_file("unreadable_file", "is not a file.", "Check the path.")
+            with path.open("rb") as opened:
+                status, raw = os.fstat(opened.fileno()), opened.read(size)
+        except FileNotFoundError:
+            reason, fix = "does not exist.", did_you_mean(path, Path.is_file)
+            if path.is_symlink():
+                reason = f"is a link to '{path.readlink()}', which does not exist."
+                fix = "Copy the file itself into the campaign."
+            fix = fix or "Paths are relative to the folder of runs.csv."
+            raise bad_file("missing_file", reason, fix) from None
+        except OSError as error:
+            reason = f"cannot be read ({error.strerror})."
+            raise bad_file("unreadable_file", reason, "Check its rights.") from error
+        marks = [len(mark) for mark, _ in _BOMS if raw.startswith(mark)]
+        if not raw[max(marks, default=0) :].strip(b" \t\r\n\0"):
+            fix = "Export it again, or leave it out: of runs.csv, or by files.exclude in the rig config."
+            raise bad_file("empty_file", "is empty.", fix)
+        return raw, status
 
 
 # ---------------------------------------------------------------- text
@@ -166,10 +163,9 @@ _CONTROL = bytes(set(range(32)) - {9, 10, 12, 13}) + b"\x7f"
 
 @dataclass(frozen=True, slots=True)
 class FileLayout:
-    """Where a trace file's data begin and what its columns are called.
+    """Where a trace file's data begin, at byte `start` of line `first_line`, and what its columns are called.
 
-    `header` are the lines before the data, without line ends; `names` is empty where columns go by position;
-    `start` is the offset of the first data byte and `first_line` its 1-based line number.
+    `header` are the lines before; `names` is empty where columns go by position. Lines count from 1.
     """
 
     header: tuple[str, ...]
@@ -183,10 +179,11 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
     """Return the text as UTF-8 bytes without byte-order mark, lines ended by a single line feed.
 
     `auto` looks for a byte-order mark, then for the zero bytes of UTF-16, then takes UTF-8, and bytes that
-    are not UTF-8 as Latin-1. BadFile if the bytes are not text in that encoding, or begin as files of other
-    formats do.
+    are not UTF-8 as Latin-1. BadFile if it is no text in that encoding, or begins as other formats do.
     """
-    _refuse_packed(raw)
+    if what := next((what for magic, what in _PACKED.items() if raw.startswith(magic)), None):
+        fix = "Export it as CSV, or give the file the ending of its format."
+        raise bad_file("binary_file", f"is {what}, not text.", fix)
     automatic = encoding == "auto"
     if automatic:
         encoding = next((name for mark, name in _BOMS if raw.startswith(mark)), None) or _guess(raw)
@@ -208,12 +205,9 @@ def as_utf8(raw: bytes, encoding: str, *, head: bool = False) -> bytes:
     raw = raw.rstrip(b"\x1a")  # DOS's end of a file
     if raw.translate(None, _CONTROL) != raw:
         place = next(i for i, byte in enumerate(raw) if byte in _CONTROL)
-        line = raw[:place].count(b"\n") + 1
-        reason = f"is not text: byte {raw[place]:#04x} stands in it."
+        reason, line = f"is not text: byte {raw[place]:#04x} stands in it.", raw.count(b"\n", 0, place) + 1
         raise bad_file("binary_file", reason, "Export the trace as text (CSV).", line=line)
-    if b"\r" in raw:
-        raw = raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    return raw
+    return raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
 
 
 def _latin_1(error: UnicodeError) -> tuple[str, int]:
@@ -221,13 +215,6 @@ def _latin_1(error: UnicodeError) -> tuple[str, int]:
 
 
 codecs.register_error("as_latin_1", _latin_1)
-
-
-def _refuse_packed(raw: bytes) -> None:
-    for magic, what in _PACKED.items():
-        if raw.startswith(magic):
-            fix = "Export it as CSV, or give the file the ending of its format."
-            raise bad_file("binary_file", f"is {what}, not text.", fix)
 
 
 def refuse_marked_up(text: bytes) -> None:
@@ -252,11 +239,9 @@ def find_layout(text: bytes, settings: TraceFormat) -> FileLayout:
         return FileLayout(header, (), None, start, count + 1)
     back = settings.names_line or (2 if settings.units_row else 1)
     if back > len(header):
-        reason = (
-            f"has a header of {len(header)} lines, and its names should stand {back} lines before the data."
-        )
+        reason = f"has a header of {len(header)} lines, and its names should stand {back} lines before the "
         fix = "Check header_lines and names_line in the rig config."
-        raise bad_file("header_not_found", reason, fix)
+        raise bad_file("header_not_found", f"{reason}data.", fix)
     cells = split_line(without_strays(header[-back], settings), settings.delimiter)
     names = tuple(name.strip() for name in cells)
     return FileLayout(header, names, count - back + 1, start, count + 1)
@@ -300,15 +285,15 @@ def header_fields(header: tuple[str, ...], config: Config) -> dict[str, float | 
     found: dict[str, float | str] = {}
     units = config.conversions("names")
     for name, pattern in config.trace.header_fields.items():
-        for line in header:
-            if match := found_by(pattern, line):
-                value = (match.group(1) if match.re.groups else match.group()) or ""
-                stays = name in (*TEXT_COLUMNS, *config.files.text_parts)
-                number = None if stays else as_number(value, config.trace.decimal)
-                if number is not None and name in units:
-                    number = units[name].of_cell(number)
-                found[name] = value.strip() if number is None else number
-                break
+        match = next(filter(None, (found_by(pattern, line) for line in header)), None)
+        if match is None:
+            continue
+        value = (match.group(1) if match.re.groups else match.group()) or ""
+        stays = name in (*TEXT_COLUMNS, *config.files.text_parts)
+        number = None if stays else as_number(value, config.trace.decimal)
+        if number is not None and name in units:
+            number = units[name].of_cell(number)
+        found[name] = value.strip() if number is None else number
     return found
 
 
@@ -320,15 +305,12 @@ def as_number(cell: str, decimal: str = ".") -> float | None:
     >>> as_number(" 1,5 ", ","), as_number("1,5"), as_number("1_000"), as_number("-2e-3")
     (1.5, None, None, -0.002)
     """
-    text = cell.strip()
-    if decimal == ",":
-        if "." in text:
-            return None
-        text = text.replace(",", ".")
-    if "_" in text:  # Python reads 1_000 as a number; a rig never writes it
+    if "_" in cell or (
+        decimal == "," and "." in cell
+    ):  # Python reads 1_000 as a number; a rig never writes it
         return None
     try:
-        return float(text)
+        return float(cell.replace(",", ".") if decimal == "," else cell)
     except ValueError:
         return None
 

@@ -1,8 +1,7 @@
 """Trace files of arrays, not of text: TDMS, MATLAB and Parquet, each read by the library made for it.
 
-Every reader gives the same: header lines `name<tab>text`, names of the columns, and a column each. What
-follows is done as for text. The libraries are optional (`pip install 'sealfit[formats]'`) and loaded where a
-file needs them.
+Every reader gives header lines `name<tab>text`, names of the columns, and a column each. The libraries are
+optional (`pip install 'sealfit[formats]'`) and loaded where a file needs them.
 """
 
 from __future__ import annotations
@@ -13,9 +12,9 @@ import re
 import struct
 import warnings
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime, time, timedelta
 from pathlib import PurePosixPath
 from types import ModuleType
@@ -29,22 +28,16 @@ from sealfit.ingest.files import bad_file
 
 # ---------------------------------------------------------------- kinds
 
-ENDINGS = {
-    ".xlsx": "xlsx",
-    ".xlsm": "xlsx",
-    ".xls": "xlsx",  # which is refused, and said how to save it
-    ".tdms": "tdms",
-    ".mat": "mat",
-    ".parquet": "parquet",
-    ".pq": "parquet",
-}
-OF_ARRAYS = ("tdms", "mat", "parquet")
+# .xls is refused, and said how to save it.
+ENDINGS = {f".{kind}": kind for kind in ("xlsx", "tdms", "mat", "parquet")}
+ENDINGS |= {".xlsm": "xlsx", ".xls": "xlsx", ".pq": "parquet"}
 CALLED = {
     "xlsx": "an Excel workbook",
     "tdms": "a TDMS file",
     "mat": "a MAT-file",
     "parquet": "a Parquet file",
 }
+OF_ARRAYS = ("tdms", "mat", "parquet")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]+")
 
 
@@ -91,10 +84,10 @@ def damage_named(kind: str) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrays:
-    """A file's header lines, the names of its columns and the columns, each of shape (n,).
+    """A file's header lines, the names of its columns (empty where they go by position) and the columns.
 
-    `names` is empty where columns go by position. A column holds float64, datetime64, or text as objects
-    (None where empty); `faults` name what is no column.
+    A column, shape (n,), holds float64, datetime64, or text as objects (None where empty); `faults` name what
+    is no column.
     """
 
     header: tuple[str, ...]
@@ -106,8 +99,7 @@ class Arrays:
 def read_arrays(raw: bytes, kind: str, settings: TraceFormat, *, head: bool = False) -> Arrays:
     """Return what a file of a kind, one of `OF_ARRAYS`, holds; with `head` its header lines at least.
 
-    BadFile if it is damaged, holds no columns or several tables of which none is chosen; CampaignError if the
-    library that reads it is not installed.
+    BadFile if it is damaged, or holds not one table; CampaignError if the library is not installed.
     """
     with damage_named(kind):
         found = _READERS[kind](raw, settings, head)
@@ -151,11 +143,8 @@ def _column(values: np.ndarray) -> np.ndarray | None:
         return values
     if values.dtype.kind == "m":
         return values / np.timedelta64(1, "s")
-    if values.dtype.kind in "UO" and all(
-        value is None or isinstance(value, str) for value in values.tolist()
-    ):
-        return values.astype(object)
-    return None
+    words = values.dtype.kind in "UO" and all(isinstance(cell, str | None) for cell in values.tolist())
+    return values.astype(object) if words else None
 
 
 def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceFormat) -> Arrays:
@@ -173,22 +162,18 @@ def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceF
             kept[name] = column
             continue
         reason = f"has {len(values)} values where others have {rows}"
+        fix = "Export all channels at one rate."
         if column is None:
-            reason = "holds neither numbers nor text"
+            reason, fix = "holds neither numbers nor text", "Export it as numbers."
         if name in needed:
-            fix = "Export all channels at one rate." if column is not None else "Export it as numbers."
             raise bad_file("column_shape", f"{reason}.", fix, column=name)
-        reason = f"{reason}; the column is not used."
-        faults.append(Fault("channel_left_out", reason, column=name, **NOTED))
+        faults.append(Fault("channel_left_out", f"{reason}; the column is not used.", column=name, **NOTED))
         kept[name] = np.full(rows, np.nan)  # columns may go by position
     return Arrays(tuple(header), tuple(kept), tuple(kept.values()), tuple(faults))
 
 
 def _chosen(
-    options: Mapping[str, Collection[str]],
-    key: str,
-    settings: TraceFormat,
-    derived: str | int | None = None,
+    options: Mapping[str, Collection[str]], key: str, settings: TraceFormat, derived: str | int | None = None
 ) -> str:
     """Return the one of several tables in a file that the config names, or the only one that fits it.
 
@@ -198,17 +183,14 @@ def _chosen(
     wanted = getattr(settings, key)
     if not options:
         raise bad_file("no_rows", "holds no column of data.", "Export it again.")
+    if wanted in options:
+        return wanted
     if wanted is not None:
-        if wanted in options:
-            return wanted
         fix = suggestion(wanted, list(options)).replace("columns are", f"{key}s are")
         raise bad_file("missing_table", f"holds no {key} '{wanted}' (trace.{key}) with data.", fix)
-    names = {
-        name
-        for ours, name in settings.their_columns.items()
-        if isinstance(name, str) and ours not in settings.optional
-    }
-    fitting = [option for option, columns in options.items() if names - {derived} <= set(columns)]
+    needed = {theirs for ours, theirs in settings.their_columns.items() if ours not in settings.optional}
+    names = {name for name in needed - {derived} if isinstance(name, str)}
+    fitting = [option for option, columns in options.items() if names <= set(columns)]
     if len(options) == 1 or len(fitting) == 1:
         return [*fitting, *options][0]
     named = ", ".join(repr(option) for option in options)
@@ -238,21 +220,14 @@ def _tdms(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
         header += [_header_line(f"{place}/{name}", value) for name, value in channel.properties.items()]
     if head:
         return Arrays(tuple(header))
-    filled = {channel.name: channel for channel in group.channels()}
-    made = _arrays(header, {name: np.asarray(channel[:]) for name, channel in filled.items()}, settings)
-    if not isinstance(time_name, str) or time_name in names[group.name]:
-        return made
-    return _with_time(made, time_name, [filled[name].properties for name in made.names])
-
-
-def _with_time(made: Arrays, name: str, properties: Sequence[Mapping[str, object]]) -> Arrays:
-    """Return the columns and one of time, from the increment that the waveforms of all channels share."""
-    clocks = {(p.get("wf_start_offset", 0.0), p["wf_increment"]) for p in properties if p.get("wf_increment")}
-    if len(clocks) != 1:
-        return made  # the column is missed where it is looked for
-    ((start, step),) = clocks
+    made = _arrays(header, {channel.name: np.asarray(channel[:]) for channel in group.channels()}, settings)
+    each = [channel.properties for channel in group.channels()]
+    clocks = {(p.get("wf_start_offset", 0.0), p["wf_increment"]) for p in each if p.get("wf_increment")}
+    if not isinstance(time_name, str) or time_name in names[group.name] or len(clocks) != 1:
+        return made  # a column of time that is not there is missed where it is looked for
+    ((start, step),) = clocks  # that the waveforms of all channels share
     times = float(start) + float(step) * np.arange(len(made.columns[0]))
-    return Arrays(made.header, (*made.names, name), (*made.columns, times), made.faults)
+    return replace(made, names=(*made.names, time_name), columns=(*made.columns, times))
 
 
 # ---------------------------------------------------------------- MATLAB
@@ -277,8 +252,9 @@ def _mat(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
         return Arrays(tuple(header))
     tables = _tables(variables)
     if not tables:
-        fix = "Save the columns as vectors, as a matrix or as a struct: "
-        fix += "s = table2struct(T, 'ToScalar', true)."
+        fix = (
+            "Save the columns as vectors, as a matrix or as a struct: s = table2struct(T, 'ToScalar', true)."
+        )
         raise bad_file("no_rows", "holds no vectors, matrix or struct of numbers.", fix)
     options = {name: table if isinstance(table, dict) else () for name, table in tables.items()}
     name = _chosen(options, "variable", settings)
@@ -346,10 +322,8 @@ def _tables(variables: Mapping[str, object]) -> dict[str, dict[str, np.ndarray] 
             vectors[struct or VECTORS][name] = value
         elif isinstance(value, np.ndarray) and value.ndim == 2 and value.size and value.dtype.kind in "fiub":
             matrices[path] = value
-    tables = {
-        name: table for name, table in vectors.items() if any(_column(v) is not None for v in table.values())
-    }
-    return tables | matrices
+    filled = [name for name, own in vectors.items() if any(_column(v) is not None for v in own.values())]
+    return {name: vectors[name] for name in filled} | matrices
 
 
 def _hdf5_value(item) -> np.ndarray | float | str | None:
@@ -397,7 +371,7 @@ def _from_arrow(column) -> np.ndarray:
         column, kind = column.cast(kind.value_type), kind.value_type
     numeric = (pa.types.is_decimal, pa.types.is_null, pa.types.is_boolean, pa.types.is_integer)
     if any(holds(kind) for holds in numeric):
-        return column.cast(pa.float64(), safe=False).to_numpy()
+        column = column.cast(pa.float64(), safe=False)
     if pa.types.is_date(kind):
         column = column.cast(pa.timestamp("s"))
     return column.to_numpy()
