@@ -1,8 +1,7 @@
 """Safe expressions of rig configs and SPECs: `(force_raw - pressure_bar * 1e5 * pi * (0.0257 / 2) ** 2)`.
 
-These are text files that people pass around, so an expression is never run as Python: it is parsed into a
-tree, every node of the tree is checked against a short list, and only numbers and arrays are ever computed
-with.
+People pass these files around, so an expression is never run as Python: every node of its tree is checked
+against a short list, and only numbers and arrays are ever computed with.
 """
 
 from __future__ import annotations
@@ -20,10 +19,8 @@ import numpy as np
 
 from sealfit.errors import ConfigError, nearest
 
-# Longest text of an expression: nobody writes a longer one by hand, and the parser's memory is bounded.
-MAX_CHARACTERS = 1000
-# Deepest nesting: keeps the walk far below Python's recursion limit.
-MAX_DEPTH = 60
+MAX_CHARACTERS = 1000  # nobody writes a longer expression by hand, and the parser's memory is bounded
+MAX_DEPTH = 60  # of nesting: keeps the walk far below Python's recursion limit
 _OF_ONE = ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh", "sign")
 FUNCTIONS = {  # name: (function, fewest arguments, most arguments)
     **{name: (getattr(np, name), 1, 1) for name in _OF_ONE},
@@ -70,20 +67,10 @@ class Expression:
 
 @lru_cache(maxsize=256)
 def parse(text: str, *, condition: bool = False) -> Expression:
-    """Return the checked expression in `text`.
+    """Return the checked expression in `text`: a number, or with `condition` what is true or false.
 
-    Parameters
-    ----------
-    text : str
-        For example `"-torque_pct * 9.84 / 100"`; with `condition`, `"load_N > 4.9 and time_s < 60"`.
-    condition : bool
-        Whether it must be a condition; a comparison in a number counts 1 where it holds and 0 where it does
-        not.
-
-    Raises
-    ------
-    ConfigError
-        If the text is no expression, or holds a piece that is not allowed; the message names that piece.
+    A comparison in a number counts 1 where it holds, else 0. ConfigError if the text is no expression, or
+    holds a piece that is not allowed.
 
     Examples
     --------
@@ -103,11 +90,11 @@ def parse(text: str, *, condition: bool = False) -> Expression:
         reason = getattr(error, "msg", None) or "it is nested too deeply"
         raise ConfigError(f"{text!r} is not an expression: {reason}.", fix=_FIX) from error
     checked = _Checked(text)
-    compute = checked.number(tree, 0)
+    compute, names = checked.number(tree, 0), frozenset(checked.numbers | checked.labels)
     if not condition:
-        return Expression(text, frozenset(checked.names), compute, checked.numbers)
+        return Expression(text, names, compute, checked.numbers)
     checked.require_conditions([tree])
-    return Expression(text, frozenset(checked.names), lambda values: compute(values) != 0.0, checked.numbers)
+    return Expression(text, names, lambda values: compute(values) != 0.0, checked.numbers)
 
 
 def require_columns(expression: Expression, known: Collection[str]) -> None:
@@ -127,10 +114,9 @@ def read_by(compute: Mapping[str, str]) -> set[str]:
 def evaluate(expression: Expression, values: Values) -> np.ndarray:
     """Return the expression's value: an array of shape (n,), or of shape () if only constants are read.
 
-    Arithmetic is in double precision; what is undefined (0/0, the root of a negative number) gives NaN and
-    what is too large gives infinity, without a warning: the rows concerned are reported where cells are
-    checked. ConfigError if a name is not in `values`, or stands for text where a number is wanted. The text
-    "" is NaN.
+    What is undefined (0/0, the root of a negative number) is NaN and what is too large infinity, without a
+    warning; the text "" is NaN. ConfigError if a name is not in `values`, or stands for text where a number
+    is wanted.
     """
     require_columns(expression, values)
     with np.errstate(all="ignore"):
@@ -141,7 +127,7 @@ class _Checked:
     """Builds what computes an expression, node by node, and refuses what is not on the list."""
 
     def __init__(self, text: str) -> None:
-        self.text, self.names, self.numbers = text, set(), set()
+        self.text, self.numbers, self.labels = text, set(), set()
 
     def number(self, node: ast.expr, depth: int) -> Computed:
         """Return what computes a number; a condition gives 1 or 0."""
@@ -155,11 +141,9 @@ class _Checked:
             case ast.Name(id="pi"):
                 return lambda values: np.float64(np.pi)
             case ast.Name(id=name) if not name.startswith("__"):
-                self.names.add(name)
                 self.numbers.add(name)
                 return lambda values: _as_number(values[name], name, self.text)
             case ast.Call(func=ast.Name(id="days"), args=[ast.Name(id=name)], keywords=[]):
-                self.names.add(name)
                 self.numbers.add(name)
                 return lambda values: np.vectorize(_day, otypes=[float])(values[name])
             case ast.Compare(
@@ -167,7 +151,7 @@ class _Checked:
                 ops=[ast.Eq() | ast.NotEq() as op],
                 comparators=[ast.Constant(value=str() as label)],
             ) if not name.startswith("__"):
-                self.names.add(name)
+                self.labels.add(name)
                 compared = _OPERATORS[type(op)]
                 return lambda values: compared(_as_text(values[name]), label).astype(float)
         function, parts = self.operation(node)
@@ -186,17 +170,15 @@ class _Checked:
             case ast.BoolOp(op=op, values=parts):
                 self.require_conditions(parts)
                 return lambda *values: reduce(_OPERATORS[type(op)], values), parts
-            case ast.Compare(left=left, ops=ops, comparators=sides) if all(
-                type(o) in _OPERATORS for o in ops
-            ):
+            case ast.Compare(left=left, ops=ops, comparators=sides) if {*map(type, ops)} <= {*_OPERATORS}:
                 return lambda *values: _compared(ops, values), [left, *sides]
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
                 function, fewest, most = FUNCTIONS[name]
-                if not fewest <= len(arguments) <= most:
-                    wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
-                    reason = f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.'
-                    raise ConfigError(reason, fix=_FIX)
-                return function, arguments
+                if fewest <= len(arguments) <= most:
+                    return function, arguments
+                wanted = str(fewest) if fewest == most else f"{fewest} to {most}"
+                reason = f'in "{self.text}": {name} takes {wanted} values, {len(arguments)} given.'
+                raise ConfigError(reason, fix=_FIX)
         raise self.refusal(f"'{ast.unparse(node)}'")
 
     def require_conditions(self, nodes: Sequence[ast.expr]) -> None:

@@ -24,10 +24,8 @@ class TraceRef:
     """One trace file and all that runs.csv, its name, header or constant columns say of the whole file.
 
     `file` is relative to the campaign folder, with forward slashes. `channels` always holds `run_id`,
-    `repeat`, `specimen_id` and the condition columns (day 0 may lack those other than the days), and where
-    they are known `speed_set_mm_s` (magnitude), `load_N`, `started_at` (ISO 8601), `run_order`, `elapsed_h`
-    and the campaign's own channels. What is not known is not there. `cut` says that the file may end within
-    a number.
+    `repeat`, `specimen_id` and the condition columns (day 0 may lack those other than the days); what is not
+    known is not there. `cut` says that the file may end within a number.
     """
 
     file: str
@@ -39,8 +37,7 @@ class TraceRef:
 class Listing(Sequence[TraceRef]):
     """The trace files of a campaign, or some of them, in order.
 
-    `columns` hold the channels; `conditions` the condition of each file in words; `cut` are the files that
-    may end within a number.
+    `columns` hold the channels, `conditions` words; files of `cut` may end within a number.
     """
 
     files: list[str]
@@ -68,19 +65,16 @@ class Listing(Sequence[TraceRef]):
 # What the name of a trace file says: named parts of a pattern, value maps, templates and computed columns.
 
 _FIELD = re.compile(r"\{([^{}]*)\}")
-
-
 Named = Mapping[str, float | str]  # what a name says; helpers begin with `_`
 
 
 def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]) -> Named | None:
     """Return what the relative path `file` says under the config's `files`; None if it does not match.
 
-    Every named group of `name_pattern` is a part; a part with a value map takes the mapped value where the
-    map has one; numbers become numbers; `compute` and the templates of `columns` then add columns. Empty
-    parts say nothing, nor does what is computed from their numbers. Numbers in other units than ours are
-    converted, those of parts first. ConfigError if a template or an expression reads a part that the pattern
-    does not have, or as `found_by`.
+    Every named group of `name_pattern` is a part, with the value of its map where that has one; `compute` and
+    the templates of `columns` then add columns. Empty parts say nothing, nor does what is computed from their
+    numbers. Numbers in other units than ours are converted, those of parts first. ConfigError if a template
+    or an expression reads a part that the pattern does not have, or as `found_by`.
 
     Examples
     --------
@@ -105,10 +99,10 @@ def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]
         for name, text in match.groupdict(default="").items():
             known = settings.values.get(name, {})
             mapped = known.get(text, text)
+            stays = text in known or name in (*TEXT_COLUMNS, *settings.text_parts)
             if isinstance(mapped, int | float):
                 say(name, f"{mapped:g}", float(mapped))
             else:
-                stays = text in known or name in (*TEXT_COLUMNS, *settings.text_parts)
                 say(name, mapped, mapped if stays else _value(mapped))
     for name, expression in settings.compute.items():
         value = float(evaluate(parse(expression), values))

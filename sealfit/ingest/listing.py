@@ -26,17 +26,12 @@ KNOWN = (
     "run_id", "repeat", "specimen_id", "temperature_C", "compression_ratio_pct", "aging_days", "load_N",
     "speed_mm_s", "started_at",
 )  # fmt: skip
-
-
 # Words, and codes of loggers, for no value.
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?", "-999", "-9999", "-99999"}
 PASSED_OVER = {"severity": "info", "action": "file left out"}
 FILES_LOOKED_AT = 2000  # for the one that is most like a glob; a campaign's names are much alike
 TITLE_LINES = 30  # lines in which the header of a table is looked for
-_BLANK = " \t,;"  # a line of nothing else is none
-
-# Ending of the files that LabVIEW writes beside its traces.
-INDEX = ".tdms_index"
+INDEX = ".tdms_index"  # ending of the files that LabVIEW writes beside its traces
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +51,8 @@ class Entry:
 def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, list[Fault]]:
     """Return the trace files of a campaign in order, what runs.csv says of them, and what was found amiss.
 
-    The table of runs is read where there is one; otherwise the config's glob finds the files, in natural
-    order (2 before 10). CampaignError if there is no folder, or neither runs.csv nor a glob, or runs.csv
-    cannot be read as a table.
+    Without a table of runs the config's glob finds the files, in natural order (2 before 10). CampaignError
+    if there is no folder, or neither runs.csv nor a glob, or runs.csv cannot be read as a table.
     """
     if not campaign.is_dir():
         what = "is not a folder." if campaign.exists() else "does not exist."
@@ -109,11 +103,10 @@ def _runs_table(campaign: Path, config: Config) -> str | None:
 def read_table(
     folder: Path, table: str, config: Config, *, needed: str | None = None
 ) -> tuple[list[int], Columns, list[Fault]]:
-    """Return the line of every row of a table, its cells by our names of the columns, and its faults.
+    """Return the line of every row of a CSV, Excel or Parquet table, its cells by our names, and its faults.
 
-    The table is a CSV, Excel or Parquet file. Cells are text, None where they say that there is nothing,
-    except in the column that is needed in every row. CampaignError if it cannot be read as a table, or that
-    column is not there.
+    Cells are text, None where they say that there is nothing, except in the column that is needed in every
+    row. CampaignError if it cannot be read as a table, or that column is not there.
     """
     try:
         text, delimiter = text_of_runs(folder, table, config)
@@ -121,7 +114,7 @@ def read_table(
         place = {"file": table, "line": error.fault.line, "column": error.fault.column}
         raise stopped(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
     whole = text.decode().split("\n")
-    numbered = [(number, line) for number, line in enumerate(whole, start=1) if line.strip(_BLANK)]
+    numbered = [(number, line) for number, line in enumerate(whole, start=1) if line.strip(" \t,;")]
     place, delimiter, header = _header(numbered[:TITLE_LINES], delimiter, config)
     names, faults = _our_names(header, {"file": table, "line": place}, config)
     if needed and needed not in names:
@@ -133,11 +126,14 @@ def read_table(
     def with_point(cell: str) -> str:
         return cell.replace(",", ".") if as_number(cell, ",") is not None else cell
 
+    def unless_missing(cell: str) -> str | None:
+        return None if re.sub(r"(?<=\d)[.,]0+$", "", cell.lower()) in MISSING else cell
+
     # Decimal commas are plain here: no cell of a table of ; or tabs can be split by them.
     if delimiter != ",":
         columns = {name: mapped(column, with_point) for name, column in columns.items()}
     for name in columns.keys() - {needed}:
-        columns[name] = mapped(columns[name], _unless_missing)
+        columns[name] = mapped(columns[name], unless_missing)
     return lines, columns, faults + found
 
 
@@ -157,10 +153,6 @@ def _header(numbered: list[tuple[int, str]], delimiter: str, config: Config) -> 
 
 def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in split_line(line, delimiter)]
-
-
-def _unless_missing(cell: str) -> str | None:
-    return None if re.sub(r"(?<=\d)[.,]0+$", "", cell.lower()) in MISSING else cell
 
 
 def _rows(
@@ -208,17 +200,15 @@ def _our_names(
     names = [ours.get(name, name) for name in header]
     faults = []
 
-    def add(check: str, name: str, reason: str, fix: str, **done) -> None:
-        faults.append(Fault(check, reason, column=name, fix=fix, **place, **done))
+    def add(check: str, name: str, reason: str, fix: str) -> None:
+        faults.append(Fault(check, reason, column=name, fix=fix, **place))
 
     for name in sorted({name for name in names if name and names.count(name) > 1}):
         add("duplicate_column", name, f"stands {names.count(name)} times in the header.", "Rename one.")
-    for theirs in ours:
-        if theirs not in header:
-            reason = "there is no such column, but files.runs_columns names it."
-            add("missing_column", theirs, reason, suggestion(theirs, header))
-    faults += misspelt(names, names, config, place)
-    return names, faults
+    for theirs in (name for name in ours if name not in header):
+        reason = "there is no such column, but files.runs_columns names it."
+        add("missing_column", theirs, reason, suggestion(theirs, header))
+    return names, faults + misspelt(names, names, config, place)
 
 
 def misspelt(
@@ -234,8 +224,10 @@ def misspelt(
             reason, fix = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."
             faults.append(Fault("column_name", reason, fix=fix, column=name, **place))
         elif SequenceMatcher(None, name, close).ratio() > 0.85:
-            reason = f"is kept as a channel; it looks like '{close}'."
-            fix = f"Write '{close}' if that is meant."
+            reason, fix = (
+                f"is kept as a channel; it looks like '{close}'.",
+                f"Write '{close}' if that is meant.",
+            )
             faults.append(Fault("column_name", reason, fix=fix, column=name, **place, **KEPT))
     return faults
 
@@ -257,13 +249,11 @@ def _with_whole_paths(campaign: Path, entries: list[Entry], table: str) -> tuple
             for name in {own.name, own.stem, own.with_suffix("").as_posix()} & missing:
                 named[name].append(own.as_posix())
     whole = {name: files[0] for name, files in named.items() if len(files) == 1}
-    made, notes = [], []
-    for entry in entries:
-        made.append(replace(entry, file=whole.get(entry.file, entry.file)))
-        if entry.file in whole:
-            reason = f"is taken for '{whole[entry.file]}', the only file of that name."
-            notes.append(entry.fault("file_name", reason, "file", value=entry.file, **NOTED))
-    return made, notes
+    notes = []
+    for entry in (entry for entry in entries if entry.file in whole):
+        reason = f"is taken for '{whole[entry.file]}', the only file of that name."
+        notes.append(entry.fault("file_name", reason, "file", value=entry.file, **NOTED))
+    return [replace(entry, file=whole.get(entry.file, entry.file)) for entry in entries], notes
 
 
 def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
@@ -272,7 +262,11 @@ def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
     if not files:
         reason = f"no file in '{campaign}' matches files.glob = {glob!r}, "
         reason += "which stands for paths below that folder."
-        raise stopped("missing_file", reason, _nearest_file(campaign, glob))
+        # The file whose path is most like the glob.
+        there = (path.relative_to(campaign).as_posix() for path in campaign.rglob("*") if path.is_file())
+        close = get_close_matches(glob, list(islice(there, FILES_LOOKED_AT)), n=1, cutoff=0.0)
+        fix = f"The nearest file is '{close[0]}'." if close else "There is no file in it: check the folder."
+        raise stopped("missing_file", reason, fix)
     faults, kept = [], []
     for file in files:
         if not is_utf8(file):
@@ -283,13 +277,6 @@ def _by_glob(campaign: Path, config: Config) -> tuple[list[Entry], list[Fault]]:
         else:
             kept.append(Entry(file))
     return kept, faults
-
-
-def _nearest_file(campaign: Path, glob: str) -> str:
-    """Return a fix for a glob that matches nothing: the file whose path is most like it."""
-    files = (path.relative_to(campaign).as_posix() for path in campaign.rglob("*") if path.is_file())
-    close = get_close_matches(glob, list(islice(files, FILES_LOOKED_AT)), n=1, cutoff=0.0)
-    return f"The nearest file is '{close[0]}'." if close else "There is no file in it: check the folder."
 
 
 def _paths(campaign: Path, entries: list[Entry], outside: set[str]) -> list[Fault]:
@@ -316,20 +303,19 @@ def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: C
     if not entries or entries[0].line is None:
         return []
     table, listed = entries[0].table, {entry.file for entry in entries}
-    there, vain = files_beside(campaign, listed - outside), []
+    there, faults = files_beside(campaign, listed - outside), []
     if config.files.glob:
         there.update(found := glob_names(campaign, config.files))
         if not found:
             reason = f"no file matches files.glob = {config.files.glob!r}."
             place = {"file": f"config '{config.name}'", "fix": "Correct it, or take it out."}
-            vain = [Fault("config", reason, **place, **KEPT)]
-    files = there - listed - {table}
+            faults = [Fault("config", reason, **place, **KEPT)]
     reason, fix = f"is not in {table}.", f"Add it to {table} if it is a trace."
-    return vain + [
-        Fault("not_listed", reason, file=f, fix=fix, **PASSED_OVER) if is_utf8(f) else _odd_name(f, "info")
-        for f in sorted(files, key=natural)
-        if not any(fnmatchcase(f, pattern) for pattern in config.files.exclude)
-    ]
+    for file in sorted(there - listed - {table}, key=natural):
+        if not any(fnmatchcase(file, pattern) for pattern in config.files.exclude):
+            missed = Fault("not_listed", reason, file=file, fix=fix, **PASSED_OVER)
+            faults.append(missed if is_utf8(file) else _odd_name(file, "info"))
+    return faults
 
 
 def is_utf8(file: str) -> bool:

@@ -51,25 +51,21 @@ def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.
 
 # ---------------------------------------------------------------- parts
 # Where a cut lies depends on the runs beside it alone (content-defined chunking), so files that are added to
-# a campaign change the part they belong to and, at most, its neighbours; everything else stays as it is on
-# the disk.
+# a campaign change the part they belong to and, at most, its neighbours.
 
-# Files of a part: few enough to be read for one condition, many enough that 100,000 files are some 400 parts.
-PART_FILES = 256
-# Bytes of trace files of a part, if these come first. Its samples take some ten times that in memory.
-PART_BYTES = 4_000_000
-# Smallest and largest part, as multiples of the size above. A run is never cut.
-LEAST, MOST = 0.25, 2.0
+PART_FILES = 256  # few enough to be read for one condition; 100,000 files are some 400 parts
+PART_BYTES = (
+    4_000_000  # of trace files of a part, if these come first; its samples take ten times that in memory
+)
+LEAST, MOST = 0.25, 2.0  # smallest and largest part, as multiples of the size above; a run is never cut
 
 
 def plan_parts(conditions: Sequence[str], runs: Sequence[str], sizes: Sequence[int]) -> list[list[int]]:
     """Return the files of each part, by their numbers, rising within a part; every file is in one part.
 
-    Conditions stay together unless one is larger than a part; runs always. A part holds conditions that are
-    neighbours in the order of their names, so the least and the largest name, which Parquet keeps, tell a
-    reader what to skip.
-
-    The arguments are condition, run and size in bytes of every file.
+    Conditions stay together unless one is larger than a part; runs always. A part holds neighbours in the
+    order of names, so the least and the largest, which Parquet keeps, tell a reader what to skip. The
+    arguments are condition, run and size in bytes of every file.
 
     Examples
     --------
@@ -120,8 +116,7 @@ Columns = Mapping[str, Mapping[str, str]]  # of each table: the type of each col
 class Asked:
     """Files to read together: whole runs.
 
-    `unused` are strokes that a comparison with other parts has ruled out; `columns`, per table, those that it
-    is to have, and their types, since other parts have them.
+    `unused` are strokes that other parts have ruled out; `columns`, per table, those that it is to have.
     """
 
     refs: Listing
@@ -133,13 +128,12 @@ class Asked:
 class PartitionResult:
     """What one part gives.
 
-    Of its files, in the order in which they were asked for, `rows` are the rows that were read, and `found`
-    the strokes; `marks` are the fingerprints of those that were read now. `strokes` has a row per stroke with
-    everything that is known of it, the keys included, and `used` by what the file itself shows; it is None
-    where they are left on the disk, and once they are let go. `tables` are those of `SAMPLED` that have rows,
-    without the strokes that are not used or were asked to be left out; or they are on the disk, in `stored`:
-    files by their names below OUT, with their sizes in bytes. `columns` are those that the samples gave,
-    `unused` and `wanted` what was asked for (`Asked`).
+    Of its files, in order, `rows` are the rows that were read, and `found` the strokes; `marks` are the
+    fingerprints of those that were read now. `strokes` has a row per stroke with everything that is known of
+    it, and `used` by what the file itself shows; it is None where they are left on the disk. `tables` are
+    those of `SAMPLED` that have rows, without the strokes that are not used; or they are on the disk, in
+    `stored`: files by their names below OUT, with their sizes in bytes. `columns` are those that the samples
+    gave, `unused` and `wanted` what was asked for (`Asked`).
     """
 
     marks: Fingerprints
@@ -169,30 +163,21 @@ def read_part(asked: Asked, campaign: Path, config: Config) -> PartitionResult:
             tables["traces_mean"] = _mean_traces(samples, strokes, config)
         if samples["steady"].any():
             tables["bins"] = _bins(samples, strokes, config)
-    columns = {
-        name: {column.name: str(column.type) for column in table.schema} for name, table in tables.items()
-    }
-    if asked.columns is not None:
-        for name, table in tables.items():
+    columns = {}
+    for name, table in tables.items():
+        columns[name] = {column.name: str(column.type) for column in table.schema}
+        if asked.columns is not None:
             tables[name] = parquet.with_columns(table, asked.columns[name], config.units)
-    return PartitionResult(
-        marks={made.file: made.mark for made in files},
-        rows=[made.rows for made in files],
-        found=[len(made.strokes) for made in files],
-        faults=tuple(fault for made in files for fault in made.faults),
-        strokes=known,
-        unused=asked.unused,
-        wanted=asked.columns,
-        columns=columns,
-        tables=tables,
-    )
+    marks, rows = {made.file: made.mark for made in files}, [made.rows for made in files]
+    found, faults = [len(made.strokes) for made in files], tuple(f for made in files for f in made.faults)
+    return PartitionResult(marks, rows, found, faults, known, asked.unused, asked.columns, columns, tables)
 
 
 def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, list]:
-    """Return everything that is known of every stroke, the keys included; run_id with its direction.
+    """Return everything that is known of every stroke, the keys included.
 
     A run with strokes both ways is two: `<run_id>+` and `<run_id>-`. One with several steady speeds in a
-    stroke, or in strokes of a file for which none is commanded, is one for each of them: `<run_id> at 42.1`.
+    stroke, or in a file for which none is commanded, is one for each of them: `<run_id> at 42.1`.
     """
     rows = [row for made in files for row in made.strokes]
     columns = columns_of(rows)
@@ -232,17 +217,13 @@ def _at_speeds(strokes: Mapping[str, list], tolerance: float) -> dict[str, list]
 
 def _two_runs(strokes: Mapping[str, list]) -> list[str]:
     """Return `run_id` with its direction where needed."""
-    names = strokes["run_id"]
-    ways = defaultdict(set)
-    for run, file, way, used in zip(
-        names, strokes["file"], strokes["direction"], strokes["used"], strict=True
-    ):
+    ways, signs = defaultdict(set), ["+" if way > 0 else "-" for way in strokes["direction"]]
+    for run, file, way, used in zip(strokes["run_id"], strokes["file"], signs, strokes["used"], strict=True):
         ways[run, file].add(way)
         if used:
             ways[run, None].add(way)
     both = {run for (run, _), found in ways.items() if len(found) > 1}
-    signed = (f"{run}{'+' if way > 0 else '-'}" for run, way in zip(names, strokes["direction"], strict=True))
-    return [new if run in both else run for run, new in zip(names, signed, strict=True)]
+    return [run + way * (run in both) for run, way in zip(strokes["run_id"], signs, strict=True)]
 
 
 def _array(values: Sequence[object]) -> pa.Array:
@@ -262,8 +243,8 @@ def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) ->
     names = list(dict.fromkeys(name for made in parts for name in made.samples))
     length = [len(made.samples["time_s"]) for made in parts]
     columns = {name: _stacked([made.samples.get(name) for made in parts], length) for name in names}
-    first = np.concatenate(([0], np.cumsum([len(made.strokes) for made in parts])[:-1]))
-    first = first - [made.strokes[0]["stroke"] for made in parts]
+    count = [len(made.strokes) for made in parts]
+    first = np.cumsum(count) - count - [made.strokes[0]["stroke"] for made in parts]
     columns["row"] = np.repeat(first, length) + columns["stroke"]
     used = np.array(strokes["used"], bool)
     if not used.all():

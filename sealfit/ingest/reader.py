@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from statistics import mode
 
 import numpy as np
 
@@ -51,8 +51,7 @@ def read_trace(campaign: Path, ref: TraceRef, config: Config) -> Trace:
     """Return one trace, with bad rows left out and named.
 
     Its columns are time_s, displacement_mm and force_N (and load_N, where it was measured) as float64, and
-    any further channel as float64 or text. BadFile if the file must be left out: missing, empty, binary, a
-    column missing, too many bad rows. It carries every fault found, the deciding one last.
+    any further channel as float64 or text. BadFile, with every fault, if the file must be left out.
     """
     return parse_trace(read_bytes(campaign, ref.file), ref, config)
 
@@ -62,7 +61,11 @@ def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
     with in_file(ref.file):
         layout, content, settings = _content(raw, ref.file, config.trace)
         if isinstance(content, Arrays):
-            rows = _read_arrays(content, layout, settings)
+            ours = locate(layout, len(content.columns), settings)
+            line = np.arange(1, len(content.columns[0]) + 1)  # the number of the sample: there are no lines
+            columns = dict(enumerate(content.columns))
+            rows = checked_cells(columns, line, ours, numeric_names(settings), settings.decimal)
+            rows = replace(rows, faults=(*content.faults, *rows.faults))
         else:
             rows = _read_text(content, layout, settings, ref.cut)
         trace = _trace(rows, layout, ref, config)
@@ -91,15 +94,6 @@ def read_header(campaign: Path, file: str, config: Config) -> dict[str, float | 
     """Return what the header lines of a trace file say; raises `BadFile` if it cannot be read."""
     raw = read_bytes(campaign, file, head=kind_of(file, config.trace) == "csv")
     return header_fields(_content(raw, file, config.trace, head=True)[0].header, config)
-
-
-def _read_arrays(found: Arrays, layout: FileLayout, settings: TraceFormat) -> Trace:
-    ours = locate(layout, len(found.columns), settings)
-    line = np.arange(1, len(found.columns[0]) + 1)  # of a file without lines: the number of the sample
-    rows = checked_cells(
-        dict(enumerate(found.columns)), line, ours, numeric_names(settings), settings.decimal
-    )
-    return replace(rows, faults=(*found.faults, *rows.faults))
 
 
 def _read_text(text: bytes, layout: FileLayout, settings: TraceFormat, may_be_cut: bool) -> Trace:
@@ -250,8 +244,8 @@ def _refuse_too_many(counted: int, rows: Trace, config: Config) -> None:
     """Raise `BadFile` if more of the rows are bad than the config allows; `rows` are those that are left."""
     bad = counted - len(rows.line)
     if bad > config.quality.max_bad_rows * counted:
-        fixes = Counter(fault.fix for fault in rows.faults if fault.action == "row left out" and fault.fix)
-        fix = fixes.most_common(1)[0][0] if fixes else ""
+        fixes = [fault.fix for fault in rows.faults if fault.action == "row left out" and fault.fix]
+        fix = mode(fixes) if fixes else ""
         reason = f"{bad} of {counted} rows are bad, more than {100 * config.quality.max_bad_rows:g} %."
         too_many = bad_file("too_many_bad_rows", reason, fix, value=float(bad))
         raise BadFile(*rows.faults, too_many.fault)
@@ -260,15 +254,12 @@ def _refuse_too_many(counted: int, rows: Trace, config: Config) -> None:
 def _named_beside(rows: Trace, ref: TraceRef, settings: TraceFormat) -> dict[str, np.ndarray]:
     """Return slots first, then channels, without helper columns.
 
-    A channel that `ref` has too is left out where it is constant (`ref` says it); one that varies is another
-    quantity than the one set for the whole file, and is renamed, `temperature_file_C` beside `temperature_C`;
-    so is one whose name a table of ours makes itself.
+    A channel that `ref` has too is left out where it is constant; one that varies is another quantity, and is
+    renamed, `temperature_file_C` beside `temperature_C`; so is one whose name a table of ours makes itself.
     """
     columns = {name: rows.columns[name] for name in SLOTS if name in rows.columns}
     for name, values in rows.columns.items():
-        if name in SLOTS or name in (settings.drop_columns or ()):
-            continue
-        if name in ref.channels and (values == values[0]).all():
-            continue
-        columns[beside(name, RESERVED.union(columns, ref.channels))] = values
+        known = name in ref.channels and (values == values[0]).all()
+        if name not in (*SLOTS, *(settings.drop_columns or ())) and not known:
+            columns[beside(name, RESERVED.union(columns, ref.channels))] = values
     return columns

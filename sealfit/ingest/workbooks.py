@@ -22,7 +22,6 @@ from sealfit.ingest.formats import CALLED, damage_named, kind_of, library, value
 HEAD_ROWS = 1000  # a header longer than this is no header
 LONGEST = object()  # stands for the sheet with the most rows
 _OLE = b"\xd0\xcf\x11\xe0"  # of .xls, and of the shell that Excel puts around an encrypted workbook
-_ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
 
 
 def read_sheet(
@@ -36,9 +35,9 @@ def read_sheet(
     """Return a sheet of a workbook as text: its name or number (from 1), or None for the only one with cells.
 
     `LONGEST` is the one with the most rows. With `head`, `HEAD_ROWS` rows are enough. Numbers are written
-    with the mark `decimal`. A merged cell has its value in its first place only; the others are empty.
-    BadFile if it is no workbook that can be read, has no such sheet, formulas without values, or merged cells
-    that may not be there; CampaignError if openpyxl is not installed.
+    with the mark `decimal`. A merged cell has its value in its first place only. BadFile if it is no workbook
+    that can be read, has no such sheet, formulas without values, or merged cells that may not be there;
+    CampaignError if openpyxl is not installed.
     """
     with _book(raw, formulas=True, by_row=merged) as book:
         title = _title(book, sheet)
@@ -78,15 +77,15 @@ def _book(raw: bytes, *, formulas: bool, by_row: bool = True) -> Iterator:
 
 
 def _refuse_others(raw: bytes) -> None:
-    if not raw.startswith(_OLE):
-        if not raw.startswith(b"PK"):
-            fix = "Export it again, or name it for what it is."
-            raise bad_file("binary_file", "is not an Excel workbook (.xlsx).", fix)
+    if raw.startswith(b"PK"):
         return
-    if _ENCRYPTED in raw:
-        fix = "Save it without (File > Info > Protect Workbook > Encrypt with Password)."
-        raise bad_file("binary_file", "is protected by a password.", fix)
-    raise bad_file("binary_file", "is a workbook of old Excel (.xls).", "Save it as .xlsx.")
+    reason, fix = "is not an Excel workbook (.xlsx).", "Export it again, or name it for what it is."
+    if raw.startswith(_OLE):
+        reason, fix = "is a workbook of old Excel (.xls).", "Save it as .xlsx."
+        if "EncryptedPackage".encode("utf-16-le") in raw:
+            reason = "is protected by a password."
+            fix = "Save it without (File > Info > Protect Workbook > Encrypt with Password)."
+    raise bad_file("binary_file", reason, fix)
 
 
 def _title(book, wanted: str | int | object | None) -> str:
@@ -94,28 +93,25 @@ def _title(book, wanted: str | int | object | None) -> str:
     if wanted is LONGEST:
         return next(iter(_rows(book)))
     titles = [sheet.title for sheet in book.worksheets]
+    if wanted is None:
+        titles = [s.title for s in book.worksheets if any(map(_has_cell, s.iter_rows(values_only=True)))]
+    listed = f"The sheets are {', '.join(repr(title) for title in titles)}."
     if isinstance(wanted, int):
         if 0 < wanted <= len(titles):
             return titles[wanted - 1]
-        reason = f"there is no sheet {wanted}: it has {len(titles)}."
-        raise bad_file("missing_sheet", reason, _listed(titles))
+        raise bad_file("missing_sheet", f"there is no sheet {wanted}: it has {len(titles)}.", listed)
     if wanted in titles:
         return wanted
     if wanted is not None:
         close = nearest(wanted, titles)
-        fix = f"Did you mean '{close}'?" if close else _listed(titles)
+        fix = f"Did you mean '{close}'?" if close else listed
         raise bad_file("missing_sheet", f"there is no sheet '{wanted}'.", fix)
-    filled = [s.title for s in book.worksheets if any(map(_has_cell, s.iter_rows(values_only=True)))]
-    if not filled:
+    if not titles:
         raise bad_file("empty_file", "has no sheet with cells.", "Export it again.")
-    if len(filled) > 1:
-        fix = f"Choose one in the rig config: sheet = {filled[0]!r} under [trace]. {_listed(filled)}"
-        raise bad_file("several_tables", f"has {len(filled)} sheets with cells.", fix)
-    return filled[0]
-
-
-def _listed(titles: list[str]) -> str:
-    return f"The sheets are {', '.join(repr(title) for title in titles)}."
+    if len(titles) > 1:
+        fix = f"Choose one in the rig config: sheet = {titles[0]!r} under [trace]. {listed}"
+        raise bad_file("several_tables", f"has {len(titles)} sheets with cells.", fix)
+    return titles[0]
 
 
 def _has_cell(row: Sequence[object]) -> bool:
@@ -125,10 +121,9 @@ def _has_cell(row: Sequence[object]) -> bool:
 def _lines(
     sheet, decimal: str, head: bool, saved: Collection[tuple[int, int]] = ()
 ) -> tuple[list[str], set[tuple[int, int]]]:
-    """Return the rows as lines, and row and column (from 1) of every formula.
+    """Return the rows as lines, at least as long as the longest above, and row and column of every formula.
 
-    A row is at least as long as the longest above it: what it lacks are empty cells. `saved` are the places
-    of formulas whose values are read; raises `BadFile` if Excel kept none of one.
+    `saved` are the places of formulas whose values are read; raises `BadFile` if Excel kept none of one.
     """
     lines, formulas, width = [], set(), 0
     rows = sheet.iter_rows(max_row=HEAD_ROWS if head else None, values_only=True)
@@ -176,8 +171,7 @@ def _refuse_merged(sheet) -> None:
 def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]:
     """Return a table of runs as UTF-8 and the delimiter of its cells, "" where that is to be found out.
 
-    Of a sheet, and of a Parquet file, the names are the first line: rows count from 2. BadFile if it cannot
-    be read, or is of another format; CampaignError if the library that reads it is not installed.
+    BadFile if it cannot be read, or is of another format; CampaignError if the library is not installed.
     """
     raw, kind = read_bytes(campaign, file), kind_of(file)
     if kind == "csv":
@@ -188,8 +182,8 @@ def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]
     if kind == "xlsx":
         sheet = 1 if config.files.runs_sheet is None else config.files.runs_sheet
         return read_sheet(raw, sheet, merged=False), "\t"
-    fix = "Save it as .csv, .xlsx or .parquet."
-    raise bad_file("binary_file", f"is {CALLED[kind]}, which is no table of runs.", fix)
+    reason = f"is {CALLED[kind]}, which is no table of runs."
+    raise bad_file("binary_file", reason, "Save it as .csv, .xlsx or .parquet.")
 
 
 def _parquet_text(raw: bytes) -> bytes:
