@@ -30,16 +30,12 @@ from sealfit.tables import CALENDAR, RUNS, STEADY
 
 
 def inputs_table(
-    campaign: Path,
-    marks: Fingerprints,
-    counts: np.ndarray,
-    used: np.ndarray,
-    faults: Sequence[Fault],
+    campaign: Path, marks: Fingerprints, counts: np.ndarray, used: np.ndarray, faults: Sequence[Fault]
 ) -> tuple[pd.DataFrame, Fingerprints]:
-    """Return table `inputs`, every trace file of the campaign and those not used, and their fingerprints.
+    """Return table `inputs`, every trace file of the campaign, and their fingerprints.
 
-    `marks` are those of the listing's files, `counts` their rows and strokes, and `used` says which of them
-    have a stroke that is used. Faults name the files that are not in the listing.
+    `marks` are those of the listing's files, `counts` their rows and strokes, and `used` says which have a
+    stroke that is used. Faults name the files that are not in the listing.
     """
     others: dict[str, str] = {}  # files that are not in the listing, and their status
     for fault in faults:
@@ -84,8 +80,8 @@ class Place:
 class Ingested:
     """Tables inputs, runs, quality and steady, and traces, traces_mean and bins unless stored by parts.
 
-    `faults` are the warnings and errors among the findings of `quality`; `marks` the files as they were read;
-    `stored` the files of the parts, by their names below OUT, with their sizes.
+    `faults` are the warnings and errors of `quality`; `marks` the files as they were read; `stored` the files
+    of the parts, by their names below OUT, with their sizes.
     """
 
     tables: dict[str, pd.DataFrame]
@@ -102,24 +98,12 @@ def ingest_campaign(
     on_file: Callable[[int, int], None] | None = None,
     place: Place | None = None,
 ) -> Ingested:
-    """Return the tables of a campaign.
+    """Return the tables of a campaign: a folder with runs.csv, or with files that the config's glob finds.
 
-    Parameters
-    ----------
-    campaign : Path
-        Folder with runs.csv, or with files that the config's glob finds.
-    workers : int
-        Processes; the tables do not depend on it.
-    on_file : callable, optional
-        Called as files have been read with their number so far, and the number of files to be read.
-    place : Place, optional
-        Where the tables of samples are to be stored, so that they need not fit into memory; only what is not
-        there yet is read.
-
-    Raises
-    ------
-    CampaignError
-        For faults that concern the whole campaign, or where not one stroke can be used.
+    The tables do not depend on the number of `workers`. `on_file` is called as files have been read with
+    their number so far, and the number of files to be read. In `place` the tables of samples are stored, so
+    that they need not fit into memory; only what is not there yet is read. CampaignError for faults that
+    concern the whole campaign, or where not one stroke can be used.
     """
     campaign = Path(campaign)
     place = place or Place()

@@ -6,8 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-
-from sealfit.ingest.segments import strong_wave
+from scipy.optimize import minimize_scalar
 
 # Rise lengths after which a rise is over: 1/50000 is left. 1/5000 still showed in means over a campaign.
 SETTLED = np.log(50000.0)
@@ -57,6 +56,10 @@ LONGER = 3.0
 SKIPPED, LEAST_ROWS = (1.0, 2.0), 8
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0
+# Means of rows from which the frequency of a wave is found, periods that they hold at least, and the factor
+# by which the spectrum is finer than theirs.
+ROWS_OF_WAVE, LEAST_PERIODS, FINER = 512, 2, 8
+STRONG = 0.5  # share of the variance beside a parabola that a strong wave explains
 
 
 class MotionStart(NamedTuple):
@@ -393,3 +396,43 @@ def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> float:
         bend = before - 2.0 * here + after
         step = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
     return float(lengths_mm[best] * (lengths_mm[1] / lengths_mm[0]) ** step)
+
+
+def strong_wave(x: np.ndarray, values: np.ndarray, late: int) -> np.ndarray:
+    """Return the sine that explains most of the variance of `values` from row `late` on, shape (n,).
+
+    A parabola is fitted beside it. It is 0 if no sine explains half of the variance that the parabola leaves.
+    `x` rises evenly from row `late` on.
+
+    Examples
+    --------
+    >>> x = np.linspace(0.0, 10.0, 400)
+    >>> wave = strong_wave(x, 5.0 - 4.0 * np.exp(-x) + np.sin(7.0 * x), 200)
+    >>> bool(np.abs(wave - np.sin(7.0 * x)).max() < 0.05)
+    True
+    """
+    size = max((len(x) - late) // ROWS_OF_WAVE, 1)
+    n = (len(x) - late) // size
+    if n < 4 * LEAST_PERIODS:
+        return np.zeros(len(x))
+    along, mean = (part[late : late + n * size].reshape(n, size).mean(axis=1) for part in (x, values))
+    place = 2.0 * (along - along[0]) / (along[-1] - along[0]) - 1.0
+    parabola = np.vander(place, 3)
+
+    def sines(periods: float, at: np.ndarray) -> np.ndarray:
+        return np.stack([np.sin(np.pi * periods * at), np.cos(np.pi * periods * at)], axis=1)
+
+    def fitted(periods: float) -> tuple[np.ndarray, float]:
+        columns = np.hstack([sines(periods, place), parabola])
+        factors = np.linalg.lstsq(columns, mean, rcond=None)[0]
+        return factors[:2], float(np.sum((mean - columns @ factors) ** 2))
+
+    beside = mean - parabola @ np.linalg.lstsq(parabola, mean, rcond=None)[0]
+    power = np.abs(np.fft.rfft(beside, FINER * n)) ** 2
+    least, whole = LEAST_PERIODS * FINER, float(beside @ beside)
+    peak = least + int(np.argmax(power[least:]))
+    if not 2.0 * power[peak] > STRONG * n * whole:
+        return np.zeros(len(x))
+    ends = ((peak - 1) / FINER, (peak + 1) / FINER)
+    periods = minimize_scalar(lambda k: fitted(k)[1], bounds=ends, method="bounded").x
+    return sines(periods, 2.0 * (x - along[0]) / (along[-1] - along[0]) - 1.0) @ fitted(periods)[0]

@@ -15,11 +15,18 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter1d
 
 from sealfit.config import Strokes
-from sealfit.ingest.segments import smoothed, stretches
-from sealfit.ingest.window import SAME_SPEED, SPEED_NOISE, STANDSTILL, slope, speed_along, steady_window
+from sealfit.ingest.window import (
+    SAME_SPEED,
+    SPEED_NOISE,
+    STANDSTILL,
+    slope,
+    speed_along,
+    steady_window,
+    stretches,
+)
 
 # Share of the travel of a motion that a steady speed covers at least. It is ten times what counts as a rest
 # (`_bounds`), so that no creep is one; 1, 3, 10 and 30 mm/s for equal times cover 2 % and more.
@@ -388,3 +395,9 @@ def _too_short(along_mm: np.ndarray, steady: np.ndarray, settings: Strokes) -> s
         needed = f"at least {settings.min_steady_share:.0%} is needed"
         return f"the steady window is {share:.0%} of the stroke; {needed}"
     return None
+
+
+def smoothed(values: np.ndarray, samples: int) -> np.ndarray:
+    """Return `values` as a running mean of running medians over `samples` samples, shape (n,)."""
+    middle = median_filter(np.asarray(values, float), samples, mode="nearest")
+    return uniform_filter1d(middle, samples, mode="nearest")

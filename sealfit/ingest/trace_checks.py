@@ -13,8 +13,8 @@ from sealfit.config import Config, Quality
 from sealfit.errors import KEPT, ConfigError, Fault
 from sealfit.ingest.cells import Trace
 from sealfit.ingest.files import bad_file
-from sealfit.ingest.segments import weighted_median
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm
+from sealfit.ingest.window import weighted_median
 from sealfit.units import Units, conversion
 
 # ---------------------------------------------------------------- spikes

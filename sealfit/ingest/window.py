@@ -9,7 +9,6 @@ from scipy.ndimage import median_filter
 from scipy.special import chdtrc
 
 from sealfit.ingest.presliding import MotionStart, rise_of
-from sealfit.ingest.segments import stretches, transient_rows, weighted_median
 
 # Share of the plateau speed below which the platform rests. A ripple of the speed stays above it.
 REST = 0.5
@@ -37,6 +36,12 @@ CLEAR = 1e-6
 SPEED_NOISE = 0.25
 # Samples of a steady window, or of a stroke that may have one, at least.
 LEAST_SAMPLES = 4
+# Parts of equal rows into which a steady window is cut to see whether it begins within a transient, how many
+# may be left out (a longer change is an effect), and how many after these the parabola is fitted to.
+PARTS, MOST_PARTS, COMPARED = 20, 2, 8
+# Standard errors, and share of the force, by which the first part must be off, one pair or the other. What
+# warming leaves beside the parabola in a stroke of low noise reaches 10 standard errors and 2 % of the force.
+OFF = ((20.0, 0.002), (8.0, 0.1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -361,3 +366,49 @@ def _last(mask: np.ndarray) -> int | None:
     """Return the last row that is true, if any."""
     found = _first(mask[::-1])
     return None if found is None else len(mask) - 1 - found
+
+
+def transient_rows(force_N: np.ndarray) -> int:
+    """Return how many of the first rows of a steady window are a transient that the law did not reach.
+
+    The force of n rows is cut into parts. A first part whose mean is far off the parabola through later ones
+    is left out, with the second if that is off, too: a rise or an overshoot of a few samples at a high speed
+    is not fitted, and an effect of so short a distance could not be told from it. Of the reversed force it is
+    the number of last rows.
+    """
+    size = len(force_N) // PARTS
+    if size < 1:
+        return 0
+    means = force_N[: size * PARTS].reshape(PARTS, size).mean(axis=1)
+    powers = np.vander(np.arange(MOST_PARTS + COMPARED, dtype=float), 3)
+    later = slice(MOST_PARTS, MOST_PARTS + COMPARED)
+    inverse = np.linalg.pinv(powers[later])
+    residual = means[: len(powers)] - powers @ (inverse @ means[later])
+    spread = np.sqrt(np.sum(residual[later] ** 2) / (COMPARED - 3))
+    error = spread * np.sqrt(1.0 + ((powers[:MOST_PARTS] @ inverse) ** 2).sum(axis=1))
+    level, size_N = abs(float(means.mean())), np.abs(residual[:MOST_PARTS])
+    off = np.any([size_N > np.maximum(k * error, share * level) for k, share in OFF], axis=0)
+    return size * int(np.count_nonzero(np.logical_and.accumulate(off)))
+
+
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """Return the value at which half of the weight lies at smaller ones; 0 where there is no weight.
+
+    >>> weighted_median(np.array([5.0, 1.0, 3.0]), np.array([1.0, 1.0, 4.0]))
+    3.0
+    """
+    order = np.argsort(values)
+    covered = np.cumsum(weights[order])
+    return float(values[order[covered.searchsorted(0.5 * covered[-1])]]) if covered[-1] > 0.0 else 0.0
+
+
+def stretches(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and the last row (exclusive) of every stretch in which `mask` is true.
+
+    Examples
+    --------
+    >>> stretches(np.array([True, False, True, True]))
+    [(0, 1), (2, 4)]
+    """
+    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))

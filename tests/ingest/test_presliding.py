@@ -8,8 +8,8 @@ from scipy.ndimage import uniform_filter1d
 from sealfit.config import Config, Strokes
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.presliding import MotionStart, _before, rise_of
-from sealfit.ingest.segments import transient_rows
 from sealfit.ingest.strokes import find_strokes
+from sealfit.ingest.window import transient_rows
 
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sealfit.ingest.segments import weighted_median
+from sealfit.ingest.window import weighted_median
 
 SIZES = (40, 9, 1, 200, 7, 2, 31)
 
