@@ -159,8 +159,7 @@ def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
     displacement_mm, force_N, steady; `strokes` have file, run_id and direction. Columns are those of table
     `traces_mean` with numbers, and `row`, the first stroke of the run.
     """
-    names = ("displacement_mm", "force_N", "steady")
-    x, force, steady = (np.asarray(samples[name]) for name in names)
+    x, force, steady = (np.asarray(samples[name]) for name in ("displacement_mm", "force_N", "steady"))
     made = []
     for run in _strokes_by_run(samples["row"], strokes["run_id"]):
         low, step, cells = _grid([x[own] for _, own in run])
@@ -170,17 +169,11 @@ def mean_traces(samples: Samples, strokes: Strokes) -> dict[str, np.ndarray]:
         keep = _comparable(np.isfinite(of_strokes), steady_cell, back)
         mean, error = _over_files(np.where(keep, of_strokes, 0.0), keep, [strokes["file"][i] for i, _ in run])
         shown = np.flatnonzero(keep.any(axis=0))
-        made.append(
-            {
-                "row": np.full(len(shown), run[0][0]),
-                "displacement_mm": low + (shown + 0.5) * step,
-                "force_N": mean[shown],
-                "force_se_N": error[shown],
-                "n": keep.sum(axis=0)[shown],
-                "steady": (keep & steady_cell).any(axis=0)[shown],
-            }
-        )
-    return {name: np.concatenate([run[name] for run in made]) for name in made[0]}
+        row, place = np.full(len(shown), run[0][0]), low + (shown + 0.5) * step
+        n, slides = keep.sum(axis=0), (keep & steady_cell).any(axis=0)
+        made.append((row, place, mean[shown], error[shown], n[shown], slides[shown]))
+    names = ("row", "displacement_mm", "force_N", "force_se_N", "n", "steady")
+    return {name: np.concatenate(parts) for name, parts in zip(names, zip(*made, strict=True), strict=True)}
 
 
 def _grid(places: Sequence[np.ndarray]) -> tuple[float, float, int]:
@@ -196,10 +189,7 @@ def _grid(places: Sequence[np.ndarray]) -> tuple[float, float, int]:
 def _of_cells(
     place: np.ndarray, force: np.ndarray, steady: np.ndarray, cells: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a stroke's mean force in each cell, NaN if empty, and whether all samples there are steady.
-
-    Short runs of empty cells are filled along a straight line.
-    """
+    """Return a stroke's mean force in each cell, NaN if empty, and whether all samples there are steady."""
     cell = np.minimum(place.astype(int), cells - 1)
     count = np.bincount(cell, minlength=cells)
     with np.errstate(invalid="ignore"):
@@ -299,10 +289,7 @@ def with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
 
 
 def _without_inertia(trace: Trace, mass: float) -> Trace:
-    """Return the trace with the force less mass times acceleration of the measured displacement.
-
-    Both count in the direction of rising displacement, as the force of friction does.
-    """
+    """Return the trace with the force less mass times acceleration, as rising displacement counts."""
     if not mass or len(trace.line) < 3:
         return trace
     time_s, displacement, force = (trace.columns[name] for name in SLOTS)
@@ -312,17 +299,10 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
     return trace.having({"force_N": force - inertia})
 
 
-def _strokes_before(trace: Trace) -> int:
-    """Return how many strokes of the record other files hold."""
-    return int(trace.channels.get("stroke", 1)) - 1
-
-
 def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[str, np.ndarray]:
-    """Return the samples of a trace with stroke, distance and flags.
-
-    Time is counted from the start of the motion if there are several strokes.
-    """
+    """Return the samples of a trace with stroke, distance and flags; time from the start of each of several."""
     time_s, displacement, force = (trace.columns[name] for name in SLOTS)
+    before = int(trace.channels.get("stroke", 1)) - 1  # strokes of the record that other files hold
     size = [stroke.stop - stroke.start for stroke in strokes]
     origin = np.array([stroke.origin for stroke in strokes])
     since = time_s[origin] if len(strokes) > 1 else np.zeros(1)
@@ -331,7 +311,7 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         middle = [np.median(displacement[stroke.start : stroke.stop]) for stroke in strokes]
         turns = turn * np.floor(np.array(middle) / turn)
     return {
-        "stroke": np.repeat([stroke.number for stroke in strokes], size) + _strokes_before(trace),
+        "stroke": np.repeat([stroke.number for stroke in strokes], size) + before,
         "time_s": time_s - np.repeat(since, size),
         "displacement_mm": displacement - np.repeat(turns, size),
         "force_N": force,
@@ -352,16 +332,10 @@ def _stroke_rows(
     rows, faults = [], []
     time_s, force = trace.columns["time_s"], trace.columns["force_N"]
     for stroke in strokes:
-        row = {
-            **trace.channels,
-            **_means(stroke, samples),
-            "file": file,
-            "stroke": stroke.number + _strokes_before(trace),
-            "direction": stroke.direction,
-            "speed_mm_s": config.units.speed_factor * stroke.speed_mm_s,
-            "several": several,
-            "several_speeds": stroke.several_speeds,
-        }
+        row = {**trace.channels, **_means(stroke, samples), "file": file}
+        row |= {"stroke": int(samples["stroke"][stroke.start]), "direction": stroke.direction}
+        row |= {"speed_mm_s": config.units.speed_factor * stroke.speed_mm_s}
+        row |= {"several": several, "several_speeds": stroke.several_speeds}
         found = stroke_faults(stroke, time_s, force, trace.line, trace.number, config.quality)
         used = not any(fault.action == "stroke left out" for fault in found)
         if used:

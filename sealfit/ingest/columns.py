@@ -155,8 +155,7 @@ def _spell(value: object) -> str | None:
 def _joined(parts: Iterable[Sequence[str | None]], rows: int) -> list[str | None]:
     """Return the parts of each row joined by ", "; None where any part is."""
     each = list(zip(*parts, strict=True)) or [()] * rows
-    texts = {row: None if None in row else ", ".join(row) for row in set(each)}
-    return [texts[row] for row in each]
+    return [None if None in row else ", ".join(row) for row in each]
 
 
 # ---------------------------------------------------------------- trace files

@@ -175,14 +175,9 @@ def in_our_units(columns: Columns, conversions: Mapping[str, Conversion]) -> Col
 
 def empty_cells(entries: list[Entry], name: str, rows: np.ndarray) -> list[Fault]:
     """Return the faults of files, by their numbers, that lack a value in a condition column."""
-    reason, fix = (
-        "holds no value: empty, n/a or the like.",
-        "Fill it: it is one of the config's condition columns.",
-    )
+    reason = "holds no value: empty, n/a or the like."
+    fix = "Fill it: it is one of the config's condition columns."
     return [entries[i].fault("empty_cell", reason, name, value="", fix=fix) for i in rows.tolist()]
-
-
-ABSOLUTE_ZERO_C = -273.15
 
 
 def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
@@ -201,7 +196,7 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
     add("speed_mm_s", lambda value: value == 0, "is not a sliding speed.", fix)
     fix = "Temperatures are in °C; give another unit in the rig config."
     for name in (name for name in columns if name.endswith("_C")):
-        add(name, lambda value: value <= ABSOLUTE_ZERO_C, "is not above absolute zero.", fix)
+        add(name, lambda value: value <= -273.15, "is not above absolute zero.", fix)
     reason, fix = "is larger than any quantity of a rig.", "Correct what gives it."
     for name in columns:
         add(name, lambda value: abs(value) >= OVERLOAD, reason, fix)
@@ -271,8 +266,6 @@ def add_runs(
     """
     none = [None] * len(conditions)
     given = columns.get("run_id", none)
-    if None not in given:
-        return columns, []
     run_ids: dict[int, str] = {}
     groups = defaultdict(list)
     specimens, speeds = columns.get("specimen_id", none), columns.get("speed_mm_s", none)
@@ -371,9 +364,8 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
             fix = "Give every file of a run its own repeat number, files of different runs a run_id each, "
             fix += "or each stroke of a repeat its number."
             if conditions[i].startswith(UNAGED):
-                fix += (
-                    " Pieces of unaged rubber that were tested with several series need a specimen_id each."
-                )
+                fix += " Pieces of unaged rubber that were tested with several series "
+                fix += "need a specimen_id each."
             faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], fix=fix))
         for name, column in told.items():
             mine, theirs = column[i], column[j]
@@ -384,13 +376,10 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
                 value = "none" if mine is None else mine
                 faults.append(entry.fault("run_disagrees", reason, name, value=value, fix=fix))
         if specimen[i] != specimen[j] and told["speed_mm_s"][i] == told["speed_mm_s"][j]:
-            reason = (
-                f"run '{run[i]}' has repeats on several specimens; their scatter counts as that of repeats."
-            )
-            fix = "Give each specimen a run_id of its own."
-            faults.append(
-                entry.fault("run_specimens", reason, "specimen_id", value=specimen[i], fix=fix, **KEPT)
-            )
+            reason = f"run '{run[i]}' has repeats on several specimens; "
+            reason += "their scatter counts as that of repeats."
+            about = {"value": specimen[i], "fix": "Give each specimen a run_id of its own.", **KEPT}
+            faults.append(entry.fault("run_specimens", reason, "specimen_id", **about))
     return faults
 
 

@@ -10,7 +10,6 @@ import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path, PurePosixPath
 
 import regex
@@ -263,7 +262,6 @@ def split_line(line: str, delimiter: str) -> list[str]:
 # Longest time of a pattern of the config on one line or name, in s. Ordinary patterns take microseconds;
 # repeats within repeats can take years.
 PATTERN_S = 0.5
-_compiled = cache(regex.compile)
 
 
 def found_by(pattern: str, text: str, *, whole: bool = False, cut: bool = False) -> regex.Match | None:
@@ -271,9 +269,9 @@ def found_by(pattern: str, text: str, *, whole: bool = False, cut: bool = False)
 
     With `cut` the text may end before the match does. ConfigError if that takes longer than `PATTERN_S`.
     """
-    match = _compiled(pattern).fullmatch if whole else _compiled(pattern).search
+    match = regex.fullmatch if whole else regex.search
     try:
-        return match(text, partial=cut, timeout=PATTERN_S)
+        return match(pattern, text, partial=cut, timeout=PATTERN_S)
     except TimeoutError:
         reason = f"the pattern '{shortened(pattern)}' takes too long on '{shortened(text)}'."
         fix = "Write it without repeats within repeats, such as (a+)+."
@@ -335,8 +333,6 @@ def without_strays(line: str, settings: TraceFormat) -> str:
 def without_footer(text: bytes, footer: str | None, start: int) -> bytes:
     """Return a text up to the first line from `start` on that begins as the footer does; else all of it.
 
-    Examples
-    --------
     >>> without_footer(b"Test 1\\nt,x\\n0,1\\nTest ended\\n", "Test", start=11)
     b'Test 1\\nt,x\\n0,1\\n'
     """

@@ -31,12 +31,8 @@ from sealfit.ingest.files import bad_file
 # .xls is refused, and said how to save it.
 ENDINGS = {f".{kind}": kind for kind in ("xlsx", "tdms", "mat", "parquet")}
 ENDINGS |= {".xlsm": "xlsx", ".xls": "xlsx", ".pq": "parquet"}
-CALLED = {
-    "xlsx": "an Excel workbook",
-    "tdms": "a TDMS file",
-    "mat": "a MAT-file",
-    "parquet": "a Parquet file",
-}
+CALLED = {"xlsx": "an Excel workbook", "tdms": "a TDMS file", "mat": "a MAT-file"}
+CALLED |= {"parquet": "a Parquet file"}
 OF_ARRAYS = ("tdms", "mat", "parquet")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]+")
 
@@ -252,9 +248,8 @@ def _mat(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
         return Arrays(tuple(header))
     tables = _tables(variables)
     if not tables:
-        fix = (
-            "Save the columns as vectors, as a matrix or as a struct: s = table2struct(T, 'ToScalar', true)."
-        )
+        fix = "Save the columns as vectors, as a matrix or as a struct: "
+        fix += "s = table2struct(T, 'ToScalar', true)."
         raise bad_file("no_rows", "holds no vectors, matrix or struct of numbers.", fix)
     options = {name: table if isinstance(table, dict) else () for name, table in tables.items()}
     name = _chosen(options, "variable", settings)

@@ -224,10 +224,8 @@ def misspelt(
             reason, fix = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."
             faults.append(Fault("column_name", reason, fix=fix, column=name, **place))
         elif SequenceMatcher(None, name, close).ratio() > 0.85:
-            reason, fix = (
-                f"is kept as a channel; it looks like '{close}'.",
-                f"Write '{close}' if that is meant.",
-            )
+            reason = f"is kept as a channel; it looks like '{close}'."
+            fix = f"Write '{close}' if that is meant."
             faults.append(Fault("column_name", reason, fix=fix, column=name, **place, **KEPT))
     return faults
 

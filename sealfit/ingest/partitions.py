@@ -54,9 +54,7 @@ def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.
 # a campaign change the part they belong to and, at most, its neighbours.
 
 PART_FILES = 256  # few enough to be read for one condition; 100,000 files are some 400 parts
-PART_BYTES = (
-    4_000_000  # of trace files of a part, if these come first; its samples take ten times that in memory
-)
+PART_BYTES = 4_000_000  # of trace files, if these come first; the samples take ten times that in memory
 LEAST, MOST = 0.25, 2.0  # smallest and largest part, as multiples of the size above; a run is never cut
 
 
@@ -191,10 +189,7 @@ def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, li
 
 
 def _at_speeds(strokes: Mapping[str, list], tolerance: float) -> dict[str, list]:
-    """Return `run_id` with the speed where the run has several in a file, and that as the speed set.
-
-    Speeds of a run are different ones where those next to each other differ by more than the tolerance.
-    """
+    """Return `run_id` with the speed where the run has several in a file, and that as the speed set."""
     names = np.array(strokes["run"], object)
     commanded = strokes.get("speed_set_mm_s", [None] * len(names)).copy()
     known = np.array(strokes["used"], bool)
@@ -235,10 +230,7 @@ def _array(values: Sequence[object]) -> pa.Array:
 
 
 def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) -> dict[str, np.ndarray]:
-    """Return all samples, with `row` (place in `strokes`).
-
-    `steady` and `sliding` are false throughout a stroke that is not used.
-    """
+    """Return all samples, with `row` (place in `strokes`); none is steady or sliding in an unused stroke."""
     parts = [made for made in files if made.samples is not None]
     names = list(dict.fromkeys(name for made in parts for name in made.samples))
     length = [len(made.samples["time_s"]) for made in parts]
@@ -246,11 +238,8 @@ def sample_columns(files: Sequence[FileStrokes], strokes: Mapping[str, list]) ->
     count = [len(made.strokes) for made in parts]
     first = np.cumsum(count) - count - [made.strokes[0]["stroke"] for made in parts]
     columns["row"] = np.repeat(first, length) + columns["stroke"]
-    used = np.array(strokes["used"], bool)
-    if not used.all():
-        for name in ("steady", "sliding"):
-            columns[name] = columns[name] & used[columns["row"]]
-    return columns
+    used = np.array(strokes["used"], bool)[columns["row"]]
+    return columns | {name: columns[name] & used for name in ("steady", "sliding")}
 
 
 def _stacked(parts: list[np.ndarray | None], length: list[int]) -> np.ndarray:

@@ -171,9 +171,8 @@ def _stuck(force_N: np.ndarray, line: np.ndarray, settings: Quality) -> list[Fau
         return []
     first, count = place
     value = float(force_N[first])
-    reason = (
-        f"{count} samples in a row are exactly {value:g} while the platform moves; elsewhere they change."
-    )
+    reason = f"{count} samples in a row are exactly {value:g} while the platform moves; "
+    reason += "elsewhere they change."
     return [_broken("stuck", reason, line[first], value, MEASURE_AGAIN)]
 
 

@@ -163,8 +163,6 @@ def constant_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     used = strokes["used"].to_numpy(bool)
     nothing = np.abs(strokes["force_N"].to_numpy(float)) < NOTHING
     constant = used & (nothing | (strokes["equal"].to_numpy(float) >= 1.0))
-    if not constant.any():
-        return np.ones(len(strokes), bool), []
     others = strokes["equal"].to_numpy(float)[used & ~constant]
     noisy = bool(len(others) and np.median(others) < FINE)
     dead = constant & (noisy | nothing)

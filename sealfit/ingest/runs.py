@@ -169,9 +169,8 @@ def _fix(text: str) -> str:
     """Return a fix: the formats that a date is in, by the usual ones, or how it should be written."""
     if likely := usual_formats([text]):
         return f"Set date_format = {' or '.join(likely)} under [files] in the rig config."
-    return (
-        "Write it as 2024-03-01T09:30:00, or give its format: date_format = '%d.%m.%Y %H:%M' under [files]."
-    )
+    fix = "Write it as 2024-03-01T09:30:00, or give its format: "
+    return fix + "date_format = '%d.%m.%Y %H:%M' under [files]."
 
 
 # ---------------------------------------------------------------- runs

@@ -76,6 +76,9 @@ class Stroke:
         return self.start + np.flatnonzero(self.steady)
 
 
+OF_ROWS = ("steady", "sliding", "presliding_N", "speed_along_mm_s")  # arrays of a stroke
+
+
 class _TraceMotion(NamedTuple):
     """A trace as strokes are found in it: arrays of shape (n,), and the noise of a displacement sample."""
 
@@ -159,19 +162,11 @@ def _turns(
     made = []
     for part in pairwise([0, *cuts[long].tolist(), whole.stop - whole.start]):
         own, rows = slice(*part), slice(whole.start + part[0], whole.start + part[1])
-        steady, along = whole.steady[own], whole.direction * displacement_mm[rows]
-        turn = replace(
-            whole,
-            start=rows.start,
-            stop=rows.stop,
-            speed_mm_s=slope(time_s[rows], displacement_mm[rows], steady),
-            steady=steady,
-            sliding=whole.sliding[own],
-            presliding_N=whole.presliding_N[own],
-            speed_along_mm_s=whole.speed_along_mm_s[own],
-            short=_too_short(along, steady, settings),
-        )
-        made.append(turn)
+        cut = {name: getattr(whole, name)[own] for name in OF_ROWS}
+        speed = slope(time_s[rows], displacement_mm[rows], cut["steady"])
+        short = _too_short(whole.direction * displacement_mm[rows], cut["steady"], settings)
+        turn = {"start": rows.start, "stop": rows.stop, "speed_mm_s": speed, "short": short}
+        made.append(replace(whole, **turn, **cut))
     return made
 
 
@@ -288,11 +283,9 @@ def _flat_parts(
     if len(off) >= FEWEST_SAMPLES and max(map(abs, ends)) <= 0.5 * tolerance:
         first, after = (int(np.argmax(np.sign(end[0]) * end <= SAME_SPEED)) for end in (off, off[::-1]))
         found = [slice(rows.start + first, rows.stop - after)] if first + after < len(off) else []
-    before, behind = (
-        _flat_parts(speed, step_mm, part, least_mm, settings)
-        for part in (slice(within.start, here.start), slice(here.stop, within.stop))
-    )
-    return [*before, *found, *behind]
+    before, behind = slice(within.start, here.start), slice(here.stop, within.stop)
+    found = _flat_parts(speed, step_mm, before, least_mm, settings) + found
+    return found + _flat_parts(speed, step_mm, behind, least_mm, settings)
 
 
 WHOLE = 0.01  # largest distance of a whole number of steps from one, of numbers written with few digits

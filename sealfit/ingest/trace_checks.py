@@ -74,8 +74,6 @@ def force_spikes(
     noise = max(1.4826 * np.median(np.abs(usual)), least)
     apart = APART * np.quantile(np.abs(usual), USUAL)
     suspects = np.abs(off) > max(settings.spike_sigma * noise, apart)
-    if not suspects.any():
-        return keep, []
     rest = np.where(suspects, 0.0, force_N)  # at rest the force may be zero
     low, high = min(rest.min(), 0.0), max(rest.max(), 0.0)
     beyond = np.maximum(low - force_N, force_N - high) > 0.5 * (high - low)
