@@ -16,14 +16,7 @@ from sealfit.errors import BadFile, Fault
 from sealfit.ingest.cells import Trace
 from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.files import placed, read_marked
-from sealfit.ingest.quality import (
-    beginnings,
-    load_faults,
-    rising_faults,
-    speed_column_faults,
-    stroke_faults,
-    swapped_faults,
-)
+from sealfit.ingest.quality import beginnings, load_checks, rising_faults, speed_column_faults, stroke_faults
 from sealfit.ingest.reader import parse_trace
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm, find_strokes, resolution_mm
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, motion_fault, speed_fault
@@ -300,7 +293,7 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
 
 
 def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[str, np.ndarray]:
-    """Return the samples of a trace with stroke, distance and flags; time from the start of each of several."""
+    """Return the samples of a trace with stroke, distance and flags, time from the start of the motion."""
     time_s, displacement, force = (trace.columns[name] for name in SLOTS)
     before = int(trace.channels.get("stroke", 1)) - 1  # strokes of the record that other files hold
     size = [stroke.stop - stroke.start for stroke in strokes]
@@ -345,19 +338,7 @@ def _stroke_rows(
         rows.append({**row, "used": used})
         number = stroke.number if several else None
         faults += [replace(fault, stroke=number) for fault in found]
-    return tuple(rows), faults + _load_faults(trace, rows, config)
-
-
-def _load_faults(trace: Trace, rows: Sequence[Mapping[str, object]], config: Config) -> list[Fault]:
-    """Return where the load measured in the strokes of use differs from the declared one, or is no load."""
-    declared = trace.channels.get("load_N")
-    loads = [row["load_N"] for row in rows if row["used"]] if "load_N" in trace.columns else []
-    if not loads:
-        return []
-    found = swapped_faults(trace.columns["force_N"], trace.columns["load_N"], config)
-    if isinstance(declared, int | float):
-        found += load_faults(float(np.mean(loads)), declared, config.units.unit("load"))
-    return found
+    return tuple(rows), faults + load_checks(trace, rows, config)
 
 
 def _means(stroke: Stroke, samples: Mapping[str, np.ndarray]) -> dict[str, object]:

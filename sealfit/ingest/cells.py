@@ -189,10 +189,10 @@ def read_cells(
         i: np.array([row[i] if i < len(row) else None for row in cells], dtype=object) for i in range(width)
     }
     trace = checked_cells(columns, line, ours, must, settings.decimal, count)
-    beyond = np.array([any(cell.strip() for cell in row[width:]) for row in cells], dtype=bool)
+    beyond = np.array([any(row[width:]) for row in cells], dtype=bool)
 
     def make(i: int) -> Fault:
-        value = " ".join(cell.strip() for cell in cells[i][width:] if cell.strip())
+        value = " ".join(filter(None, cells[i][width:]))
         reason = f"the line has {len(cells[i])} cells where {width} are named."
         fix = "Move it to a column with a name of its own, or delete the line."
         if len(cells[i]) == 2 * width:

@@ -8,7 +8,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -241,22 +241,20 @@ def find_layout(text: bytes, settings: TraceFormat) -> FileLayout:
         reason = f"has a header of {len(header)} lines, and its names should stand {back} lines before the "
         fix = "Check header_lines and names_line in the rig config."
         raise bad_file("header_not_found", f"{reason}data.", fix)
-    cells = split_line(without_strays(header[-back], settings), settings.delimiter)
-    names = tuple(name.strip() for name in cells)
+    names = tuple(split_line(without_strays(header[-back], settings), settings.delimiter))
     return FileLayout(header, names, count - back + 1, start, count + 1)
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
-    """Return the cells of one line; a quoted cell may hold the delimiter."""
+    """Return the cells of one line without white space around them; a quoted one may hold the delimiter."""
     if delimiter == "whitespace":
         return line.split()
     mark = "\t" if delimiter == "tab" else delimiter
-    if '"' not in line:
-        return line.split(mark)
-    try:
-        return next(csv.reader([line], delimiter=mark), [])
-    except csv.Error:
-        return line.split(mark)
+    cells = line.split(mark)
+    if '"' in line:
+        with suppress(csv.Error):
+            cells = next(csv.reader([line], delimiter=mark), [])
+    return [cell.strip() for cell in cells]
 
 
 # Longest time of a pattern of the config on one line or name, in s. Ordinary patterns take microseconds;

@@ -147,12 +147,8 @@ def _header(numbered: list[tuple[int, str]], delimiter: str, config: Config) -> 
     found = []
     for number, line in numbered:
         own = delimiter or max(",;\t", key=line.count)
-        found.append((number, own, _cells(line, own)))
+        found.append((number, own, split_line(line, own)))
     return next((one for one in found if known & set(one[-1])), (found or [(1, ",", [])])[0])
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    return [cell.strip() for cell in split_line(line, delimiter)]
 
 
 def _rows(
@@ -162,7 +158,7 @@ def _rows(
     lines, rows, faults = [], [], []
     named = max((i for i, name in enumerate(names, start=1) if name), default=0)
     for number, line in numbered:
-        cells = _cells(line, delimiter)
+        cells = split_line(line, delimiter)
         row = {name: cell for name, cell in zip(names, cells, strict=False) if name and cell}
         place = {"file": table, "line": number}
         if '"' in line and _left_open(line, delimiter):

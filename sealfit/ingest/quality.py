@@ -7,7 +7,7 @@ commanded speed are judged in `trace_checks.py`, and what needs other traces in 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,7 @@ from scipy.special import bdtrc
 
 from sealfit.config import Config, Quality
 from sealfit.errors import KEPT, NOTED, STROKE_OUT, ConfigError, Fault
+from sealfit.ingest.cells import Trace
 from sealfit.ingest.strokes import Stroke
 from sealfit.ingest.trace_checks import resolution, with_unit
 from sealfit.tables import CALENDAR, QUALITY, STEADY
@@ -211,6 +212,18 @@ def speed_column_faults(measured: float, column: float, config: Config) -> list[
     reason = f"the speed column says {column:.4g} {unit}, displacement over time {measured:.4g} {unit}."
     fix = "Check the units of both columns; displacement over time is used."
     return [Fault("speed_disagreement", reason, column="speed_mm_s", value=float(column), fix=fix, **KEPT)]
+
+
+def load_checks(trace: Trace, rows: Sequence[Mapping[str, object]], config: Config) -> list[Fault]:
+    """Return where the load measured in the strokes of use differs from the declared one, or is no load."""
+    declared = trace.channels.get("load_N")
+    loads = [row["load_N"] for row in rows if row["used"]] if "load_N" in trace.columns else []
+    if not loads:
+        return []
+    found = swapped_faults(trace.columns["force_N"], trace.columns["load_N"], config)
+    if isinstance(declared, int | float):
+        found += load_faults(float(np.mean(loads)), declared, config.units.unit("load"))
+    return found
 
 
 def load_faults(measured: float, declared: float, unit: str) -> list[Fault]:

@@ -131,7 +131,7 @@ def _names_elsewhere(error: BadFile, layout: FileLayout, body: bytes, settings: 
         return error
     lines = [*layout.header, *body[:HEAD_BYTES].decode("utf-8", "replace").split("\n")]
     for number, line in enumerate(lines, start=1):
-        if wanted <= {cell.strip() for cell in split_line(line, settings.delimiter)}:
+        if wanted <= set(split_line(line, settings.delimiter)):
             instead = " in place of header_ends_at" if settings.header_ends_at is not None else ""
             count = number + len(layout.header) - layout.names_line
             fix = f"They stand in line {number}: set header_lines = {count}{instead} under [trace]."
