@@ -23,8 +23,6 @@ from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, motio
 from sealfit.ingest.window import acceleration
 from sealfit.store.manifest import Fingerprint, fingerprint
 
-# ---------------------------------------------------------------- average
-
 Samples = Mapping[str, np.ndarray]  # columns of equal length
 Strokes = Mapping[str, Sequence]
 

@@ -26,8 +26,6 @@ from sealfit.store.parquet import as_words
 from sealfit.store.staged_writes import file_size
 from sealfit.tables import CALENDAR, RUNS, STEADY
 
-# ---------------------------------------------------------------- inputs
-
 
 def inputs_table(
     campaign: Path, marks: Fingerprints, counts: np.ndarray, used: np.ndarray, faults: Sequence[Fault]
@@ -56,8 +54,6 @@ def inputs_table(
     )
     return table, {file: mark for file, mark in marks.items() if mark.sha256 is not None}
 
-
-# ---------------------------------------------------------------- campaign
 
 # Columns of samples, and of their scatter, whose means are in `steady`.
 OF_SAMPLES = ("time_s", "displacement_mm", "distance_mm", "force_N", "presliding_N", "force_sd_N", "n")

@@ -16,8 +16,6 @@ from sealfit.config import TraceFormat
 from sealfit.errors import Fault
 from sealfit.ingest.files import FileLayout, as_number, bad_file, split_line, without_strays
 
-# ---------------------------------------------------------------- rows
-
 
 @dataclass(frozen=True, slots=True)
 class Trace:

@@ -20,8 +20,6 @@ from sealfit.ingest.files import as_number
 from sealfit.ingest.listing import Entry, stopped
 from sealfit.units import Conversion
 
-# ---------------------------------------------------------------- run values
-
 NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
 COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
 _MOSTLY = 0.5  # a column with more numbers than this is one of numbers, and the rest of its cells are slips

@@ -16,8 +16,6 @@ from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import TEXT_COLUMNS, as_number, found_by
 from sealfit.units import Conversion
 
-# ---------------------------------------------------------------- refs
-
 
 @dataclass(frozen=True, slots=True)
 class TraceRef:

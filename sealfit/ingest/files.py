@@ -18,8 +18,6 @@ from sealfit.config import Config, TraceFormat
 from sealfit.errors import BadFile, ConfigError, Fault, did_you_mean, shortened
 from sealfit.store.manifest import Fingerprint, fingerprint_of
 
-# ---------------------------------------------------------------- folder
-
 LINE_ENDS = b"\r\n\x1a"  # the last is DOS's end of a file
 MOST_CUT = 0.25  # Largest share of text files without a line end that are taken for cut: one of four.
 

@@ -26,8 +26,6 @@ from sealfit.errors import NOTED, CampaignError, Fault, SealfitError
 from sealfit.ingest.columns import suggestion
 from sealfit.ingest.files import bad_file
 
-# ---------------------------------------------------------------- kinds
-
 # .xls is refused, and said how to save it.
 ENDINGS = {f".{kind}": kind for kind in ("xlsx", "tdms", "mat", "parquet")}
 ENDINGS |= {".xlsm": "xlsx", ".xls": "xlsx", ".pq": "parquet"}
@@ -73,9 +71,6 @@ def damage_named(kind: str) -> Iterator[None]:
         said = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
         fix = "It is damaged or of another format: export it again, or set trace.format in the rig config."
         raise bad_file("damaged_file", f"cannot be read as {CALLED[kind]} ({said}).", fix) from error
-
-
-# ---------------------------------------------------------------- arrays
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,8 +26,6 @@ from sealfit.store.manifest import Fingerprints
 from sealfit.store.parquet import as_words, to_arrow
 from sealfit.tables import BINS, BOOL, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
 
-# ---------------------------------------------------------------- shaped
-
 # Columns that serve the ingest only.
 INNER = (
     "several", "several_speeds", "left", "equal", "extreme", "begins", "begins_half", "run", "sliding", "row",
@@ -101,8 +99,6 @@ def _cut(name: str, weight: float) -> bool:
     number = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
     return number < weight * 2.0**64
 
-
-# ---------------------------------------------------------------- part
 
 SAMPLED = ("traces", "traces_mean", "bins")  # tables that are made, and stored, part by part
 

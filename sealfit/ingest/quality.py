@@ -308,8 +308,6 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
     return pd.DataFrame({name: pd.array([row[name] for row in cells], kind) for name, kind in kinds.items()})
 
 
-# ---------------------------------------------------------------- incomplete
-
 LEAST_KNOWN = 0.8  # share of files with a value from which the search for effects still looks at a column
 NO_VALUE = "(no value)"  # level of a category in files without one
 

@@ -15,8 +15,6 @@ from sealfit.errors import KEPT, NOTED, STROKE_OUT, Fault
 from sealfit.ingest.quality import FINE, MEASURE_AGAIN
 from sealfit.ingest.scatter import RepeatCodes, ScatterFit, fit_scatter, repeat_means
 
-# ---------------------------------------------------------------- outlying
-
 # Share of the repeats that the search takes out at most. Beyond it the bulk is not known.
 MAX_OUTLIERS = 0.1
 # Share of its variance below which a residual is that of a run's only repeat.
@@ -83,8 +81,6 @@ def _judged(fit: ScatterFit, apart: ScatterFit, rows: np.ndarray, tests: int, ti
     p = -np.expm1((tests - (len(rows) - 1)) * np.log1p(-min(p_one, 1.0 - 1e-16)))
     return _Judged(rows, t, float(p), float(apart.mean[worst]) if len(rows) == 1 else force)
 
-
-# ---------------------------------------------------------------- peers
 
 AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign
 # What is the same to the last digit only in copies of a stroke.

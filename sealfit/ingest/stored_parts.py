@@ -23,8 +23,6 @@ from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints
 from sealfit.store.staged_writes import PARQUET, sync
 
-# ---------------------------------------------------------------- trace access
-
 
 @dataclass(frozen=True)
 class StoredTraces:

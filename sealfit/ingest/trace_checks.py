@@ -17,8 +17,6 @@ from sealfit.ingest.strokes import Stroke, displacement_noise_mm
 from sealfit.ingest.window import weighted_median
 from sealfit.units import Units, conversion
 
-# ---------------------------------------------------------------- spikes
-
 NEIGHBOURS = 5  # samples of the running median: blind to one or two wrong ones, and exact on any slope
 # A spike is so many times as far off as this share of the samples (of noise: 7.8 SDs); else it is a burst.
 APART, USUAL = 4.0, 0.95
@@ -102,9 +100,6 @@ def _spike(stroke: int | None, column: str, value: float, off: float, line: int)
     return Fault("spike", reason, fix="Correct the cell if the true value is known.", **place, **done)
 
 
-# ---------------------------------------------------------------- motion
-
-
 def motion_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fault | None:
     """Return a fault if nothing moves in a trace, or if its angle begins anew at each turn; else None."""
     place, unit = trace.columns["displacement_mm"], config.units.unit("displacement")
@@ -123,8 +118,6 @@ def motion_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fau
         fix = "Check the displacement column and its unit, or set strokes.min_travel_mm in the config."
     return bad_file(check, reason, fix, column="displacement_mm").fault
 
-
-# ---------------------------------------------------------------- speed check
 
 GROSS = 1.5  # factor beyond which a file contradicts itself; below it the commanded speed may be nominal
 

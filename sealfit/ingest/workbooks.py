@@ -17,8 +17,6 @@ from sealfit.errors import nearest
 from sealfit.ingest.files import as_utf8, bad_file, read_bytes
 from sealfit.ingest.formats import CALLED, damage_named, kind_of, library, value_text
 
-# ---------------------------------------------------------------- sheets
-
 HEAD_ROWS = 1000  # a header longer than this is no header
 LONGEST = object()  # stands for the sheet with the most rows
 _OLE = b"\xd0\xcf\x11\xe0"  # of .xls, and of the shell that Excel puts around an encrypted workbook
@@ -163,9 +161,6 @@ def _refuse_merged(sheet) -> None:
     if merged := sorted(below, key=lambda cells: cells.min_row):
         fix = "Unmerge them and write the value into each, or move remarks to a sheet of their own."
         raise bad_file("merged_cells", f"the cells {merged[0]} are merged.", fix, line=merged[0].min_row)
-
-
-# ---------------------------------------------------------------- tables of runs
 
 
 def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]:
