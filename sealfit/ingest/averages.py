@@ -36,12 +36,8 @@ def standard_error(values: np.ndarray) -> float:
 
     SE = s sqrt(2 tau / n), with the autocorrelation time tau = 1/2 + sum of rho(k) over lags up to the first
     M that is at least 5 tau (Sokal's window). A trend or a ripple makes it larger; correlation that would
-    make it smaller is not believed.
-
-    Notes
-    -----
-    Sokal 1997, Monte Carlo Methods in Statistical Mechanics, section 3, doi:10.1007/978-1-4899-0319-8_6; GUM
-    4.2.7.
+    make it smaller is not believed. Sokal 1997, Monte Carlo Methods in Statistical Mechanics, section 3,
+    doi:10.1007/978-1-4899-0319-8_6; GUM 4.2.7.
 
     Examples
     --------

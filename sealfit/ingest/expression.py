@@ -211,8 +211,6 @@ def _as_text(value: object) -> np.ndarray:
 def _day(date: object) -> float:
     """Return the number of the day of a date, ISO 8601 or as 17.04.2025, without its time; NaN for others.
 
-    Examples
-    --------
     >>> _day("2025-04-17 08:07") - _day("10.04.2025")
     7.0
     """

@@ -81,8 +81,8 @@ class MotionStart(NamedTuple):
 class Rise(NamedTuple):
     """Where the rise of one start is over, and what is left of it: `left_N * exp(-distance / length_mm)`.
 
-    `left_N` is the force at distance 0 less that of steady sliding, negative where the force comes up; 0
-    where there is no rise, or none that follows the bristles' law. `length_mm` is 0 where there is no rise.
+    `left_N` is the force at distance 0 less that of steady sliding; 0 without a rise that follows the
+    bristles' law. `length_mm` is 0 where there is no rise.
     """
 
     end_mm: float
@@ -110,11 +110,8 @@ def rise_of(start: MotionStart) -> Rise:
     Only a force that begins below everything the plateau later shows is a rise. With much damping of the
     bristles (sigma_1) a fast stroke's force comes up at once, to more than its level, and falls to it by the
     same law; then the fall has to be over. A strong wave is taken out if the rise takes more than a third of
-    the stroke.
-
-    Notes
-    -----
-    Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425, doi:10.1109/9.376053.
+    the stroke. Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425,
+    doi:10.1109/9.376053.
 
     Examples
     --------
@@ -384,8 +381,6 @@ def _at_most(lengths_mm: np.ndarray, explained: np.ndarray) -> float:
 
     The parabola goes through the best of the lengths and the two beside it, so the length never jumps.
 
-    Examples
-    --------
     >>> lengths_mm, explained = np.array([1.0, 2.0, 4.0, 8.0]), np.array([0.0, 3.0, 3.0, 0.0])
     >>> round(_at_most(lengths_mm, explained), 4)  # the square root of 8
     2.8284

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -21,13 +20,6 @@ MAX_OUTLIERS = 0.1
 ALONE = 1e-9
 
 
-class _Judged(NamedTuple):
-    rows: np.ndarray  # one repeat, or the two of a run
-    t: float
-    p: float  # adjusted over the campaign
-    mean_N: float  # of the run without it; of the run, if both are out
-
-
 def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
     """Return the repeats that disagree with their runs beyond the pooled scatter.
 
@@ -36,19 +28,16 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
     cannot be known: both are returned). `level` is the chance that any repeat at all is flagged in a campaign
     without outliers.
 
-    Notes
-    -----
-    The generalized extreme studentized deviate procedure (Rosner 1983, Technometrics 25(2), 165-172,
+    This is the generalized extreme studentized deviate procedure (Rosner 1983, Technometrics 25(2), 165-172,
     doi:10.1080/00401706.1983.10487848), on residuals within runs: the most extreme repeat is taken out,
-    scatter and pattern are estimated without it, and so on; the outliers are those up to the last one that
-    exceeds its limit. The limit is Sidak's for the repeats left, on Student's t with the pooled degrees of
-    freedom.
+    scatter and pattern are estimated without it, and so on. The outliers are those up to the last one beyond
+    its limit: Sidak's for the repeats left, on Student's t with the pooled degrees of freedom.
     """
     layout = RepeatCodes.of(means)
     force = means["force_N"].to_numpy(float)
     tiny = 1e-6 * float(np.max(np.abs(force), initial=0.0)) + 1e-300  # repeats that agree to the last digit
     kept = np.ones(len(means), bool)
-    found: list[_Judged] = []
+    found = []
     fit = fit_scatter(layout, force, kept)
     while len(found) < max(1, int(MAX_OUTLIERS * len(means))):
         tests = int((kept & (fit.share > ALONE)).sum())
@@ -60,26 +49,26 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
             rows = np.array([furthest])
         kept[rows] = False
         apart = fit_scatter(layout, force, kept)
-        found.append(_judged(fit, apart, rows, tests, tiny))
-        if found[-1].p >= level and abs(found[-1].t) < 3.0:  # nothing further out remains
+        t, p, mean_N = _judged(fit, apart, rows, tests, tiny)
+        found.append(means.iloc[rows].assign(run_mean_N=mean_N, t=t, p=p, alone=len(rows) == 2))
+        if p >= level and abs(t) < 3.0:  # nothing further out remains
             break
         fit = apart
-    last = max((number for number, one in enumerate(found, start=1) if one.p < level), default=0)
-    each = [means.iloc[:0].assign(run_mean_N=0.0, t=0.0, p=0.0, alone=False)]
-    for rows, t, p, mean_N in found[:last]:
-        each.append(means.iloc[rows].assign(run_mean_N=mean_N, t=t, p=p, alone=len(rows) == 2))
-    return pd.concat(each)
+    last = max((number for number, one in enumerate(found, start=1) if one["p"].iloc[0] < level), default=0)
+    return pd.concat([means.iloc[:0].assign(run_mean_N=0.0, t=0.0, p=0.0, alone=False), *found[:last]])
 
 
-def _judged(fit: ScatterFit, apart: ScatterFit, rows: np.ndarray, tests: int, tiny: float) -> _Judged:
-    """Return t and p of what was taken out, by the scatter of the rest, `apart`; `fit` is that with it."""
+def _judged(
+    fit: ScatterFit, apart: ScatterFit, rows: np.ndarray, tests: int, tiny: float
+) -> tuple[float, float, float]:
+    """Return t and p of the rows taken out, by the scatter of the rest, `apart`, and their run's mean."""
     worst = rows[np.argmax(np.abs(fit.t[rows]))]
     force = float(fit.mean[worst])
     sd = max(float(apart.scatter.sd_N(force)), tiny) * np.sqrt(fit.share[worst])
     t = float(fit.residual[worst] / sd)
     p_one = 2.0 * stdtr(apart.df_at(force), -abs(t))
     p = -np.expm1((tests - (len(rows) - 1)) * np.log1p(-min(p_one, 1.0 - 1e-16)))
-    return _Judged(rows, t, float(p), float(apart.mean[worst]) if len(rows) == 1 else force)
+    return t, float(p), float(apart.mean[worst]) if len(rows) == 1 else force
 
 
 AGAINST = -0.5  # share of its peers' force by which a force against its motion is of the wrong sign
@@ -110,8 +99,6 @@ def reversed_strokes(strokes: pd.DataFrame) -> tuple[np.ndarray, list[Fault]]:
     force = (strokes["force_N"] * strokes["direction"]).to_numpy(float)
     used = strokes["used"].to_numpy(bool) & np.isfinite(force)
     against = used & (force < 0.0)
-    if not against.any():
-        return keep, []
     found = []
     of_run, of_way = strokes.groupby(["direction", "run"]).indices, strokes.groupby("direction").indices
     sorted_force = {key: np.sort(force[rows[used[rows]]]) for key, rows in (*of_run.items(), *of_way.items())}

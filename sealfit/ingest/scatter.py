@@ -38,8 +38,7 @@ class RepeatScatter:
 def repeat_means(steady: pd.DataFrame) -> pd.DataFrame:
     """Return one row per file and run: `file`, `run_id`, `repeat`, `force_N` (size of its strokes' mean).
 
-    The strokes of a file share its set-up; its mean is the unit that is repeated. Rows with `used` false are
-    left out.
+    The strokes of a file share its set-up, so its mean is repeated. Rows with `used` false are left out.
     """
     rows = steady[steady["used"].to_numpy(bool)] if "used" in steady.columns else steady
     grouped = rows.groupby(["run_id", "repeat"], sort=True, observed=True)
@@ -50,13 +49,10 @@ def repeat_means(steady: pd.DataFrame) -> pd.DataFrame:
 def repeat_scatter(steady: pd.DataFrame) -> RepeatScatter:
     """Return the scatter of repeats within their runs, pooled over runs, as a function of the force.
 
-    s0 is in the force's unit, g without unit.
-
-    Notes
-    -----
-    Maximum likelihood of the run variances, s_r^2 ~ sd^2(F_r) chi^2(n_r - 1) / (n_r - 1), with s0^2 and g^2
-    not below zero: weighted least squares of s_r^2 on [1, F_r^2], weights renewed until they stay (Fisher
-    scoring). The common pattern of the repeats costs one degree of freedom per repeat number but one.
+    s0 is in the force's unit, g without unit. Maximum likelihood of the run variances, s_r^2 ~ sd^2(F_r)
+    chi^2(n_r - 1) / (n_r - 1), with s0^2 and g^2 not below zero: weighted least squares of s_r^2 on [1,
+    F_r^2], weights renewed until they stay (Fisher scoring). The common pattern of the repeats costs one
+    degree of freedom per repeat number but one.
     """
     means = repeat_means(steady)
     force_N, kept = means["force_N"].to_numpy(float), np.ones(len(means), bool)

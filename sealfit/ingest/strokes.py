@@ -220,10 +220,8 @@ def several_speeds(speeds: Sequence[float]) -> list[float]:
     --------
     >>> several_speeds([5.0, 5.0, 1.0, 1.0]), several_speeds([5.0, 5.0, 5.0, 1.0])
     ([1.0, 5.0], [])
-    >>> several_speeds([1.0, 2.0, 4.0])
-    [1.0, 2.0, 4.0]
-    >>> several_speeds([5.0, -8.0, 5.0, -8.0])
-    []
+    >>> several_speeds([1.0, 2.0, 4.0]), several_speeds([5.0, -8.0, 5.0, -8.0])
+    ([1.0, 2.0, 4.0], [])
     """
     forward = _several([speed for speed in speeds if speed > 0])
     return forward or _several([-speed for speed in speeds if speed < 0])

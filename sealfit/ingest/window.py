@@ -371,10 +371,8 @@ def _last(mask: np.ndarray) -> int | None:
 def transient_rows(force_N: np.ndarray) -> int:
     """Return how many of the first rows of a steady window are a transient that the law did not reach.
 
-    The force of n rows is cut into parts. A first part whose mean is far off the parabola through later ones
-    is left out, with the second if that is off, too: a rise or an overshoot of a few samples at a high speed
-    is not fitted, and an effect of so short a distance could not be told from it. Of the reversed force it is
-    the number of last rows.
+    A first part whose mean is far off the parabola through later ones is left out, with the second if that is
+    off, too: an effect of so short a distance could not be told from a rise or an overshoot of a few samples.
     """
     size = len(force_N) // PARTS
     if size < 1:
