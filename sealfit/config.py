@@ -282,7 +282,7 @@ class Files(Strict):
     @model_validator(mode="after")
     def _parts_are_there(self) -> Files:
         if self.name_pattern is None and (self.columns or self.compute):
-            from sealfit.ingest.file_names import name_parts
+            from sealfit.ingest.listing import name_parts
 
             name_parts("", self, {})
         return self

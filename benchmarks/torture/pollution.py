@@ -48,7 +48,7 @@ from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.config import load_config, parse_config
 from sealfit.errors import Fault, SealfitError
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.property_table import read_properties
 from sealfit.ingest.reader import read_trace
 from sealfit.pipeline import STEPS, run

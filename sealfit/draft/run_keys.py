@@ -17,9 +17,8 @@ from sealfit.draft.dialect import CLOCK, Dialect
 from sealfit.draft.file_names import FEW, HEIGHT_FROM, NamePart, Names
 from sealfit.draft.files_found import Found, RunsTable
 from sealfit.errors import ConfigError
-from sealfit.ingest.file_names import channels_of, name_parts
 from sealfit.ingest.files import as_number
-from sealfit.ingest.listing import RUNS_CSV, natural
+from sealfit.ingest.listing import RUNS_CSV, channels_of, name_parts, natural
 from sealfit.ingest.runs import excel_time, usual_formats
 from sealfit.units import Units, conversion
 

@@ -14,7 +14,7 @@ import pandas as pd
 from sealfit.config import Bins, Config
 from sealfit.errors import BadFile, Fault
 from sealfit.ingest.cells import Trace
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.files import placed, read_marked
 from sealfit.ingest.quality import beginnings, load_checks, rising_faults, speed_column_faults, stroke_faults
 from sealfit.ingest.reader import parse_trace

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -82,6 +82,48 @@ def in_order(columns: Columns) -> Columns:
     filled = {name: known(column) for name, column in columns.items()}
     first = {name: int(there.argmax()) for name, there in filled.items() if there.any()}
     return {name: columns[name] for name in sorted(first, key=first.__getitem__)}
+
+
+@dataclass(frozen=True, slots=True)
+class TraceRef:
+    """One trace file and all that runs.csv, its name, header or constant columns say of the whole file.
+
+    `file` is relative to the campaign folder, with forward slashes. `channels` always holds `run_id`,
+    `repeat`, `specimen_id` and the condition columns (day 0 may lack those other than the days); what is not
+    known is not there. `cut` says that the file may end within a number.
+    """
+
+    file: str
+    channels: Mapping[str, float | str]
+    cut: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Listing(Sequence[TraceRef]):
+    """The trace files of a campaign, or some of them, in order.
+
+    `columns` hold the channels, `conditions` words; files of `cut` may end within a number.
+    """
+
+    files: list[str]
+    columns: Columns
+    conditions: list[str]
+    cut: frozenset[str] = frozenset()
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, i: int) -> TraceRef:
+        known = ((name, column[i]) for name, column in self.columns.items())
+        channels = {name: value for name, value in known if value is not None}
+        return TraceRef(self.files[i], channels, self.files[i] in self.cut)
+
+    def take(self, files: np.ndarray) -> Listing:
+        """Return some of the files, by their numbers, with the columns in which any of them has a value."""
+        columns = taken(self.columns, files)
+        filled = {name: c for name, c in columns.items() if any(value is not None for value in c)}
+        own = [self.files[i] for i in files]
+        return Listing(own, filled, [self.conditions[i] for i in files], self.cut.intersection(own))
 
 
 # ---------------------------------------------------------------- conditions

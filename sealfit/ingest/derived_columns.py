@@ -15,8 +15,7 @@ from sealfit.errors import KEPT, NOTED, CampaignError, ConfigError, Fault
 from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.columns import UNAGED, Column, Columns, known, mapped, overlaid, put, where
 from sealfit.ingest.expression import evaluate, parse, require_columns
-from sealfit.ingest.file_names import TEXT_COLUMNS
-from sealfit.ingest.files import as_number
+from sealfit.ingest.files import TEXT_COLUMNS, as_number
 from sealfit.ingest.listing import Entry, stopped
 from sealfit.units import Conversion
 

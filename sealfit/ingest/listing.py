@@ -13,14 +13,16 @@ from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 
-from sealfit.config import Config
-from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, Fault, nearest, printable
+from sealfit.config import Config, Files
+from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, ConfigError, Fault, nearest, printable
 from sealfit.ingest.columns import NO_COLUMN, Columns, mapped, suggestion
-from sealfit.ingest.files import as_number, inside, split_line
+from sealfit.ingest.expression import evaluate, parse
+from sealfit.ingest.files import TEXT_COLUMNS, as_number, found_by, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
 from sealfit.store.manifest import found_by_glob, glob_names
 from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.store.paths import runs_tables
+from sealfit.units import Conversion
 
 KNOWN = (
     "run_id", "repeat", "specimen_id", "temperature_C", "compression_ratio_pct", "aging_days", "load_N",
@@ -338,3 +340,74 @@ def files_beside(campaign: Path, files: Collection[str]) -> set[str]:
             continue
         found.update(below + name for name in names)
     return found.difference(files)
+
+
+# ---------------------------------------------------------------- names
+# What the name of a trace file says: named parts of a pattern, value maps, templates and computed columns.
+
+_FIELD = re.compile(r"\{([^{}]*)\}")
+Named = Mapping[str, float | str]  # what a name says; helpers begin with `_`
+
+
+def name_parts(file: str, settings: Files, conversions: Mapping[str, Conversion]) -> Named | None:
+    """Return what the relative path `file` says under the config's `files`; None if it does not match.
+
+    Every named group of `name_pattern` is a part, with the value of its map where that has one; `compute` and
+    the templates of `columns` then add columns. Empty parts say nothing, nor does what is computed from their
+    numbers. Numbers in other units than ours are converted, those of parts first. ConfigError if a template
+    or an expression reads a part that the pattern does not have, or as `found_by`.
+
+    Examples
+    --------
+    >>> rig = Files(name_pattern=r"(?P<_sign>n?)(?P<_rpm>\\d+)\\.csv", values={"_sign": {"": 1, "n": -1}},
+    ...             compute={"speed_mm_s": "_sign * _rpm"}, columns={"run_id": "{_rpm} rpm"})
+    >>> channels_of(name_parts("n120.csv", rig, {}))
+    {'speed_mm_s': -120.0, 'run_id': '120 rpm'}
+    """
+    texts: dict[str, str] = {}
+    values: dict[str, float | str] = {}
+
+    def say(name: str, text: str, value: float | str) -> None:
+        if name in conversions and isinstance(value, float):
+            value = conversions[name].of_cell(value)
+            text = f"{value:.12g}"
+        texts[name], values[name] = text, value
+
+    if settings.name_pattern is not None:
+        match = found_by(settings.name_pattern, file, whole=True)
+        if match is None:
+            return None
+        for name, text in match.groupdict(default="").items():
+            known = settings.values.get(name, {})
+            mapped = known.get(text, text)
+            stays = text in known or name in (*TEXT_COLUMNS, *settings.text_parts)
+            if isinstance(mapped, int | float):
+                say(name, f"{mapped:g}", float(mapped))
+            else:
+                say(name, mapped, mapped if stays else _value(mapped))
+    for name, expression in settings.compute.items():
+        value = float(evaluate(parse(expression), values))
+        absent = any(values[part] == "" for part in parse(expression).numbers)
+        say(name, *(("", "") if absent else (f"{value:g}", value)))
+    for name, template in settings.columns.items():
+        text = _FIELD.sub(lambda found: _part(found.group(1), texts, template), template)  # noqa: B023
+        say(name, text, text if name in TEXT_COLUMNS else _value(text))
+    return {name: value for name, value in values.items() if value != "" or name.startswith("_")}
+
+
+def channels_of(named: Named | None, helpers: Collection[str] = ()) -> dict[str, float | str]:
+    """Return what a name says, of the helpers only those asked for; nothing where it does not match."""
+    said = (named or {}).items()
+    return {name: v for name, v in said if v != "" and (not name.startswith("_") or name in helpers)}
+
+
+def _value(text: str) -> float | str:
+    number = as_number(text)
+    return text if number is None else number
+
+
+def _part(name: str, texts: Mapping[str, str], template: str) -> str:
+    if name not in texts:
+        reason = f"template {template!r} reads a part '{name}' that the name has not."
+        raise ConfigError(reason, fix=f"Parts: {', '.join(texts) or 'none'}.")
+    return texts[name]

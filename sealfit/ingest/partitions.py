@@ -16,9 +16,8 @@ import pyarrow as pa
 from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.averages import ALONG, FileStrokes, bin_table, mean_traces, read_strokes
-from sealfit.ingest.columns import columns_of, condition_columns, keys_of
+from sealfit.ingest.columns import Listing, columns_of, condition_columns, keys_of
 from sealfit.ingest.derived_columns import of_one_speed
-from sealfit.ingest.file_names import Listing
 from sealfit.ingest.files import as_number
 from sealfit.ingest.strokes import several_speeds
 from sealfit.store import parquet

@@ -15,6 +15,7 @@ from sealfit.ingest.cells import Trace, body_of, checked_cells, clean, read_cell
 from sealfit.ingest.columns import (
     RESERVED,
     SLOTS,
+    TraceRef,
     beside,
     channel_columns,
     header_units,
@@ -23,7 +24,6 @@ from sealfit.ingest.columns import (
     required,
 )
 from sealfit.ingest.expression import Expression, evaluate, parse
-from sealfit.ingest.file_names import TraceRef, name_parts
 from sealfit.ingest.files import (
     HEAD_BYTES,
     FileLayout,
@@ -40,6 +40,7 @@ from sealfit.ingest.files import (
     without_footer,
 )
 from sealfit.ingest.formats import OF_ARRAYS, Arrays, kind_of, read_arrays
+from sealfit.ingest.listing import name_parts
 from sealfit.ingest.workbooks import read_sheet
 from sealfit.units import conversion
 

@@ -20,13 +20,15 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.errors import BadFile, CampaignError, ConfigError, Fault, nearest
+from sealfit.errors import BadFile, CampaignError, ConfigError, Fault, nearest, shortened
 from sealfit.ingest import derived_columns as derived
 from sealfit.ingest.averages import with_strokes
 from sealfit.ingest.columns import (
     RESERVED,
     Column,
     Columns,
+    Listing,
+    TraceRef,
     beside,
     columns_of,
     condition_columns,
@@ -41,10 +43,9 @@ from sealfit.ingest.columns import (
     where,
 )
 from sealfit.ingest.expression import parse, read_by
-from sealfit.ingest.file_names import Listing, TraceRef, channels_of, fits_up_to, name_parts, unmatched
-from sealfit.ingest.files import as_number, bad_file, cut_files, placed, read_bytes
+from sealfit.ingest.files import as_number, bad_file, cut_files, found_by, placed, read_bytes
 from sealfit.ingest.formats import kind_of
-from sealfit.ingest.listing import Entry, list_entries, misspelt
+from sealfit.ingest.listing import Entry, channels_of, list_entries, misspelt, name_parts
 from sealfit.ingest.reader import read_header, read_trace
 from sealfit.ingest.strokes import several_speeds
 from sealfit.ingest.trace_checks import measured_speeds
@@ -278,6 +279,33 @@ def _named(entries: list[Entry], config: Config) -> tuple[list[int], Columns, li
         reason = f"none of {len(entries)} files is matched; of this one, the nearest, {nearest.reason}"
         raise CampaignError([replace(nearest, reason=reason, severity="error", action="stopped")])
     return kept, columns_of(parts), faults
+
+
+def fits_up_to(pattern: str, file: str) -> str:
+    """Return the longest beginning of a path with which a match of the pattern can begin.
+
+    Examples
+    --------
+    >>> fits_up_to(r"T(?P<T>\\d+)_d(?P<aging_days>\\d+)[.]csv", "T80_C20_d4.csv")
+    'T80_'
+    """
+    begins = (file[:length] for length in range(len(file), 0, -1))
+    with suppress(ConfigError):  # it takes too long
+        return next((begin for begin in begins if found_by(pattern, begin, whole=True, cut=True)), "")
+    return ""
+
+
+def unmatched(file: str, pattern: str) -> tuple[str, str]:
+    """Return why a path does not match the config's pattern, without the path, and the fix."""
+    begin = fits_up_to(pattern, file)
+    up_to = f"it fits up to '{begin}', then" if begin else "from its start"
+    rest = f"'{shortened(file[len(begin) :], 30)}'" if begin != file else "nothing more"
+    where = f"{up_to} the path has {rest}"
+    reason = f"the whole path below the campaign folder does not match files.name_pattern: {where}."
+    fix = "Rename it, widen the pattern, or list it under files.exclude."
+    if "/" in file and found_by(pattern, file.rpartition("/")[2], whole=True):
+        fix = "The pattern matches the name without its folders: begin it with '(?:.*/)?'."
+    return reason, fix
 
 
 def _headers(campaign: Path, entries: list[Entry], config: Config) -> Columns:

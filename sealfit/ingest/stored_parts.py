@@ -17,7 +17,7 @@ import pyarrow as pa
 from sealfit import __version__
 from sealfit.config import Config
 from sealfit.errors import Fault, disk
-from sealfit.ingest.file_names import Listing
+from sealfit.ingest.columns import Listing
 from sealfit.ingest.partitions import SAMPLED, Asked, Columns, PartitionResult, read_part
 from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints

@@ -11,7 +11,7 @@ from sealfit.draft import draft
 from sealfit.draft.columns import moving_strokes, stroke_count
 from sealfit.draft.dialect import sniff
 from sealfit.draft.vocabulary import AFTER, column_role, name_and_unit, setting
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.files import as_utf8
 from sealfit.ingest.reader import read_trace
 from sealfit.units import UNITS, Units, conversion

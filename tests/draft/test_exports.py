@@ -15,7 +15,7 @@ from sealfit.config import parse_config
 from sealfit.draft import draft
 from sealfit.draft.dialect import settings_in, started_in
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.reader import read_trace
 
 ROUNDED = 6e-4  # s, mm, N: the coarsest export writes three decimals

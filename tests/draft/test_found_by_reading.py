@@ -8,7 +8,7 @@ import pytest
 from sealfit.config import parse_config
 from sealfit.draft import draft
 from sealfit.errors import RequestError
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
 

@@ -6,7 +6,7 @@ import numpy.testing as npt
 
 from sealfit.config import load_config, parse_config
 from sealfit.draft import draft
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
 

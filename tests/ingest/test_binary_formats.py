@@ -29,7 +29,7 @@ from sealfit.commands import check
 from sealfit.errors import BadFile, CampaignError
 from sealfit.ingest import formats
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.reader import read_header, read_trace
 from sealfit.pipeline import ingest
 

@@ -11,8 +11,8 @@ from trace_helpers import DAYS, HEADER, ROWS, campaign, channels, config, csv_of
 from sealfit.errors import CampaignError, ConfigError
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.cells import seconds_of_day
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.expression import evaluate, parse
-from sealfit.ingest.file_names import TraceRef
 from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
 from sealfit.units import Units

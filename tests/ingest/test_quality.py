@@ -5,7 +5,7 @@ import pytest
 from sealfit.config import Config, Quality, Strokes, parse_config
 from sealfit.errors import Fault
 from sealfit.ingest.averages import read_strokes
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.quality import (
     improbable_loads,
     incomplete_columns,

@@ -12,7 +12,7 @@ from sealfit.config import parse_config
 from sealfit.errors import BadFile, ConfigError
 from sealfit.ingest.averages import with_strokes
 from sealfit.ingest.cells import decimal_fix
-from sealfit.ingest.file_names import TraceRef
+from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.reader import read_trace
 from sealfit.ingest.trace_checks import speed_fault
 
