@@ -18,15 +18,7 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sealfit.config import Strokes
-from sealfit.ingest.window import (
-    SAME_SPEED,
-    SPEED_NOISE,
-    STANDSTILL,
-    slope,
-    speed_along,
-    steady_window,
-    stretches,
-)
+from sealfit.ingest.window import SAME_SPEED, SPEED_NOISE, STANDSTILL, speed_along, steady_window, stretches
 
 # Share of the travel of a motion that a steady speed covers at least. It is ten times what counts as a rest
 # (`_bounds`), so that no creep is one; 1, 3, 10 and 30 mm/s for equal times cover 2 % and more.
@@ -209,6 +201,20 @@ def steady_speeds(
         cuts.append(cut)
         begins.append(cut if rested else rows.start)
     return list(zip(map(slice, cuts, [*cuts[1:], n]), begins, strict=True))
+
+
+def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -> float:
+    """Return the slope of displacement over time by least squares, one for all pieces of a steady window.
+
+    Each piece (between rests) has an intercept, so a rest is no slow sliding. NaN without samples.
+    """
+    product = square = 0.0
+    for first, stop in stretches(steady):
+        t, d = time_s[first:stop], displacement_mm[first:stop]
+        t = t - t.mean()
+        product += float(t @ (d - d.mean()))
+        square += float(t @ t)
+    return product / square if square > 0.0 else np.nan
 
 
 def several_speeds(speeds: Sequence[float]) -> list[float]:

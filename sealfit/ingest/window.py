@@ -205,20 +205,6 @@ def first_motion(force_N: np.ndarray, since: int) -> int:
     return since if still is None else since + still
 
 
-def slope(time_s: np.ndarray, displacement_mm: np.ndarray, steady: np.ndarray) -> float:
-    """Return the slope of displacement over time by least squares, one for all pieces of a steady window.
-
-    Each piece (between rests) has an intercept, so a rest is no slow sliding. NaN without samples.
-    """
-    product = square = 0.0
-    for first, stop in stretches(steady):
-        t, d = time_s[first:stop], displacement_mm[first:stop]
-        t = t - t.mean()
-        product += float(t @ (d - d.mean()))
-        square += float(t @ t)
-    return product / square if square > 0.0 else np.nan
-
-
 def _settles(time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, tolerance: float) -> bool:
     """Return whether the speed, a parabola fitted over time, stays within the tolerance of one value.
 

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 
 from sealfit.config import Strokes
 from sealfit.ingest.presliding import MotionStart, rise_of
-from sealfit.ingest.strokes import displacement_noise_mm, find_strokes, steady_speeds, turning_rows
-from sealfit.ingest.window import slope
+from sealfit.ingest.strokes import displacement_noise_mm, find_strokes, slope, steady_speeds, turning_rows
 
 
 def stroke(
