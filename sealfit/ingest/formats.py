@@ -139,10 +139,7 @@ def _column(values: np.ndarray) -> np.ndarray | None:
 
 
 def _arrays(header: list[str], found: Mapping[str, np.ndarray], settings: TraceFormat) -> Arrays:
-    """Return named columns; those shorter than the longest, or of other things, are left out and named.
-
-    BadFile if one of these is a column that the config names.
-    """
+    """Return named columns, without those of another length or kind; BadFile if the config names one."""
     kept, faults, by_place = {}, [], dict(enumerate(found, start=1))
     needed = {by_place.get(own, own) for own in settings.their_columns.values()}
     lengths = {len(values) for name, values in found.items() if name in needed}

@@ -140,10 +140,7 @@ def read_table(
 
 
 def _header(numbered: list[tuple[int, str]], delimiter: str, config: Config) -> tuple[int, str, list[str]]:
-    """Return number, delimiter and cells of the first line with the name of a known column, or of the first.
-
-    Lines above it are titles. The delimiter is found out where it is "".
-    """
+    """Return number, delimiter and cells of the first line that names a known column, else of the first."""
     theirs = (str(own.name) for own in config.files.runs_columns.values())
     known = {"file", *KNOWN, *config.condition, *theirs}
     found = []

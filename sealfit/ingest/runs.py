@@ -254,10 +254,7 @@ def _stop_at_errors(faults: Sequence[Fault], campaign: Path | None = None, files
 
 
 def _named(entries: list[Entry], config: Config) -> tuple[list[int], Columns, list[Fault]]:
-    """Return which files to keep, by their numbers, what their names say, and findings.
-
-    A file found by the glob whose name says nothing is left out.
-    """
+    """Return which files to keep, what their names say, and findings; of the glob only those that match."""
     kept, parts, faults = [], [], []
     for i, entry in enumerate(entries):
         try:
@@ -321,10 +318,7 @@ def _headers(campaign: Path, entries: list[Entry], config: Config) -> Columns:
 
 
 def _lacking(columns: Columns, files: int, config: Config) -> dict[str, np.ndarray]:
-    """Return which of so many files lack each condition column, shape (files,).
-
-    Unaged rubber needs only the days and the rubber.
-    """
+    """Return which files lack each condition column; unaged rubber needs only the days and the rubber."""
     none, names = [None] * files, condition_columns(config)
     unaged = where(columns.get("aging_days", none), lambda days: days == 0)
     always = ("aging_days", *config.rubber) if config.aging else names
@@ -377,10 +371,7 @@ def _from_traces(
 
 
 def _constant(name: str, values: pd.Series, *, wanted: bool) -> float | str | None:
-    """Return the value of a column of a trace; None if it varies, where no constant is wanted.
-
-    BadFile if it varies where one is wanted, or is text where a number is needed.
-    """
+    """Return the value of a column of a trace; None, or BadFile where it is `wanted`, if it varies."""
     value = values.iloc[0]
     if (values != value).any():
         if not wanted:

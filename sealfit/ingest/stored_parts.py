@@ -201,10 +201,7 @@ def asked_again(
 
 
 def _common_columns(parts: Sequence[PartitionResult]) -> Columns:
-    """Return the columns of each table over all parts; numbers beside words are words.
-
-    Tables of one folder must agree: a reader takes the columns of the first file for those of all.
-    """
+    """Return the columns of each table over all parts, which must agree; numbers beside words are words."""
     common: dict[str, dict[str, str]] = {name: {} for name in SAMPLED}
     for columns in (part.columns for part in parts):
         for table, types in columns.items():

@@ -206,10 +206,7 @@ def first_motion(force_N: np.ndarray, since: int) -> int:
 
 
 def _settles(time_s: np.ndarray, along_mm: np.ndarray, noise_mm: float, tolerance: float) -> bool:
-    """Return whether the speed, a parabola fitted over time, stays within the tolerance of one value.
-
-    Ripples of the speed do not count. A sine wave changes by 24 % where it is above 0.9 of its plateau.
-    """
+    """Return whether the speed, a parabola over time that no ripple moves, stays within the tolerance."""
     n = len(time_s)
     if n < 2 * LEAST_SAMPLES:
         return True

@@ -61,10 +61,7 @@ def _rows(book) -> dict[str, int]:
 
 @contextmanager
 def _book(raw: bytes, *, formulas: bool, by_row: bool = True) -> Iterator:
-    """Open a workbook with its formulas or with the values that Excel kept of them.
-
-    Read `by_row` it takes little memory, and does not say which cells are merged.
-    """
+    """Open a workbook with its formulas or their values; `by_row` in little memory, without merged cells."""
     _refuse_others(raw)
     openpyxl = library("openpyxl", "xlsx")
     options = {"read_only": by_row, "data_only": not formulas, "keep_links": False}
