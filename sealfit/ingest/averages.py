@@ -317,13 +317,12 @@ def _stroke_rows(
     """Return a row for every stroke, and what was found in them."""
     several, unit = len(strokes) > 1, config.units.unit("force")
     rows, faults = [], []
-    time_s, force = trace.columns["time_s"], trace.columns["force_N"]
     for stroke in strokes:
         row = {**trace.channels, **_means(stroke, samples), "file": file}
         row |= {"stroke": int(samples["stroke"][stroke.start]), "direction": stroke.direction}
         row |= {"speed_mm_s": config.units.speed_factor * stroke.speed_mm_s}
         row |= {"several": several, "several_speeds": stroke.several_speeds}
-        found = stroke_faults(stroke, time_s, force, trace.line, trace.number, config.quality)
+        found = stroke_faults(stroke, trace, config.quality)
         used = not any(fault.action == "stroke left out" for fault in found)
         if used:
             found += rising_faults(row["left"], row["force_N"], unit)

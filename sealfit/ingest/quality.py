@@ -49,19 +49,8 @@ STILL_RISING = 0.01
 MEASURE_AGAIN = "Check the cable and the logger, and measure again."
 
 
-def stroke_faults(
-    stroke: Stroke,
-    time_s: np.ndarray,
-    force_N: np.ndarray,
-    line: np.ndarray,
-    number: np.ndarray,
-    settings: Quality,
-) -> list[Fault]:
-    """Return what is wrong with one stroke by itself, without its file: short, gappy, saturated, stuck.
-
-    The arrays, shape (n,), are the whole trace, the line in the file of each of its rows, and the number of
-    each before the config's `keep`: rows that it filters out are no gap.
-    """
+def stroke_faults(stroke: Stroke, trace: Trace, settings: Quality) -> list[Fault]:
+    """Return what is wrong with one stroke of a trace by itself: short, gappy, saturated, stuck."""
     if stroke.short is not None:
         reason, samples = stroke.short, float(len(stroke.rows))
         fix = "Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config."
@@ -76,8 +65,8 @@ def stroke_faults(
         speed = float(stroke.speed_mm_s)
         found = [Fault("no_plateau", reason, column="speed_mm_s", value=speed, fix=fix, **KEPT)]
     whole, steady = slice(stroke.start, stroke.stop), stroke.rows
-    found += _gaps(time_s[whole], line[whole], number[whole], settings)
-    force_N, line = force_N[steady], line[steady]
+    found += _gaps(trace.columns["time_s"][whole], trace.line[whole], trace.number[whole], settings)
+    force_N, line = trace.columns["force_N"][steady], trace.line[steady]
     return found + (_saturated(force_N, line, settings) or _stuck(force_N, line, settings))
 
 
@@ -95,6 +84,7 @@ def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:
 
 
 def _gaps(time_s: np.ndarray, line: np.ndarray, number: np.ndarray, settings: Quality) -> list[Fault]:
+    """Return gaps in time; rows that the config's `keep` filtered out, which `number` counts, are none."""
     rows, lengths = np.diff(number), np.diff(time_s)
     steps = lengths / rows
     usual = float(np.median(steps))

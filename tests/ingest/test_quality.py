@@ -5,6 +5,7 @@ import pytest
 from sealfit.config import Config, Quality, Strokes, parse_config
 from sealfit.errors import Fault
 from sealfit.ingest.averages import read_strokes
+from sealfit.ingest.cells import Trace
 from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.quality import (
     improbable_loads,
@@ -32,11 +33,18 @@ def trace(n=1000, noise=0.1, step=0.0, seed=0, ripple=0.0):
     return time, x, np.round(force / step) * step if step else force
 
 
+def rows_of(time, force, line=None, number=None):
+    number = np.arange(len(time)) if number is None else number
+    line = 2 + number if line is None else line
+    return Trace(
+        {"time_s": time, "force_N": force}, line, np.zeros(len(time), bool), len(time), number=number
+    )
+
+
 def checks(time, x, force, **quality):
     config = Config(quality=Quality(**quality))
     (stroke,) = find_strokes(time, x, force, config.strokes)
-    number = np.arange(len(time))
-    return stroke_faults(stroke, time, force, 2 + number, number, config.quality)
+    return stroke_faults(stroke, rows_of(time, force), config.quality)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -79,8 +87,7 @@ def blamed(force):
     none = np.zeros(len(force))
     stroke = Stroke(1, 0, len(force), 0, 1, 5.0, every, every, none, none + 5.0)
     time = np.linspace(0.0, 8.0, len(force))
-    number = np.arange(len(force))
-    return [f.check for f in stroke_faults(stroke, time, force, 2 + number, number, Quality())]
+    return [f.check for f in stroke_faults(stroke, rows_of(time, force), Quality())]
 
 
 def test_a_few_samples_of_a_short_stroke_may_share_its_extreme():
@@ -141,7 +148,7 @@ def test_the_longest_gap_is_told_as_long_as_it_is_over_rows_filtered_out():
     kept = np.r_[0:400, 600:1000]
     number = np.r_[0:400, 410:810]  # 190 rows are lost, and 10 are filtered out
     (stroke,) = find_strokes(time[kept], x[kept], force[kept], Strokes())
-    (fault,) = stroke_faults(stroke, time[kept], force[kept], 2 + kept, number, Quality())
+    (fault,) = stroke_faults(stroke, rows_of(time[kept], force[kept], 2 + kept, number), Quality())
     assert "after this line, is 1.61 where 0.00801 is usual" in fault.reason
 
 
@@ -150,7 +157,7 @@ def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
     x = -10.0 * np.cos(0.5 * np.pi * time)
     force = 20.0 + 0.1 * np.gradient(x, time)
     (stroke,) = find_strokes(time, x, force, Strokes(min_steady_share=0.6))
-    (fault,) = stroke_faults(stroke, time, force, np.arange(200), np.arange(200), Quality())
+    (fault,) = stroke_faults(stroke, rows_of(time, force), Quality())
     assert fault.check == "too_short"
     assert fault.fix.startswith("Drive at a constant speed. ")
     assert "strokes.min_samples" in fault.fix  # of a sinusoidal motion nothing else can be changed
@@ -160,7 +167,7 @@ def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
 def test_a_stroke_too_short_says_what_is_needed():
     time, x, force = trace(n=18)
     (stroke,) = find_strokes(time, x, force, Strokes())
-    (fault,) = stroke_faults(stroke, time, force, np.arange(18), np.arange(18), Quality())
+    (fault,) = stroke_faults(stroke, rows_of(time, force), Quality())
     assert (fault.check, fault.action) == ("too_short", "stroke left out")
     assert "at least 20 are needed" in fault.reason
     assert "strokes.min_samples" in fault.fix
