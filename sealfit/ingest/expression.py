@@ -170,7 +170,7 @@ class _Checked:
             case ast.BoolOp(op=op, values=parts):
                 self.require_conditions(parts)
                 return lambda *values: reduce(_OPERATORS[type(op)], values), parts
-            case ast.Compare(left=left, ops=ops, comparators=sides) if {*map(type, ops)} <= {*_OPERATORS}:
+            case ast.Compare(left=left, ops=ops, comparators=sides) if set(map(type, ops)) <= set(_OPERATORS):
                 return lambda *values: _compared(ops, values), [left, *sides]
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
                 function, fewest, most = FUNCTIONS[name]

@@ -213,7 +213,8 @@ def _two_runs(strokes: Mapping[str, list]) -> list[str]:
         if used:
             ways[run, None].add(way)
     both = {run for (run, _), found in ways.items() if len(found) > 1}
-    return [run + way * (run in both) for run, way in zip(strokes["run_id"], signs, strict=True)]
+    named = zip(strokes["run_id"], signs, strict=True)
+    return [f"{run}{way}" if run in both else run for run, way in named]
 
 
 def _array(values: Sequence[object]) -> pa.Array:

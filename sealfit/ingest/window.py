@@ -75,7 +75,7 @@ def steady_window(
     its plateau.
     """
     n = len(time_s)
-    steady, sliding, left, length = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n), 0.0
+    steady, sliding, left, length, settles = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n), 0.0, True
     if n < LEAST_SAMPLES:
         return Window(steady, sliding, left, length)
     # A glitch of one sample is not a rest.
@@ -89,7 +89,6 @@ def steady_window(
     if plateau <= 0.0:
         return Window(steady, sliding, left, length)
     fast = speed >= (1.0 - tolerance) * plateau
-    settles = True
     stroke, since = _StrokeMotion(time_s, along_mm, speed, fast, plateau, half), 0 if blurred else origin
     for first, last in stroke.moving(moves):
         still = stroke.standstill(since, first)
