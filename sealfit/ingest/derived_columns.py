@@ -201,10 +201,7 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
 
 
 def swapped_columns(entries: list[Entry], columns: Columns) -> list[Fault]:
-    """Return that unaged rubber has 100 degrees and a compression other than 100, as if these were swapped.
-
-    Day 0 may have temperature and compression of an aged condition.
-    """
+    """Return that unaged rubber of no aged condition has 100 °C and compression, as if these were swapped."""
     none = [None] * len(entries)
     days, *others = (columns.get(name, none) for name in ("aging_days", *_AGED_ONLY))
     pairs = list(zip(*others, strict=True))
@@ -216,9 +213,6 @@ def swapped_columns(entries: list[Entry], columns: Columns) -> list[Fault]:
             return [entry.fault("swapped_columns", reason, _AGED_ONLY[0], value=pair[0], fix=fix, **KEPT)]
     return []
 
-
-# ---------------------------------------------------------------- derive
-# Everything here works on what is already known of each file, and reads none.
 
 # Share by which commanded speeds and loads of one setting differ at most; a plate or a step is more.
 SETTING = 0.005

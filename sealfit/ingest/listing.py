@@ -113,8 +113,7 @@ def read_table(
     try:
         text, delimiter = text_of_runs(folder, table, config)
     except BadFile as error:
-        place = {"file": table, "line": error.fault.line, "column": error.fault.column}
-        raise stopped(error.fault.check, error.fault.reason, error.fault.fix, **place) from error
+        raise CampaignError([replace(error.fault, file=table, action="stopped")]) from error
     whole = text.decode().split("\n")
     numbered = [(number, line) for number, line in enumerate(whole, start=1) if line.strip(" \t,;")]
     place, delimiter, header = _header(numbered[:TITLE_LINES], delimiter, config)

@@ -1,8 +1,7 @@
 """The trace files of a campaign and everything that is known of each before it is fitted to anything.
 
-What runs.csv, the file name, the header lines and the constant columns of the trace say is put together here,
-in this order of precedence; runs, repeats, specimens and the order of the campaign are derived where they are
-not given.
+Runs.csv goes before the file name, that before the header lines, and these before the constant columns of the
+trace. Runs, repeats, specimens and the order of the campaign are derived where they are not given.
 """
 
 from __future__ import annotations
