@@ -205,8 +205,6 @@ def profiled() -> Iterator[list[TimedPart]]:
 def timed(name: str, rows: int | None = None, of: str = "") -> Iterator[TimedPart]:
     """Take the time of the block, where somebody asked for it; rows may be told while it runs.
 
-    Examples
-    --------
     >>> with profiled() as parts, timed("ingest"), timed("reading", rows=3, of="files"):
     ...     pass
     >>> [(part.step, part.part, part.rows, part.of) for part in parts]

@@ -26,8 +26,6 @@ SENSITIVITY = ["variable", "level", "acts_on", "smallest_N", "smallest_pct", "fi
 def with_units(frame: pd.DataFrame, units: Units, schema: Schema | None = None) -> pd.DataFrame:
     """Return the frame with `attrs["units"]`, the true unit by column, and with a schema `attrs["meaning"]`.
 
-    Examples
-    --------
     >>> with_units(pd.DataFrame({"force_N": [1.0], "n": [2]}), Units({"force": ("torque", "mN m")})).attrs
     {'units': {'force_N': 'mN m'}}
     """

@@ -28,12 +28,8 @@ def known(value: object) -> bool:
 def number(value: float | None, digits: int = 3) -> str:
     """Return `value` to `digits` significant digits; a dash if there is none.
 
-    Examples
-    --------
-    >>> number(0.61234), number(-12.3456), number(1752.4), number(0.0), number(None)
-    ('0.612', '−12.3', '1752', '0', '–')
-    >>> number(1.234e-5)
-    '1.23\u202f×\u202f10⁻⁵'
+    >>> number(0.61234), number(-12.3456), number(1752.4), number(0.0), number(1.234e-5)
+    ('0.612', '−12.3', '1752', '0', '1.23\u202f×\u202f10⁻⁵')
     """
     if isinstance(value, float) and math.isinf(value):
         return "∞" if value > 0 else "−∞"
@@ -50,22 +46,16 @@ def number(value: float | None, digits: int = 3) -> str:
 def given(value: float | None, digits: int = 3) -> str:
     """Return a number that was set, without trailing zeros.
 
-    Examples
-    --------
     >>> given(0.5), given(10.02), given(1752.0)
     ('0.5', '10', '1752')
     """
-    if not known(value):
-        return NOTHING
-    text = number(value, digits)
+    text = number(value, digits) if known(value) else NOTHING
     return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
 
 
 def decimals(size: float, digits: int = 2) -> int:
     """Return how many decimals show `size` to `digits` significant digits; negative left of the point.
 
-    Examples
-    --------
     >>> decimals(0.0123), decimals(0.0996), decimals(3.4), decimals(456.0)
     (3, 2, 1, -1)
     """
@@ -79,16 +69,8 @@ def decimals(size: float, digits: int = 2) -> int:
 def measured(value: float | None, lo: float | None, hi: float | None) -> tuple[str, str]:
     """Return a value and its interval, rounded to two significant digits of the interval's shorter side.
 
-    Examples
-    --------
-    >>> measured(0.83512, 0.8214, 0.8489)
-    ('0.835', '[0.821, 0.849]')
-    >>> measured(6.123, 5.513, 6.7012)
-    ('6.12', '[5.51, 6.70]')
-    >>> measured(1.5, 0.25, 21.0)
-    ('1.5', '[0.2, 21.0]')
-    >>> measured(4.0, None, None), measured(4.0, None, 5.5)
-    (('4.00', '–'), ('4.00', 'up to 5.50'))
+    >>> measured(6.123, 5.513, 6.7012), measured(1.5, 0.25, 21.0), measured(4.0, None, 5.5)
+    (('6.12', '[5.51, 6.70]'), ('1.5', '[0.2, 21.0]'), ('4.00', 'up to 5.50'))
     """
     if not known(value):
         return NOTHING, NOTHING
@@ -106,13 +88,7 @@ def measured(value: float | None, lo: float | None, hi: float | None) -> tuple[s
 
 
 def together(values: Sequence[float | None], digits: int = 2) -> list[str]:
-    """Return numbers of one unit with the same decimals: the smallest shows `digits` significant ones.
-
-    Examples
-    --------
-    >>> together([1.4234, 0.3121, 0.2899, None])
-    ['1.42', '0.31', '0.29', '–']
-    """
+    """Return numbers of one unit with the same decimals: the smallest shows `digits` significant ones."""
     sizes = [abs(value) for value in values if known(value) and value != 0]
     if not sizes:
         return [number(value) for value in values]
@@ -123,13 +99,7 @@ def together(values: Sequence[float | None], digits: int = 2) -> list[str]:
 
 
 def p_value(p: float | None) -> str:
-    """Return a p-value with its sign: "= 0.012", "< 0.001".
-
-    Examples
-    --------
-    >>> p_value(0.0123), p_value(0.00012), p_value(0.0512), p_value(0.8), p_value(None)
-    ('= 0.012', '< 0.001', '= 0.051', '= 0.80', 'not available')
-    """
+    """Return a p-value with its sign: "= 0.012", "< 0.001"."""
     if not known(p):
         return "not available"
     if p < 0.001:
@@ -140,26 +110,12 @@ def p_value(p: float | None) -> str:
 
 
 def of_unit(text: str, unit: str) -> str:
-    """Return a number with its unit, without a line break between them.
-
-    Examples
-    --------
-    >>> of_unit("1.5", "mN m")
-    '1.5\xa0mN\xa0m'
-    >>> of_unit("1.5", "")
-    '1.5'
-    """
+    """Return a number with its unit, without a line break between them."""
     return f"{text} {unit}".strip().replace(" ", "\u00a0")
 
 
 def count(n: int, one: str, many: str | None = None) -> str:
-    """Return "1 file", "3 files".
-
-    Examples
-    --------
-    >>> count(1, "series", "series"), count(0, "file"), count(1752, "file")
-    ('1 series', '0 files', '1752 files')
-    """
+    """Return "1 file", "3 files"."""
     return f"{_fixed(float(n), 0)} {one if n == 1 else many or one + 's'}"
 
 
@@ -196,15 +152,7 @@ _SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displ
 
 
 def symbol_html(name: str) -> Markup:
-    """Return a parameter's symbol as HTML: mu_s as an italic mu with an upright s below.
-
-    Other names stay as they are.
-
-    Examples
-    --------
-    >>> str(symbol_html("mu_s")), str(symbol_html("<b>"))
-    ('<i>μ</i><sub>s</sub>', '&lt;b&gt;')
-    """
+    """Return a parameter's symbol as HTML, with an upright s below an italic μ; other names as they are."""
     word, sub = _split(name)
     if word is None:
         return escape(name)
@@ -213,13 +161,7 @@ def symbol_html(name: str) -> Markup:
 
 
 def symbol_plain(name: str) -> str:
-    """Return a parameter's symbol as plain text: "μ_s".
-
-    Examples
-    --------
-    >>> symbol_plain("sigma_2"), symbol_plain("rate")
-    ('σ_2', 'rate')
-    """
+    """Return a parameter's symbol as plain text: "μ_s"."""
     word, sub = _split(name)
     letter = GREEK.get(word, word)
     return name if word is None else f"{letter}_{sub}" if sub else letter
@@ -228,8 +170,6 @@ def symbol_plain(name: str) -> str:
 def symbol_math(name: str) -> str:
     r"""Return a parameter's symbol for a plot, in matplotlib's mathtext.
 
-    Examples
-    --------
     >>> symbol_math("mu_s"), symbol_math("cost$")
     ('$\\mu_{\\mathrm{s}}$', 'cost\\$')
     """
@@ -263,26 +203,12 @@ def _slot(names: Collection[str] = ()) -> re.Pattern:
 
 
 def true_units(text: str, units: Units, names: Collection[str] = ()) -> str:
-    """Return a sentence with each name of a slot, or of `names`, replaced by its quantity and unit.
-
-    Examples
-    --------
-    >>> true_units("force_N is stuck", Units({"force": ("torque", "mN m")}))
-    'torque (mN m) is stuck'
-    """
+    """Return a sentence with each name of a slot, or of `names`, replaced by its quantity and unit."""
     return _slot(names).sub(lambda found: channel_label(found[0], units), str(text))
 
 
 def channel_label(name: str, units: Units) -> str:
-    """Return a channel with its unit, e.g. "sliding distance (mm)"; a campaign's own column keeps its name.
-
-    Examples
-    --------
-    >>> channel_label("displacement_mm", Units({"displacement": ("angle", "turn")}))
-    'angle (turn)'
-    >>> channel_label("batch", Units())
-    'batch'
-    """
+    """Return a channel with its unit: "sliding distance (mm)"; a campaign's own column keeps its name."""
     quantity, unit = channel_words(name, units), units.of(name)
     return f"{quantity} ({unit})" if unit else quantity
 
@@ -290,7 +216,6 @@ def channel_label(name: str, units: Units) -> str:
 def channel_words(name: str, units: Units) -> str:
     """Return a channel's name in words, without its unit."""
     special = {
-        "distance_mm": "sliding distance",
         "displacement_from_mm": f"{units.quantity('displacement')} at the window's start",
         "displacement_to_mm": f"{units.quantity('displacement')} at the window's end",
         "speed_set_mm_s": f"commanded {units.quantity('speed').removeprefix('sliding ')}",
@@ -304,15 +229,7 @@ def channel_words(name: str, units: Units) -> str:
 
 
 def effect_label(effect: Mapping, units: Units) -> str:
-    """Return an effect's label in words, slots and the force by their quantity, without the target.
-
-    Examples
-    --------
-    >>> label = "ripple along displacement_mm, added to force"
-    >>> effect = {"label": label, "channels": ["displacement_mm"], "acts_on": "force"}
-    >>> effect_label(effect, Units())
-    'ripple along displacement'
-    """
+    """Return an effect's label in words, slots and the force by their quantity, without the target."""
     target = rf", (?:added to|factor on) {re.escape(effect['acts_on'])}(?=,|$)"
     force = units.quantity("force").removeprefix("friction ")
     label = re.sub(r"\bforce\b", force, re.sub(target, "", effect["label"]))
@@ -323,8 +240,6 @@ def effect_label(effect: Mapping, units: Units) -> str:
 class ConditionNames:
     """Short names of conditions and series: values with units.
 
-    Examples
-    --------
     >>> names = ConditionNames.of(Config())
     >>> names("temperature_C=60, compression_ratio_pct=80, aging_days=4"), names("unaged"), names.key
     ('60 °C · 80 % · 4 d', 'unaged', 'aging temperature · compression ratio · aging time')
@@ -341,10 +256,8 @@ class ConditionNames:
 
     def __call__(self, text: object) -> str:
         """Return the short name of a condition or series."""
-        parts = self.parts(text)
-        if not parts:
-            return str(text)
-        return " · ".join(self._value(name, value) for name, value in parts.items())
+        values = [self._value(name, value) for name, value in self.parts(text).items()]
+        return " · ".join(values) or str(text)
 
     def parts(self, text: object) -> dict[str, str]:
         """Return {column: value} of a condition's name; empty for "unaged"."""
@@ -361,9 +274,8 @@ class ConditionNames:
     @property
     def key(self) -> str:
         """The names of the values, in their order; "" for a single one."""
-        if len(self.columns) < 2:
-            return ""
-        return " · ".join(channel_words(name, self.units) for name in self.columns)
+        names = [channel_words(name, self.units) for name in self.columns]
+        return " · ".join(names) if len(names) > 1 else ""
 
     def _value(self, name: str, value: str) -> str:
         if not re.fullmatch(r"-?[0-9.]+(e[-+]?[0-9]+)?", value):
@@ -390,18 +302,17 @@ def capital(text: str) -> str:
 # ---------------------------------------------------------------- order
 
 
-def is_number(text: str) -> bool:
-    """Return whether text is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def by_number(text: str) -> tuple[int, float, str]:
     """Return a sort key that puts texts that are numbers by their size and before the others."""
-    return (0, float(text), "") if is_number(text) else (1, 0.0, text)
+    try:
+        return 0, float(text), ""
+    except ValueError:
+        return 1, 0.0, text
+
+
+def is_number(text: str) -> bool:
+    """Return whether text is a number."""
+    return by_number(text)[0] == 0
 
 
 def natural(text: str) -> list[tuple[int, float, str]]:

@@ -36,8 +36,6 @@ Thing = TypeVar("Thing")
 def spread(things: Sequence[Thing], most: int) -> list[Thing]:
     """Return at most `most` of `things`, selected evenly from the first to the last.
 
-    Examples
-    --------
     >>> spread("abcdefghi", 3), spread("ab", 3)
     (['a', 'e', 'i'], ['a', 'b'])
     """
@@ -45,13 +43,7 @@ def spread(things: Sequence[Thing], most: int) -> list[Thing]:
 
 
 def panels_of(things: Sequence[Thing], what: str) -> tuple[list[Thing], str]:
-    """Return the things to draw, a panel each, and a note on the selection; `what` is their plural.
-
-    Examples
-    --------
-    >>> panels_of(range(40), "series")[1]
-    '12 of 40 series are drawn, selected evenly.'
-    """
+    """Return the things to draw, a panel each, and a note on the selection; `what` is their plural."""
     text = f"{MOST_PANELS} of {count(len(things), what, what)} are drawn, selected evenly."
     return spread(things, MOST_PANELS), text if len(things) > MOST_PANELS else ""
 

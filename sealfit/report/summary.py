@@ -239,12 +239,8 @@ def residual_clause(closure: Mapping, units: Units) -> str:
 
 
 def split_channels(text: str | None, known: Collection[str]) -> list[str]:
-    """Return the channel names that `text` joins by spaces.
+    """Return the channel names, some of which may contain spaces, that `text` joins by spaces.
 
-    A column name may contain spaces, so the text is cut at the names in `known`.
-
-    Examples
-    --------
     >>> split_channels("direction oil temp", {"direction", "oil temp"})
     ['direction', 'oil temp']
     """

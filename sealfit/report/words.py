@@ -107,8 +107,6 @@ def target_html(target: str, config: Config) -> Markup:
 def with_symbols(text: object, *, formula: bool = False) -> Markup:
     """Return text as HTML with its parameters as symbols; single letters are parameters in a formula only.
 
-    Examples
-    --------
     >>> str(with_symbols("a mu_0 > 0"))
     'a <i>μ</i><sub>0</sub> &gt; 0'
     >>> str(with_symbols("A exp(-s / s_0) + t^2", formula=True))
