@@ -17,9 +17,7 @@ from typing import Literal
 class Fault:
     """One thing found wrong (or worth saying) in a campaign: where, what, what was done, how to fix it.
 
-    A `Fault` with `severity` "error" stops a run if it concerns the campaign; one that concerns a file or a
-    cell leaves that file or row out (`action`) and the run goes on (design: a fault of a file, a fault of a
-    cell).
+    An error of the campaign stops a run; one of a file or a cell leaves that file or row out (`action`).
     """
 
     check: str  # short name of the rule, e.g. "missing_column"
@@ -81,8 +79,6 @@ def shortened(text: str, most: int = LONGEST_VALUE) -> str:
 def printable(text: str) -> str:
     """Return a text with control characters, and bytes of names that are not UTF-8, as escapes.
 
-    Examples
-    --------
     >>> printable("caf\\udce9\\x1b[2J")
     'caf\\\\xe9\\\\x1b[2J'
     """
@@ -123,8 +119,6 @@ def grouped(faults: Iterable[Fault]) -> list[list[Fault]]:
 def told(group: Sequence[Fault]) -> str:
     """Return the message of one group: the fault, or how many files have it and examples.
 
-    Examples
-    --------
     >>> told([Fault("empty_file", "is empty.", file=f"{i}.csv", fix="Export it again.") for i in range(84)])
     '84 files: is empty. For example 0.csv; 1.csv; 2.csv. Export it again.'
     """
@@ -316,8 +310,6 @@ def disk(path: Path, option: str = "--out") -> Iterator[None]:
         raise OutError(f"cannot be written ({reason}).", file=path, fix=fix) from error
 
 
-# ---------------------------------------------------------------- memory
-
 _NO_MEMORY = (
     "failed to map segment from shared object", "annot allocate memory", "can't start new thread",
     "Failed to launch worker thread", "without setting an exception", "without exception set",
@@ -333,12 +325,8 @@ def memory_ran_out(error: BaseException) -> bool:
     an OSError, a thread a RuntimeError, or an exception of Arrow's own; a module in C that is loaded and
     gives up is a SystemError.
 
-    Examples
-    --------
     >>> memory_ran_out(ImportError("libm.so: failed to map segment from shared object"))
     True
-    >>> memory_ran_out(ImportError("No module named 'scipy'"))
-    False
     """
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True

@@ -26,10 +26,7 @@ _DEFAULT = {
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """The true unit of each slot: `Units({"force": ("torque", "mN m")})` when a config declares one.
-
-    Keys are quantities (`force`, `displacement`, `speed`, `load`, `time`); values are (quantity name, unit).
-    """
+    """The true unit of each slot: `Units({"force": ("torque", "mN m")})` when a config declares one."""
 
     declared: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     channels: Mapping[str, str] = field(default_factory=dict)  # units of the campaign's own channels
@@ -49,8 +46,6 @@ class Units:
         ConfigError if the units do not fit together (turn and mm/s), or are not known to pint and not spelled
         "<displacement>/<time>".
 
-        Examples
-        --------
         >>> Units({"displacement": ("angle", "turn"), "speed": ("speed", "rpm")}).speed_factor
         60.0
         """
@@ -72,10 +67,8 @@ class Units:
             return self.unit("speed")
         if column == "time_s":
             return self.unit("time")
-        if column.startswith("load") and column.endswith("_N"):
-            return self.unit("load")
         if column.endswith("_N"):
-            return self.unit("force")
+            return self.unit("load" if column.startswith("load") else "force")
         return next((unit for ending, unit in _ENDINGS.items() if column.endswith(ending)), "")
 
     def label(self, column: str) -> str:
@@ -137,20 +130,10 @@ class Conversion:
 
 @cache
 def conversion(unit: str, to: str) -> Conversion:
-    """Return the conversion of numbers in `unit` to the unit `to`.
+    """Return the conversion of numbers in `unit` to the unit `to`, both as pint reads them: kgf, mm/min, degF.
 
-    Parameters
-    ----------
-    unit, to : str
-        Units as pint reads them: kgf, lbf, in, mm/min, ms, degF, h, um, kN, N*m.
+    ConfigError if `unit` is unknown or of another dimension than `to`; the fix names the nearest unit.
 
-    Raises
-    ------
-    ConfigError
-        If `unit` is unknown or of another dimension than `to`; the fix names the nearest unit.
-
-    Examples
-    --------
     >>> conversion("kgf", "N")(2.0), round(conversion("degF", "degC")(212.0), 9)
     (19.6133, 100.0)
     """
@@ -181,8 +164,6 @@ def other_unit(said: str, unit: str) -> str | None:
 
     A unit that is not known says nothing.
 
-    Examples
-    --------
     >>> other_unit("kN", "N"), other_unit("kg", "N"), other_unit("V", "N")
     ('kN', 'kgf', '')
     >>> other_unit("kg", "kgf"), other_unit("Sek", "s")
@@ -308,8 +289,6 @@ _BY_LOWER = {spelled.lower(): unit for spelled, unit in reversed(UNITS.items())}
 def unit_of(text: str) -> Unit | None:
     """Return the unit that a text is, brackets around it or not; None if it is none that is known.
 
-    Examples
-    --------
     >>> unit_of("[kN]").name, unit_of("Sec").name, unit_of("(µm)").name, unit_of("Weg")
     ('kN', 's', 'um', None)
     """
