@@ -143,6 +143,12 @@ class LifetimeRequest:
     model: str = "after"
 
 
+def require_model(name: str) -> None:
+    """Raise RequestError unless `name` is one of the two models."""
+    if name not in MODELS:
+        raise RequestError(f"there is no model '{name}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
+
+
 def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     """Return the days to a threshold of a quantity, by the likeliest law and by its rivals, with intervals.
 
@@ -153,8 +159,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     from sealfit.fit.aging.lifetime import answer, finite_ends, goal_of, over_laws
 
     store = Store.open(out)
-    if asked.model not in MODELS:
-        raise RequestError(f"there is no model '{asked.model}'.", fix=f"Choose one of: {', '.join(MODELS)}.")
+    require_model(asked.model)
     goal, years = goal_of(asked.threshold, asked.loss_pct), asked.years
     if goal.value is not None and goal.value <= 0 and store.state.properties is None:
         reason = f"--threshold {goal.value:g} is never reached: friction is above 0."

@@ -65,19 +65,8 @@ def run(
 ) -> dict:
     """Run the out-of-date steps among `steps`, in order, and return the summary of all of them.
 
-    Parameters
-    ----------
-    campaign, out : Path
-        The campaign's folder and the folder of results.
-    config : Path or None
-        A rig config, or None for the default.
-    **options
-        Fields of `Options`.
-
-    Raises
-    ------
-    SealfitError
-        CampaignError, ConfigError, OutError, FitError: whatever the user has to fix.
+    `options` are fields of `Options`. CampaignError, ConfigError, OutError or FitError for whatever the user
+    has to fix.
     """
     chosen, source = Options(**options), ConfigCopy.at(config)
     checked = source.parse()
@@ -106,11 +95,6 @@ def fit_properties(
 
     The table is a CSV, Excel or Parquet file with a row per specimen; `names` and `batch` are as those of
     `sealfit.ingest.property_table.read_properties`, and all else as for `run`.
-
-    Raises
-    ------
-    SealfitError
-        Whatever the user has to fix.
     """
     chosen, source = Options(**options), ConfigCopy.at(config)
     source.parse()
@@ -123,16 +107,11 @@ def fit_properties(
 def single(step: str, out: Path, *, progress: Silent | None = None, **options) -> dict:
     """Do one step after the first in an OUT whose earlier steps are current, and return its summary.
 
-    `options` are fields of `Options`.
-
     StaleError if a step before it is missing or stale; it names the command to run. RequestError if close-
     loop needs the user's own effects and no `effects_folder` is given.
     """
     chosen = Options(**options)
-    with (
-        Store.writing(out, effects=chosen.effects_folder) as store,
-        on_cluster(chosen.scheduler, out),
-    ):
+    with Store.writing(out, effects=chosen.effects_folder) as store, on_cluster(chosen.scheduler, out):
         for before in store.up_to(step)[:-1][-1:]:
             store.require(before)
         return _do_steps(store, (step,), chosen, progress or Silent())

@@ -130,7 +130,7 @@ class Conversion:
 
 @cache
 def conversion(unit: str, to: str) -> Conversion:
-    """Return the conversion of numbers in `unit` to the unit `to`, both as pint reads them: kgf, mm/min, degF.
+    """Return the conversion of numbers in `unit` to the unit `to`, as pint reads them: kgf, mm/min, degF.
 
     ConfigError if `unit` is unknown or of another dimension than `to`; the fix names the nearest unit.
 

@@ -42,10 +42,8 @@ def run(
 
     Parameters
     ----------
-    campaign, out : str or Path
-        The campaign's folder, and the folder of results; that one is created if it is not there.
-    config : str or Path, optional
-        Rig config (TOML).
+    campaign, out, config : str or Path
+        The campaign's folder, the folder of results (created if missing), and the rig config (TOML).
     workers : int, optional
         Processes to use; default: all cores.
     effects_folder : str or Path, optional
@@ -79,21 +77,14 @@ def fit_properties(
 
     Parameters
     ----------
-    values : str or Path
-        CSV, Excel or Parquet file with a row per specimen.
-    out, config
-        As `run`.
+    values, out, config : str or Path
+        CSV, Excel or Parquet file with a row per specimen, folder of results, and config.
     properties : sequence of str
         Columns of the properties; by default the only one there is.
     batch : str
         Column that names the batch of a specimen.
     **options
-        `force` and `progress` of `sealfit.pipeline.fit_properties`.
-
-    Raises
-    ------
-    SealfitError
-        Whatever the user has to fix: the message says where, what and how.
+        `force` and `progress` of `sealfit.pipeline.fit_properties`. Errors as `run`.
     """
     one_thread()
     options.setdefault("progress", progress.for_notebook())
@@ -105,17 +96,8 @@ def fit_properties(
 def open(out: str | Path, effects_folder: str | Path | None = None) -> Results:
     """Return the results in a folder that `sealfit.run` or the command line made.
 
-    Parameters
-    ----------
-    out : str or Path
-        The folder of results.
-    effects_folder : str or Path, optional
-        Folder of your own effects, if the loop was closed with some: Python is run from it for predictions.
-
-    Raises
-    ------
-    OutError
-        If there is no such folder, or it holds no results.
+    `effects_folder` has your own effects, if the loop was closed with some: Python is run from it for
+    predictions. OutError if there is no such folder, or it holds no results.
     """
     one_thread()
     return Results(out, effects_folder)
@@ -191,24 +173,15 @@ class Results:
     def residuals(self, model: str = "after") -> pd.DataFrame:
         """Return a row per bin: measured minus model, fitted and held out; `model` is "after" or "before".
 
-        Raises
-        ------
-        RequestError
-            If there is no such model.
+        RequestError if there is no such model.
         """
-        if model not in commands.MODELS:
-            raise RequestError(
-                f"there is no model '{model}'.", fix=f"Choose one of: {', '.join(commands.MODELS)}."
-            )
+        commands.require_model(model)
         return self.table(f"residuals_{model}")
 
     def traces(self, condition: str | None = None) -> pd.DataFrame:
         """Return a row per sample of every trace, or of those of one condition, as table `runs` spells it.
 
-        Raises
-        ------
-        RequestError
-            If no such condition was tested; the fix names the nearest.
+        RequestError if no such condition was tested; the fix names the nearest.
         """
         return self._of_condition("traces", condition)
 
@@ -219,10 +192,7 @@ class Results:
     def table(self, name: str) -> pd.DataFrame:
         """Return any table of OUT as it is stored, with `attrs["meaning"]` of its columns.
 
-        Raises
-        ------
-        RequestError
-            If there is no such table; the fix names the nearest, or all.
+        RequestError if there is no such table; the fix names the nearest, or all.
         """
         return self._table(self._current(_step_of(name)), name)
 
@@ -237,16 +207,8 @@ class Results:
     def predict(self, points: pd.DataFrame | Mapping[str, Sequence]) -> pd.DataFrame:
         """Return the points with the force, before and after, and 95 % intervals, as `sealfit predict` does.
 
-        Parameters
-        ----------
-        points : DataFrame, or mapping of column names to values
-            The condition columns, signed `speed_mm_s`, and what else the model needs; a message says what is
-            missing.
-
-        Raises
-        ------
-        RequestError
-            If a column is missing that the model needs, or is there twice.
+        `points` has the condition columns, signed `speed_mm_s`, and what else the model needs. RequestError
+        if a column is missing that the model needs, or is there twice.
         """
         from sealfit.closure.prediction_csv import points_of
 
@@ -276,10 +238,7 @@ class Results:
         **options
             `compression_ratio_pct`, `years` (find the temperature that lasts so long), `law` and `model`.
 
-        Raises
-        ------
-        RequestError
-            If the request does not fit the campaign.
+        RequestError if the request does not fit the campaign.
         """
         asked = commands.LifetimeRequest(quantity, threshold, loss_pct, temperature_C, **options)
         return Lifetime(commands.lifetime(self.out, asked))

@@ -223,19 +223,9 @@ _DOCUMENTS = {"closure": TypeAdapter(CLOSURE), "model": TypeAdapter(MODEL)}
 
 
 def read_document(name: str, text: str) -> dict:
-    """Return the content of closure.json or model.json.
+    """Return the content of closure.json ("closure") or model.json ("model") from its text.
 
-    Parameters
-    ----------
-    name : str
-        "closure" or "model".
-    text : str
-        The text of the file.
-
-    Raises
-    ------
-    ValueError
-        If the text is no JSON, or the document is none that a loop writes.
+    ValueError if the text is no JSON, or the document is none that a loop writes.
     """
     document = json.loads(text, parse_int=lambda digits: (int if len(digits) < INTEGER else float)(digits))
     _DOCUMENTS[name].validate_python(document)
