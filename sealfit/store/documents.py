@@ -54,94 +54,75 @@ def _are_below(places: Iterable[int], count: int, least: int = 0) -> bool:
 
 # ---------------------------------------------------------------- closure.json
 
-NAMES_OF_ERRORS = (
-    "rmse_N", "rmse_runs_N", "heldout_rmse_N", "heldout_extrapolated_rmse_N", "max_abs_N", "mean_abs_pct",
-    "lack_of_fit_p",
-)  # fmt: skip
-ERRORS = record(**dict.fromkeys(NAMES_OF_ERRORS, Maybe))
+ERRORS = record(
+    **dict.fromkeys(("rmse_N", "rmse_runs_N", "heldout_rmse_N", "heldout_extrapolated_rmse_N"), Maybe),
+    **dict.fromkeys(("max_abs_N", "mean_abs_pct", "lack_of_fit_p"), Maybe),
+)
 EFFECT = record(
-    id=Text,
-    label=Text,
-    level=Text,
+    **dict.fromkeys(("id", "label", "level", "acts_on", "reference", "form"), Text),
     channels=Names,
-    acts_on=Text,
     operation=Operation,
-    reference=Text,
-    form=Text,
-    named=StrictBool,
-    candidate=StrictBool,
+    **dict.fromkeys(("named", "candidate"), StrictBool),
     parameters=list[record(name=Text, value=Maybe, ci95=tuple[Maybe, Maybe], unit=Text | None)],
     p_value=Number,
-    heldout_gain_N=Maybe,
-    heldout_rmse_N=Maybe,
+    **dict.fromkeys(("heldout_gain_N", "heldout_rmse_N"), Maybe),
     alternatives=list[record(id=Text, channels=Names, acts_on=Text, heldout_rmse_N=Maybe)],
 )
 FIT_QUALITY = record(
     lambda own: own.state == "unknown" or None not in (own.ratio, own.p_value),
     state=Literal["within_scatter", "above_scatter", "unknown"],
-    ratio=Maybe,
-    p_value=Maybe,
+    **dict.fromkeys(("ratio", "p_value"), Maybe),
 )
 DETECTABLE = record(
     lambda own: (own.smallest_N is None) == (own.smallest_pct is None),
-    variable=Text,
-    level=Text,
-    acts_on=Text,
-    smallest_N=Maybe,
-    smallest_pct=Maybe,
+    **dict.fromkeys(("variable", "level", "acts_on"), Text),
+    **dict.fromkeys(("smallest_N", "smallest_pct"), Maybe),
     files_needed=StrictInt | None,
     cannot_tell=StrictBool,
 )
 LEFT = record(
     lambda own: own.channel is None or own.p_value is not None,
-    rmse_N=Maybe,
-    level=Text | None,
-    channel=Text | None,
-    p_value=Maybe,
+    **dict.fromkeys(("rmse_N", "p_value"), Maybe),
+    **dict.fromkeys(("level", "channel"), Text | None),
     significant=StrictBool,
 )
+REFUSED = record(
+    **dict.fromkeys(("id", "acts_on", "label", "reason"), Text),
+    channels=Names,
+    p_value=Number,
+    weak=StrictBool,
+)
+INCOMPLETE = record(channel=Text, files_without=StrictInt, files=StrictInt, searched=StrictBool)
 CLOSURE = record(
     schema=Literal[1],
     verdict=Literal["closed", "nothing_missing", "unexplained", "cannot_tell"],
     fit_quality=FIT_QUALITY,
     sensitivity=list[DETECTABLE],
-    refused=list[
-        record(
-            id=Text, channels=Names, acts_on=Text, label=Text, p_value=Number, reason=Text, weak=StrictBool
-        )
-    ],
-    units=record(force_N=Text, displacement_mm=Text, speed_mm_s=Text, load_N=Text, time_s=Text),
+    refused=list[REFUSED],
+    units=record(**dict.fromkeys(("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s"), Text)),
     noise_floor_N=Maybe,
-    before=ERRORS,
-    after=ERRORS,
+    **dict.fromkeys(("before", "after"), ERRORS),
     heldout_unit=Text,
     effects=list[EFFECT],
     scatter=list[record(level=Text, sd_rel=Maybe, sd_N=Maybe, df=Maybe)],
     left=LEFT,
     outlier_files=list[record(file=Text, deviation_pct=Number, p_value=Number)],
     next_runs=list[record(why=Text, conditions=dict[Text, StrictBool | Number | Text])],
-    incomplete_channels=list[
-        record(channel=Text, files_without=StrictInt, files=StrictInt, searched=StrictBool)
-    ],
+    incomplete_channels=list[INCOMPLETE],
 )
 
 
 # ---------------------------------------------------------------- model.json
 
 
-def _fixed_agree(term) -> bool:
+def _is_fixed(name: str, value: object) -> bool:
     """Return whether what is fixed in an effect is of the kind that its name says."""
-    for name, value in term.fixed.items():
-        kind = str if name == "categories" else float | int
-        if name in ("categories", "means") or name.endswith("knots"):
-            good = isinstance(value, list) and all(isinstance(own, kind) for own in value)
-        elif name.endswith("_ref"):
-            good = isinstance(value, kind)
-        else:  # `shift` is written without the origins of passes
-            good = isinstance(value, dict) and (name != "shift" or value == {})
-        if not good:
-            return False
-    return True
+    kind = str if name == "categories" else float | int
+    if name in ("categories", "means") or name.endswith("knots"):
+        return isinstance(value, list) and all(isinstance(own, kind) for own in value)
+    if name.endswith("_ref"):
+        return isinstance(value, kind)
+    return isinstance(value, dict) and (name != "shift" or value == {})  # `shift` has no origins of passes
 
 
 def _sizes_agree(model) -> bool:
@@ -165,9 +146,7 @@ def _sizes_agree(model) -> bool:
 
 CONDITIONS = record(
     lambda own: len(own.condition) > 0 and len({len(column) for column in asdict(own).values()}) == 1,
-    condition=Names,
-    series=Names,
-    rubber=Names,
+    **dict.fromkeys(("condition", "series", "rubber"), Names),
     aging_days=list[Annotated[Number, Field(ge=0)]],
 )
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
@@ -179,7 +158,7 @@ DECLARED = record(
     law=dict[Text, StrictBool],  # by series
 )
 TERM = record(
-    _fixed_agree,
+    lambda own: all(_is_fixed(*fixed) for fixed in own.fixed.items()),
     id=Text,
     channels=Annotated[Names, Field(min_length=1)],
     acts_on=Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"],
@@ -189,10 +168,8 @@ TERM = record(
     smoothness=Maybe,
 )
 FITTED = record(theta=list[Number], terms=list[TERM])
-GROUPED = record(  # a covariance from whole groups: for each, the numbers of its parameters
-    covariance=Matrix,
-    information=list[tuple[list[Annotated[int, Field(strict=True, ge=0)]], Matrix]],
-)
+INFORMATION = list[tuple[list[Annotated[int, Field(strict=True, ge=0)]], Matrix]]
+GROUPED = record(covariance=Matrix, information=INFORMATION)  # from whole groups: numbers of its parameters
 COMPONENT = record(
     level=Literal["stroke", "file", "run", "specimen"],
     kind=Literal["offset", "gain", "v_s", "sigma_2"],
@@ -204,11 +181,9 @@ MODEL = record(
     schema=Literal[1],
     config=Config,
     conditions=CONDITIONS,
-    has_load=StrictBool,
-    has_aging=StrictBool,
+    **dict.fromkeys(("has_load", "has_aging"), StrictBool),
     declared=DECLARED,
-    before=FITTED,
-    after=FITTED,
+    **dict.fromkeys(("before", "after"), FITTED),
     covariance=Matrix,
     sandwiches=list[GROUPED],
     df=Annotated[Number, Field(ge=0)],
