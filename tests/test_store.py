@@ -98,7 +98,7 @@ def test_a_table_survives_parquet(tmp_path_factory, rows):
     frame["file"] = [row[0] for row in rows]
     frame["line"] = pd.array([row[1] for row in rows], dtype="Int64")
     frame["value"] = [row[3] for row in rows]
-    parquet.write(frame, QUALITY, Units(), path)
+    parquet.write_arrow(parquet.to_arrow(frame, QUALITY, Units()), path)
     back = parquet.read(path)
     assert list(back.columns) == QUALITY.names()
     assert [None if pd.isna(v) else v for v in back["file"]] == [row[0] for row in rows]

@@ -23,15 +23,12 @@ from sealfit.config import Config, Files, Loop, Sensor, parse_config, read_confi
 from sealfit.errors import OutError
 
 # ---------------------------------------------------------------- fingerprint
-# A fingerprint per input, and one key per step.
-#
 # A step is current if its stored key equals the key computed now. The key depends on the program's version,
 # the part of the config that the step uses, its inputs, and the step before it.
 
 # The steps in order; each reads the tables of those before it.
 STEPS = ("ingest", "fit-steady", "fit-aging", "fit-dynamic", "close-loop", "report")
-# The steps of a table of properties, which has no traces.
-STEPS_OF_PROPERTIES = ("fit-aging", "report")
+STEPS_OF_PROPERTIES = ("fit-aging", "report")  # of a table of properties, which has no traces
 # Parts of the config that a step does not use, with defaults; a change of them does not make it stale.
 UNSEEN = {
     "ingest": {"sensor": Sensor(), "loop": Loop()},
@@ -40,16 +37,12 @@ UNSEEN = {
 
 
 class Fingerprint(NamedTuple):
-    """Size in bytes, times of last change in ns, and SHA-256 of one file; all None for a missing file.
-
-    `mtime_ns` is that of the content, which programs may set; `ctime_ns` is that of the content or the entry,
-    which they may not.
-    """
+    """Size in bytes, times of last change in ns, and SHA-256 of one file; all None for a missing file."""
 
     size: int | None = None
-    mtime_ns: int | None = None
+    mtime_ns: int | None = None  # of the content; programs may set it
     sha256: str | None = None
-    ctime_ns: int | None = None
+    ctime_ns: int | None = None  # of the content or the entry; they may not
 
 
 Fingerprints = dict[str, Fingerprint]  # by file name
@@ -133,8 +126,7 @@ def step_keys(
     config = config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
     keys: dict[str, str] = {}
     names = sorted(inputs)
-    hashes = (inputs[name].sha256 or "" for name in names)
-    known = "\0".join([*names, *hashes])  # no path contains \0
+    known = "\0".join([*names, *(inputs[name].sha256 or "" for name in names)])  # no path contains \0
     before = hashlib.sha256(os.fsencode(known)).hexdigest()
     for step in STEPS if properties is None else STEPS_OF_PROPERTIES:
         seen = [__version__, step, seen_config(step, config).model_dump(mode="json"), before]
@@ -147,7 +139,6 @@ def step_keys(
 
 
 # ---------------------------------------------------------------- provenance
-# The content of provenance.json and of the report's provenance section.
 
 PACKAGES = ("numpy", "pandas", "scipy", "pyarrow", "matplotlib", "pydantic", "jinja2", "typer", "rich")
 
@@ -158,6 +149,7 @@ def provenance(state: State) -> dict:
     for name in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             packages[name] = version(name)
+    config, path = state.config, state.config.path
     return {
         "program": "sealfit",
         "version": __version__,
@@ -166,11 +158,7 @@ def provenance(state: State) -> dict:
         "packages": packages,
         "campaign": str(state.campaign),
         "table": None if state.properties is None else state.properties.table,
-        "config": {
-            "name": state.config.name,
-            "path": str(state.config.path) if state.config.path else None,
-            "text": state.config.text,
-        },
+        "config": {"name": config.name, "path": str(path) if path else None, "text": config.text},
         "inputs": [
             {"file": name, "size": mark.size, "sha256": mark.sha256}
             for name, mark in state.inputs.items()
@@ -185,7 +173,6 @@ def provenance(state: State) -> dict:
 
 
 # ---------------------------------------------------------------- state
-# The content of state.json: campaign, config, inputs, and the key of each step.
 
 STATE = "state.json"
 STAGING = ".staging-"  # the beginning of the name of a folder of staged files
@@ -323,11 +310,8 @@ _STATE = TypeAdapter(State)
 
 def to_json(document: object, *, indent: int | None = 1, ensure_ascii: bool = False) -> str:
     """Return `document` as JSON text: numbers that are not finite become null, numpy's become Python's."""
-    style = {"indent": indent, "ensure_ascii": ensure_ascii, "allow_nan": False}
-    try:
-        return json.dumps(document, **style) + "\n"
-    except (TypeError, ValueError):  # a type that JSON lacks, or a number that is not finite
-        return json.dumps(_plain(document), **style) + "\n"
+    text = json.dumps(_plain(document), indent=indent, ensure_ascii=ensure_ascii, allow_nan=False)
+    return f"{text}\n"
 
 
 def _plain(value: object) -> object:

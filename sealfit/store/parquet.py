@@ -23,14 +23,11 @@ Columns = Mapping[str, pd.Series | np.ndarray | pa.Array]  # of equal length, or
 
 
 def to_arrow(frame: pd.DataFrame | Columns, schema: Schema, units: Units) -> pa.Table:
-    """Return `frame` as a table of `schema`.
+    """Return `frame` as a table of `schema`: its columns first, in its order and types, NaN as null.
 
-    The schema's columns are first, in its order and types; if it is open, all others follow. Each field's
-    metadata holds `unit` (the true one) and `meaning`; the table's holds `sealfit` (version and table) and
-    `units` (true unit by column). NaN becomes null.
-
-    ValueError if a column is missing, doubled, of the wrong type, or not in a closed schema: a fault of the
-    step, not of the user's data.
+    If it is open, all others follow. Each field's metadata holds `unit` (the true one) and `meaning`; the
+    table's holds `sealfit` (version and table) and `units` (true unit by column). ValueError if a column is
+    missing, doubled, of the wrong type, or not in a closed schema: a fault of the step, not of the data.
     """
     names = [str(name) for name in frame]
     if doubled := sorted({name for name in names if names.count(name) > 1}):
@@ -40,7 +37,6 @@ def to_arrow(frame: pd.DataFrame | Columns, schema: Schema, units: Units) -> pa.
     if missing or (others and not schema.open_):
         unknown = f"columns that it does not know {others}"
         raise ValueError(f"table {schema.name}: missing columns {missing}, {unknown}")
-
     arrays, fields = [], []
     for column in (*schema.columns, *(Column(name, CHANNEL, None) for name in others)):
         array = _array(frame[column.name], column, schema.name)
@@ -81,11 +77,6 @@ def _field(column: Column, dtype: pa.DataType, units: Units) -> pa.Field:
     return pa.field(column.name, dtype, metadata=about)
 
 
-def write(frame: pd.DataFrame, schema: Schema, units: Units, path: Path) -> None:
-    """Write `frame` to `path`. Raises OSError if the disk refuses, ValueError as `to_arrow`."""
-    write_arrow(to_arrow(frame, schema, units), path)
-
-
 def write_arrow(table: pa.Table, path: Path) -> None:
     """Write a table without checks; the caller syncs it to the disk. Raises OSError if the disk refuses."""
     measured = [field.name for field in table.schema if pa.types.is_floating(field.type)]
@@ -124,9 +115,8 @@ def read(
     Columns of words in `coded` come as categories: no word is spelled out for every row. `where` names
     columns that are read, and the values of the rows that are kept.
     """
-    paths = [path] if isinstance(path, Path) else path
     parts = []
-    for one in paths:
+    for one in [path] if isinstance(path, Path) else path:
         try:
             # A tenth of what read_table takes for a small file.
             with pq.ParquetFile(one, read_dictionary=list(coded), page_checksum_verification=True) as file:
@@ -173,8 +163,7 @@ def _of_column(values: pd.Series | np.ndarray, column: Column) -> pa.Array | pa.
         return pa.array(values, from_pandas=True)
     if column.dtype == TEXT or (column.dtype is None and _mixed(values)):
         return as_words(pd.Series(values))
-    missing = values.dtype != float or np.isnan(values).any()  # that none is, is seen faster here
-    return pa.array(values, type=column.dtype, from_pandas=missing)
+    return pa.array(values, type=column.dtype, from_pandas=True)
 
 
 def as_words(values: pd.Series) -> pa.Array:
@@ -184,6 +173,5 @@ def as_words(values: pd.Series) -> pa.Array:
 
 def _mixed(values: pd.Series | np.ndarray) -> bool:
     """Whether a channel holds categories, or a mixture of numbers and text, which is stored as text."""
-    if isinstance(values.dtype, pd.CategoricalDtype):
-        return True
-    return values.dtype == object and any(isinstance(value, str) for value in values)
+    categories = isinstance(values.dtype, pd.CategoricalDtype)
+    return categories or (values.dtype == object and any(isinstance(value, str) for value in values))

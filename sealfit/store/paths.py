@@ -9,9 +9,6 @@ from sealfit.config import Config
 from sealfit.errors import RUNS_TABLES, CampaignError, ConfigError, Fault, RequestError, did_you_mean, quoted
 from sealfit.store.manifest import ConfigCopy, fingerprint
 
-# ---------------------------------------------------------------- places
-# The folders and files named on the command line; a missing one is refused with the closest existing name.
-
 RUNS = "runs.csv"
 FIX_PATH = "Fix the path."
 
@@ -33,16 +30,12 @@ def campaign_folder(path: Path, config: Config) -> Path:
     CampaignError, whose fix names the likeliest, if there is no such folder, or no table of runs in it where
     the config needs one.
     """
-    if path.is_file():
-        fix = f"Give the folder that holds {RUNS}."
-        if path.name in RUNS_TABLES:
-            fix = f"Give its folder: {quoted(path.parent)}"
-        raise CampaignError(
-            [Fault("campaign_folder", "is a file, not a campaign folder.", str(path), fix=fix)]
-        )
     if not path.is_dir():
-        fix = did_you_mean(path) or FIX_PATH
-        raise CampaignError([Fault("campaign_folder", "there is no such folder.", str(path), fix=fix)])
+        what, fix = "there is no such folder.", did_you_mean(path) or FIX_PATH
+        if path.is_file():
+            what, own = "is a file, not a campaign folder.", path.name in RUNS_TABLES
+            fix = f"Give its folder: {quoted(path.parent)}" if own else f"Give the folder that holds {RUNS}."
+        raise CampaignError([Fault("campaign_folder", what, str(path), fix=fix)])
     if config.files.glob is None and config.files.runs_table is None and not runs_tables(path, config):
         below = sorted(child.parent for child in path.glob(f"*/{RUNS}"))
         names = sorted(child.name + ("/" if child.is_dir() else "") for child in path.iterdir())
@@ -61,14 +54,11 @@ def existing_file(path: Path, what: str) -> Path:
         return path
     if path.is_dir():
         raise RequestError(f"is a folder, not a {what}.", file=path, fix="Give the file itself.")
-    raise RequestError(
-        f"there is no such {what}.", file=path, fix=did_you_mean(path, Path.is_file) or FIX_PATH
-    )
+    fix = did_you_mean(path, Path.is_file) or FIX_PATH
+    raise RequestError(f"there is no such {what}.", file=path, fix=fix)
 
 
 # ---------------------------------------------------------------- own effects
-# The folder of the user's own effects, the only place from which Python is run.
-#
 # A campaign and a folder of results may come from somebody else, so Python is never run from them or from a
 # path stored in them. The user names the folder, by --effects-folder or in the config given with --config.
 # OUT keeps the hashes of the files to detect changes.
@@ -96,8 +86,7 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
         fix = f"Name the folder by {OPTION}, or move the config."
         raise ConfigError(reason, file=config.path, fix=fix)
     if not folder.is_dir():
-        fix = did_you_mean(folder) or FIX_PATH
-        raise ConfigError(f"{said}: there is no folder {folder}.", fix=fix)
+        raise ConfigError(f"{said}: there is no folder {folder}.", fix=did_you_mean(folder) or FIX_PATH)
     for path in (folder, *sorted(folder.glob("*.py"))):
         if place := _place_of(path, data):
             fix = "Read the files; if you trust them, move them to a folder of your own."
@@ -120,8 +109,8 @@ def effects_seen(
 ) -> dict[str, str | None]:
     """Return the present hashes of the user's own effects, as far as known; nothing is run.
 
-    `given` is the folder that the command line names, `kept` and `kept_config` are what the folder of results
-    keeps, and `config` is that config as it stands now, read again if its file is still there.
+    `given` is the folder that the command line names, `kept` and `kept_config` are what OUT keeps, and
+    `config` is that config as it stands now.
     """
     if given is not None:
         return effect_hashes(given)

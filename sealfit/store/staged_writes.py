@@ -49,7 +49,8 @@ class Staged:
         """Write table `name` of `tables.SCHEMAS`; ValueError if the frame lacks its columns or types."""
         from sealfit.store import parquet
 
-        self._write(f"{name}{PARQUET}", lambda path: parquet.write(frame, SCHEMAS[name], self._units, path))
+        made = parquet.to_arrow(frame, SCHEMAS[name], self._units)
+        self._write(f"{name}{PARQUET}", lambda path: parquet.write_arrow(made, path))
 
     def json(self, name: str, document: Mapping) -> None:
         """Write `document` as `<name>.json`; numbers that are not finite become null."""
@@ -110,8 +111,7 @@ class Staged:
 def finish(out: Path) -> None:
     """Move the files of a complete step to their places, remove what is left over, and move the state.
 
-    Whatever of it has been done already stays, so it may be interrupted and called again. OutError if one of
-    its folders is a link.
+    It may be interrupted and called again. OutError if one of its folders is a link.
     """
     folder = out / COMPLETE
     if (state := State.read(folder)) is not None and state.steps:
@@ -173,8 +173,6 @@ def sync(path: Path) -> None:
 
 
 # ---------------------------------------------------------------- lock
-# One writer per OUT: the lock names host and process.
-#
 # The kernel drops the lock with the process that held it, however that ended, so the lock of a dead process
 # of this host is taken over at once. Another host's lock is never taken over: what runs there cannot be seen
 # from here. Where the file system has no locks, the process that the file names is looked for.
@@ -240,11 +238,7 @@ def _owner(handle: int) -> dict:
 
 
 def _refuse_owner(handle: int, path: Path, option: str, locked: bool | None) -> None:
-    """Raise OutError if another process holds the file, or may hold it.
-
-    It holds the file if this one could not lock it. If it runs on another host, or if there are no locks, its
-    name in the file has to do.
-    """
+    """Raise OutError if another process holds the file, or may hold it by its name in the file."""
     owner = _owner(handle)
     if locked is False:
         more = ""
@@ -260,11 +254,9 @@ def _refuse_owner(handle: int, path: Path, option: str, locked: bool | None) -> 
 
 
 def _runs(pid: object) -> bool:
-    if not isinstance(pid, int):
-        return False
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, TypeError, OverflowError):  # or it is no number
         return False
     except OSError:  # it runs, and is another user's
         return True
@@ -299,15 +291,11 @@ def replace_file(output: Path, text: str) -> None:
 
 
 # ---------------------------------------------------------------- own folder
-# Ownership of the output folder: create it, or refuse one made by another program; one writer holds it.
 
 
 @contextlib.contextmanager
 def held(out: Path) -> Iterator[None]:
-    """Hold `out` as its only writer.
-
-    It is created if missing, and removed if it stays empty. What an interrupted step left to be moved is
-    moved; other staged files are removed.
+    """Hold `out` as its only writer; it is created if missing, and removed if it stays empty.
 
     OutError if `out` is a file, a folder that sealfit did not make, in use by another process, or cannot be
     written.

@@ -18,7 +18,7 @@ def made():
 
 def read_again(tables, folder):
     for name, table in tables.items():
-        parquet.write(table, SCHEMAS[name], Units(), folder / name)
+        parquet.write_arrow(parquet.to_arrow(table, SCHEMAS[name], Units()), folder / name)
     return {name: parquet.read(folder / name) for name in tables}
 
 
