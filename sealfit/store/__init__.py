@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 class Store:
     """One OUT folder with the campaign and the config it belongs to.
 
-    `kept` is the state as stored in it. `effects` is the folder of the user's own effects that the command
-    line names; the config has it, and no other.
+    `kept` is the state as stored. The config has the folder `effects` of the command line, and no other.
     """
 
     def __init__(self, out: Path, state: State, kept: State | None, effects: Path | None):
@@ -50,8 +49,8 @@ class Store:
             files = self.config.files if state.properties is None else Files()
             self._changed = manifest.changes(state.campaign, state.inputs, files)
         else:
-            missing = f"the campaign folder {state.campaign} is missing"
-            self.warnings.append(f"{missing}, so changes cannot be detected.")
+            what = f"the campaign folder {state.campaign} is missing, so changes cannot be detected."
+            self.warnings.append(what)
         self.marks = state.inputs | self._changed  # the present files of the campaign
 
     # ------------------------------------------------------------ opening
@@ -59,8 +58,7 @@ class Store:
     def open(cls, out: Path, effects: Path | None = None) -> Store:
         """Return the results in `out`, for reading; `effects` is the folder that --effects-folder names.
 
-        OutError, whose fix names the likeliest folder, if `out` holds no results. ConfigError if `effects`
-        may not be run, as `own_effects_folder`.
+        OutError, whose fix names the likeliest folder, if `out` holds none. Else as `own_effects_folder`.
         """
         if (out / COMPLETE).exists():
             with held(out):  # which moves its files
@@ -91,12 +89,10 @@ class Store:
         """Hold `out` as its only writer and give the store; without `campaign`, one that already has results.
 
         `source` is the config that the command line names, `effects` the folder that --effects-folder names,
-        `properties` what is asked of a table of properties in `campaign`.
-
-        OutError if `out` is a file, a folder that sealfit did not make, the results of another campaign, in
-        use by another process, or cannot be written.
+        `properties` what is asked of a table of properties in `campaign`. OutError as `held`, or if `out` has
+        the results of another campaign.
         """
-        if campaign is None or source is None:
+        if campaign is None:
             cls.open(out, effects)  # raises if there are no results
         with held(out):
             if campaign is None or source is None:
@@ -134,13 +130,11 @@ class Store:
 
     def _keep_what_moved(self) -> None:
         """Store a new path of the campaign, new times of unchanged files, and an equivalent config."""
-        kept = self._kept
+        kept, known = self._kept, self.state.inputs
         if kept is None:
             return
-        known = self.state.inputs
         same = {n: mark for n, mark in self._changed.items() if _same_content(mark, known.get(n))}
-        if same:
-            self.state = replace(self.state, inputs=known | same)
+        self.state = replace(self.state, inputs=known | same)
         source = self.state.config if _same_config(kept.config, self.state.config) else kept.config
         tidy = replace(self.state, config=source, own_effects=kept.own_effects)
         if tidy != kept:
@@ -186,10 +180,7 @@ class Store:
         return order[: order.index(step) + 1]
 
     def is_whole(self, file: str, done: manifest.Done) -> bool:
-        """Whether a file is what its step wrote; it is read once by this process.
-
-        Parts of large tables are read only if they were touched since state.json was written.
-        """
+        """Whether a file is what its step wrote; it is read once, and parts of large tables if touched."""
         if file_size(f"{self.out}/{file}") != done.files[file]:
             return False
         if file not in done.checksums or (file.endswith(PARQUET) and "/" in file and not self._touched(file)):
@@ -214,16 +205,13 @@ class Store:
             return f"inputs changed ({', '.join(changed[:3])}{more})"
         if self._kept is not None and self._kept.properties != self.state.properties:
             return "other columns are asked for"
-        own = what_differs(self.kept_effects, self.state.own_effects)
-        if own and step == "close-loop":
-            return own
-        return f"the config ({self.state.config.name}) changed"
+        own = what_differs(self.kept_effects, self.state.own_effects) if step == "close-loop" else ""
+        return own or f"the config ({self.state.config.name}) changed"
 
     def require(self, step: str) -> None:
         """Raise StaleError, naming the command to run, unless `step` and all before it are current."""
         for name in self.up_to(step):
-            why = self.why_stale(name)
-            if why:
+            if why := self.why_stale(name):
                 raise StaleError(f"{why}.", file=self.out, fix=f"Run: {self.command(name)}")
 
     def require_effects(self) -> None:
@@ -261,9 +249,8 @@ class Store:
 
         The folder of a complete step is there before any file changes, and state.json changes last.
         """
-        if self._opened is None:
-            return
-        if (self.out / COMPLETE).exists() or _status_of(self.out) != self._opened:
+        written = (self.out / COMPLETE).exists() or _status_of(self.out) != self._opened
+        if self._opened is not None and written:
             raise OutError("was written while it was read.", file=self.out, fix="Run the command again.")
 
     def _parts_of(self, table: str) -> list[Path]:
@@ -320,8 +307,7 @@ class Store:
         inputs = self.state.inputs if staged.inputs is None else staged.inputs
         # Copied, as the files below are those of no step.
         files, checksums, steps = dict(staged.files), dict(staged.checksums), self.state.steps
-        now = datetime.now(UTC).isoformat(timespec="seconds")
-        key = self._step_keys(inputs)[name]
+        now, key = datetime.now(UTC).isoformat(timespec="seconds"), self._step_keys(inputs)[name]
         done = manifest.Done(key, __version__, now, round(seconds, 3), files, checksums)
         earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
         state = replace(self.state, inputs=inputs, steps={**earlier, name: done})
