@@ -184,7 +184,7 @@ def _law(found: Found, name: str, title: str) -> Plot:
     days, needed = np.linspace(0, 16, 200), printed_errors()["start"]
 
     def draw(ax: Axes) -> None:
-        draw_aging(ax, points, curves, found.config.units)
+        draw_aging(ax, points, curves, curves.iloc[:0], ["mu_s", "mu_c"], found.config.units)
         for quantity in ("mu_s", "mu_c"):
             ax.plot(days, as_printed(quantity, days), color=BLACK, linestyle=":")
         ax.plot(days, as_printed("mu_c", days, needed), color=QUIET, linestyle="--")

@@ -11,6 +11,7 @@ from typing import Literal, TypeVar
 import matplotlib as mpl
 import matplotlib.style
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -31,6 +32,7 @@ MOST_MARKS = 300  # of a panel, until they are drawn as pixels: more makes an SV
 MOST_ROWS = 200  # conditions or series of a table
 
 Thing = TypeVar("Thing")
+Tables = Mapping[str, pd.DataFrame]  # those of the report, by name
 
 
 def spread(things: Sequence[Thing], most: int) -> list[Thing]:

@@ -164,7 +164,7 @@ def test_aging_draws_points_bars_and_law(ax):
     curves = pd.DataFrame(
         {"quantity": "mu_s", "aging_days": [0.0, 4.0], "value": [0.9, 0.8], "lo95": 0.7, "hi95": 1.0}
     )
-    draw_aging(ax, points, curves, Units())
+    draw_aging(ax, points, curves, curves.iloc[:0], ["mu_s"], Units())
     npt.assert_array_equal(ax.lines[0].get_ydata(), [0.9, 0.8])
     (bars,) = ax.containers
     points, _, (lines,) = bars
@@ -196,7 +196,7 @@ def test_trace_shades_its_steady_window(ax):
     x = np.linspace(0, 40, 81)
     trace = pd.DataFrame({"displacement_mm": x, "direction": -1, "force_N": -1.0, "force_se_N": np.nan})
     trace = trace.assign(n=np.where(x < 10, 2, 3), steady=((x >= 5) & (x <= 12)) | ((x >= 20) & (x <= 30)))
-    draw_trace(ax, trace, TORQUE)
+    draw_trace(ax, trace, pd.DataFrame(columns=["file", "stroke"]), TORQUE)
     npt.assert_array_equal(ax.lines[0].get_ydata(), 1.0)  # in the direction of motion
     drawn = ax.lines[1].get_ydata()
     npt.assert_array_equal(np.isnan(drawn), x < 10)  # where every repeat is there
@@ -221,7 +221,7 @@ def test_scaled_days_are_plain_numbers(ax):
     known = {"kind": "value", "quantity": "mu_s", "temperature_C": 60.0, "compression_ratio_pct": 80.0}
     rows = pd.DataFrame({**known, "scaled_days": [0.0, 1.0, 30.0], "value": [0.9, 0.8, 0.7], "lo95": np.nan})
     rows = rows.assign(hi95=np.nan, aging_days=[0.0, 1.0, 30.0])
-    draw_master_curve(ax, rows, {60.0: "#0072B2"}, Units())
+    draw_master_curve(ax, rows, rows.iloc[:0], {60.0: "#0072B2"}, Units())
     ax.figure.draw_without_rendering()
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0", "1", "10"]
 

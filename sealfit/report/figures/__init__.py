@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import pandas as pd
-
 from sealfit.config import Config
 from sealfit.report.figures.aging import aging, master_curve, traces_mean
 from sealfit.report.figures.residual import (
@@ -17,18 +15,17 @@ from sealfit.report.figures.residual import (
     variance_levels,
 )
 from sealfit.report.figures.speed import force_speed, starts
-from sealfit.report.style import Plot
+from sealfit.report.style import Plot, Tables
 
 # The figures of closure.json, and those of the tables alone, in the order of the report.
 OF_LOOP = (finding, before_after, effect_shapes, refused)
 OF_TABLES = (variance_levels, residual_channels, force_speed, aging, master_curve, starts, traces_mean)
 
 
-def draw_all(tables: Mapping[str, pd.DataFrame], closure: Mapping | None, config: Config) -> dict[str, Plot]:
+def draw_all(tables: Tables, closure: Mapping | None, config: Config) -> dict[str, Plot]:
     """Return every plot that these tables give, by name; one without data is not there.
 
-    `tables` are those of the report, all of them present, some perhaps empty; `closure` is closure.json, None
-    of properties. The config gives the labels their true units.
+    All tables are present, some perhaps empty; `closure` is closure.json, None of properties.
     """
     plots = [] if closure is None else [make(tables, closure, config) for make in OF_LOOP]
     plots += [make(tables, config) for make in OF_TABLES]

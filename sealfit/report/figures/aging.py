@@ -27,7 +27,7 @@ from sealfit.report.notation import (
     symbol_math,
     symbol_plain,
 )
-from sealfit.report.style import Key, Panel, Plot
+from sealfit.report.style import Key, Panel, Plot, Tables
 from sealfit.units import Units
 
 TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
@@ -39,34 +39,26 @@ UNCORRECTED = Key("before, without the effects", style.FLOOR, "dotted")
 
 # ---------------------------------------------------------------- aging
 def draw_aging(
-    ax: Axes,
-    points: pd.DataFrame,
-    curves: pd.DataFrame,
+    ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, before: pd.DataFrame, quantities: Sequence[str],
     units: Units,
-    before: pd.DataFrame | None = None,
-    quantities: Sequence[str] = (),
-) -> None:
+) -> None:  # fmt: skip
     """Draw the coefficients of one series over aging time: the law with its band, and each condition's fit.
 
     `points` are the fits per condition, with columns quantity, aging_days, value, lo95, hi95; `curves` are
     rows of table `aging_curves`, and `before` those of the same table without the loop's effects.
     `quantities` are those of all series, in the order of their colours.
     """
-    quantities = list(dict.fromkeys([*quantities, *curves["quantity"], *points["quantity"]]))
     for k, quantity in enumerate(quantities):
         colour, marker = style.CYCLE[k % len(style.CYCLE)], "os^Dv"[k % 5]
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
         style.draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, alpha=0.18)
         ax.plot(curve["aging_days"], curve["value"], color=colour)
-        if before is not None:
-            earlier = before[before["quantity"] == quantity].sort_values("aging_days")
-            ax.plot(earlier["aging_days"], earlier["value"], color=colour, linestyle=":", linewidth=1.1)
+        earlier = before[before["quantity"] == quantity].sort_values("aging_days")
+        ax.plot(earlier["aging_days"], earlier["value"], color=colour, linestyle=":", linewidth=1.1)
         here = points[points["quantity"] == quantity]
-        ends = np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float)
-        spread = np.abs(np.nan_to_num(ends))
-        markers, *_ = ax.errorbar(
-            here["aging_days"], here["value"], spread, color=colour, fmt=marker, elinewidth=0.8, capsize=1.5
-        )
+        spread = np.stack([here["value"] - here["lo95"], here["hi95"] - here["value"]]).astype(float)
+        spread, look = np.abs(np.nan_to_num(spread)), {"fmt": marker, "elinewidth": 0.8, "capsize": 1.5}
+        markers, *_ = ax.errorbar(here["aging_days"], here["value"], spread, color=colour, **look)
         explain(markers, [_of_point(row) for row in here.to_dict("records")])
     ax.xaxis.set_major_locator(style.round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
@@ -83,7 +75,7 @@ def _of_point(row: Mapping) -> str:
     return f"{symbol_plain(row['quantity'])} {value} {interval}\n{given(row['aging_days'])} d"
 
 
-def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+def aging(tables: Tables, config: Config) -> Plot | None:
     """Return the aging curves, a panel per series, or None without aging days."""
     curves = tables["aging_curves"]
     if curves.empty or not config.aging:
@@ -112,10 +104,8 @@ def aging(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
             if curve.empty:
                 continue
             here = fits[(fits["series"] == name) | (unaged & (fits["rubber"] == rubber.get(name)))]
-            draw = partial(
-                draw_aging, points=here, curves=curve, units=config.units,
-                before=earlier[earlier["series"] == name], quantities=drawn,
-            )  # fmt: skip
+            rows = {"points": here, "curves": curve, "before": earlier[earlier["series"] == name]}
+            draw = partial(draw_aging, **rows, quantities=drawn, units=config.units)
             symbols = [symbol_plain(quantity) for quantity in dict.fromkeys(curve["quantity"])]
             title = f"{names(name)}, {symbols[0]}" if of_property and len(quantities) > 1 else names(name)
             alt = f"Aging, {names(name)}: {joined(symbols)} over {number(right)} d; "
@@ -134,9 +124,8 @@ def _span(
 ) -> tuple[float, float]:
     """Return the ends of the axis of values; intervals of means have bounds, those of fits may have none."""
     ends = [points["lo95"], points["hi95"]] if of_property else []
-    shown = pd.concat(
-        [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"], *ends]
-    ).dropna()
+    ends += [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"]]
+    shown = pd.concat(ends).dropna()
     out = 0.0 if of_property else 0.002  # share of a campaign's values that may lie outside
     return style.padded(shown.quantile(out), shown.quantile(1 - out))
 
@@ -150,12 +139,8 @@ def property_means(values: pd.DataFrame) -> pd.DataFrame:
         means = means_of(own)
         half, value = means.half_width(), means.table["value"]
         kept = means.table[["condition", "series", "aging_days", "value"]]
-        parts.append(
-            kept.assign(
-                rubber=rubber, quantity="steady", parameter=quantity, identified=True,
-                lo95=value - half, hi95=value + half,
-            )
-        )  # fmt: skip
+        named = {"rubber": rubber, "quantity": "steady", "parameter": quantity, "identified": True}
+        parts.append(kept.assign(**named, lo95=value - half, hi95=value + half))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -169,16 +154,15 @@ def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str]) -> pd.Data
 
 
 # ---------------------------------------------------------------- averaged traces
-def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units, repeats: pd.DataFrame | None = None) -> None:
+def draw_trace(ax: Axes, trace: pd.DataFrame, repeats: pd.DataFrame, units: Units) -> None:
     """Draw one run's mean force along its displacement with its standard error; the steady window is shaded.
 
     `trace` are its rows of table `traces_mean`, `repeats` those of its strokes in table `traces` with their
     direction; the force is drawn in the direction of motion.
     """
-    if repeats is not None:
-        for _, stroke in repeats.groupby(["file", "stroke"]):
-            one = envelope(along_motion(stroke), REPEAT_BUCKETS)
-            ax.plot(one["displacement_mm"], one["force_N"], color=style.QUIET, linewidth=0.5, zorder=1)
+    for _, stroke in repeats.groupby(["file", "stroke"]):
+        one = envelope(along_motion(stroke), REPEAT_BUCKETS)
+        ax.plot(one["displacement_mm"], one["force_N"], color=style.QUIET, linewidth=0.5, zorder=1)
     thin = envelope(along_motion(trace))
     x, force, error = thin["displacement_mm"], thin["force_N"], thin["force_se_N"].fillna(0)
     style.draw_band(ax, x, force - error, force + error, style.AFTER, alpha=0.25)
@@ -186,11 +170,8 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, units: Units, repeats: pd.DataFram
     ax.plot(x, force, color=style.SKY, linewidth=0.8)
     ax.plot(x, force.where(whole), color=style.AFTER, linewidth=0.9)
     trace = trace.sort_values("displacement_mm")
-    steady = trace["steady"].astype(bool)
-    ax.fill_between(
-        trace["displacement_mm"], 0, 1, where=steady, transform=ax.get_xaxis_transform(), color=style.QUIET,
-        alpha=0.12, linewidth=0, zorder=0,
-    )  # fmt: skip
+    window = {"where": trace["steady"].astype(bool), "transform": ax.get_xaxis_transform(), "zorder": 0}
+    ax.fill_between(trace["displacement_mm"], 0, 1, color=style.QUIET, alpha=0.12, linewidth=0, **window)
     ax.set_xlabel(plain(units.label("displacement_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
 
@@ -211,15 +192,14 @@ def envelope(trace: pd.DataFrame, buckets: int = TRACE_BUCKETS) -> pd.DataFrame:
     return trace.iloc[np.unique(np.concatenate([ends, [0, len(trace) - 1]]))]
 
 
-def traces_mean(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+def traces_mean(tables: Tables, config: Config) -> Plot | None:
     """Return a few averaged traces, spread over conditions and speeds, or None if there are none."""
     traces = tables["traces_mean"]
     chosen = example_runs(traces, tables["runs"])
     if chosen.empty:
         return None
-    names, units = ConditionNames.of(config), config.units
+    names, units, single = ConditionNames.of(config), config.units, tables["traces"]
     traces = traces[traces["run_id"].isin(chosen["run_id"])]
-    single = tables["traces"]
     ends = along_motion(single)["force_N"].quantile([0.002, 0.998]) if len(single) else None  # but spikes
     shown = pd.concat([along_motion(traces)["force_N"], ends])
     span = style.padded(shown.min(), shown.max())
@@ -274,11 +254,7 @@ QUANTITIES = {
 
 
 def draw_master_curve(
-    ax: Axes,
-    rows: pd.DataFrame,
-    colours: Mapping[float, str],
-    units: Units,
-    before: pd.DataFrame | None = None,
+    ax: Axes, rows: pd.DataFrame, before: pd.DataFrame, colours: Mapping[float, str], units: Units
 ) -> None:
     """Draw one quantity's values over scaled aging time, and the law with its 95 % band.
 
@@ -292,21 +268,16 @@ def draw_master_curve(
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     style.draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], style.FLOOR)
     ax.plot(law["scaled_days"], law["value"], color=style.FLOOR)
-    if before is not None:
-        earlier = before[before["kind"] == "law"].sort_values("scaled_days")
-        ax.plot(earlier["scaled_days"], earlier["value"], color=style.FLOOR, linestyle=":")
+    earlier = before[before["kind"] == "law"].sort_values("scaled_days")
+    ax.plot(earlier["scaled_days"], earlier["value"], color=style.FLOOR, linestyle=":")
     fresh = values[values["scaled_days"] == 0]
     if not fresh.empty:  # an unclipped line without points has its place at the corner of the figure
-        ax.plot(
-            fresh["scaled_days"], fresh["value"], linestyle="", marker="o", color=style.BLACK, clip_on=False
-        )
+        ax.plot(fresh["scaled_days"], fresh["value"], "o", color=style.BLACK, clip_on=False)
     percents = np.sort(aged["compression_ratio_pct"].dropna().unique())
     for (celsius, percent), own in aged.groupby(["temperature_C", "compression_ratio_pct"], dropna=False):
         rank = int(np.searchsorted(percents, percent)) if np.isfinite(percent) else 0
         marker, colour = MARKERS[rank % len(MARKERS)], colours.get(celsius, style.BLACK)
-        (points,) = ax.plot(
-            own["scaled_days"], own["value"], linestyle="", marker=marker, markersize=4, color=colour
-        )
+        (points,) = ax.plot(own["scaled_days"], own["value"], marker, markersize=4, color=colour)
         known = [(value, unit) for value, unit in ((celsius, "°C"), (percent, "%")) if np.isfinite(value)]
         place = ", ".join(f"{given(value)} {unit}" for value, unit in known)
         texts = zip(own["value"], own["aging_days"], strict=True)
@@ -315,7 +286,7 @@ def draw_master_curve(
     ax.set_ylabel(symbol_math(rows["quantity"].iloc[0]))
 
 
-def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+def master_curve(tables: Tables, config: Config) -> Plot | None:
     """Return the master curves, a panel per rubber and quantity, or None where there is no joint law."""
     table = tables["master_curve"]
     if table.empty:
@@ -328,19 +299,16 @@ def master_curve(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | N
     before = tables.get("master_curve_before", table.iloc[:0])
     for (rubber, quantity), rows in groups:
         earlier = before[(before["rubber"] == rubber) & (before["quantity"] == quantity)]
-        shown = pd.concat(
-            [rows["value"], rows["lo95"], rows["hi95"], earlier.loc[earlier["kind"] == "law", "value"]]
-        )
+        earlier = earlier[earlier["kind"] == "law"]
+        shown = pd.concat([rows["value"], rows["lo95"], rows["hi95"], earlier["value"]])
         limits = {"ylim": style.padded(shown.min(), shown.max())}
-        draw = partial(draw_master_curve, rows=rows, colours=colours, units=config.units, before=earlier)
+        draw = partial(draw_master_curve, rows=rows, before=earlier, colours=colours, units=config.units)
         words = QUANTITIES.get(quantity, symbol_plain(quantity))
         title = f"{rubber}, {words}" if several else words
         alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
         panels.append(Panel(capital(title), alt, draw, limits=limits))
-    legend = [
-        Key(f"{given(t)} °C", colour, "point")
-        for t, colour in style.spread(list(colours.items()), style.MOST_KEYS)
-    ]
+    keys = style.spread(list(colours.items()), style.MOST_KEYS)
+    legend = [Key(f"{given(t)} °C", colour, "point") for t, colour in keys]
     if ((table["kind"] == "value") & (table["scaled_days"] == 0)).any():
         legend.append(Key("unaged", style.BLACK, "point"))
     legend.append(Key("law, 95 % band", style.FLOOR, "band"))
