@@ -26,7 +26,7 @@ def stored(traces: pd.DataFrame, folder, files: list[list[str]]) -> list[StoredT
         paths.append(folder / f"{number}.parquet")
         part = traces[traces["file"].isin(own)]
         absent = {name: None for name in TRACES.names() if name not in part}
-        parquet.write(part.assign(**absent), TRACES, Units(), paths[-1])
+        parquet.write_arrow(parquet.to_arrow(part.assign(**absent), TRACES, Units()), paths[-1])
     return [StoredTraces(frozenset("a"), tuple(paths[:1])), StoredTraces(frozenset("b"), tuple(paths[1:]))]
 
 

@@ -110,14 +110,16 @@ def test_a_table_survives_parquet(tmp_path_factory, rows):
 def test_a_number_that_is_missing_is_null_and_stays_missing(tmp_path_factory, values):
     path = tmp_path_factory.mktemp("t") / "bins.parquet"
     frame = small("bins", len(values)).assign(load_N=pd.Series(values, dtype=float))
-    parquet.write(frame, BINS, Units(), path)
+    parquet.write_arrow(parquet.to_arrow(frame, BINS, Units()), path)
     assert pq.read_table(path)["load_N"].null_count == sum(value is None for value in values)
     np.testing.assert_array_equal(parquet.read(path)["load_N"], np.array(values, dtype=float))
 
 
 def test_columns_come_in_the_order_of_the_schema_and_channels_after_them(tmp_path):
     frame = small("bins", humidity_pct=40.0, batch="b1")
-    parquet.write(frame[sorted(frame.columns)], BINS, Units(), tmp_path / "bins.parquet")
+    parquet.write_arrow(
+        parquet.to_arrow(frame[sorted(frame.columns)], BINS, Units()), tmp_path / "bins.parquet"
+    )
     assert list(parquet.read(tmp_path / "bins.parquet").columns) == [*BINS.names(), "batch", "humidity_pct"]
 
 
@@ -125,7 +127,10 @@ def test_columns_come_in_the_order_of_the_schema_and_channels_after_them(tmp_pat
 def test_only_the_rows_asked_for_are_read(tmp_path, coded):
     paths = [tmp_path / name for name in ("one.parquet", "two.parquet")]
     for path, runs in zip(paths, (["a", "b", "a"], ["c", "d", "b"]), strict=True):
-        parquet.write(small("bins", 3).assign(run_id=runs, load_N=[1.0, 2.0, 3.0]), BINS, Units(), path)
+        parquet.write_arrow(
+            parquet.to_arrow(small("bins", 3).assign(run_id=runs, load_N=[1.0, 2.0, 3.0]), BINS, Units()),
+            path,
+        )
     rows = parquet.read(paths, ["run_id", "load_N"], coded, where={"run_id": ["b", "d"]})
     assert rows["run_id"].tolist() == ["b", "d", "b"]
     assert rows["load_N"].tolist() == [2.0, 2.0, 3.0]

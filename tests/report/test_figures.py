@@ -37,6 +37,7 @@ from sealfit.report.figures.speed import curve_lines, force_speed, run_points
 from sealfit.report.style import AFTER, Key, Panel, Plot, compose, is_logarithmic, value_ticks
 from sealfit.units import Units
 
+NO_POINTS = pd.DataFrame()
 TORQUE = Units(
     {"force": ("torque", "mN m"), "displacement": ("angle", "turn"), "speed": ("rotational speed", "rpm")}
 )
@@ -324,20 +325,20 @@ def test_an_effect_of_the_direction_is_shown_over_the_signed_speed(made, command
 
 
 def test_a_factor_is_drawn_in_percent(ax, made):
-    draw_shape(ax, shapes(), made.closure["effects"][0], Units())
+    draw_shape(ax, shapes(), NO_POINTS, made.closure["effects"][0], Units())
     assert ax.get_ylabel() == r"change of $\mu$ (%)"
     npt.assert_allclose(ax.lines[-1].get_ydata()[-1], -100 * DROP, rtol=1e-6)
 
 
 def test_a_shape_along_repeats_has_ticks_at_repeats_only(ax, made):
     rows, points = shapes(), shape_points().iloc[:3].assign(x=[1.0, 2.0, 3.0])
-    draw_shape(ax, rows.assign(x=np.linspace(1, 3, len(rows))), made.closure["effects"][0], Units(), points)
+    draw_shape(ax, rows.assign(x=np.linspace(1, 3, len(rows))), points, made.closure["effects"][0], Units())
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["1", "2", "3"]
 
 
 def test_partial_residuals_lie_behind_an_effect(ax, made):
     points = shape_points()
-    draw_shape(ax, shapes(), made.closure["effects"][0], Units(), points)
+    draw_shape(ax, shapes(), points, made.closure["effects"][0], Units())
     drawn = ax.containers[0]
     npt.assert_allclose(drawn.lines[0].get_xydata(), np.stack([points["x"], 100 * points["value"]], axis=1))
     npt.assert_allclose(np.ptp(drawn.lines[2][0].get_segments()[0][:, 1]), 2 * 1.959964 * 0.05)
@@ -350,7 +351,9 @@ def test_partial_residuals_lie_behind_an_effect(ax, made):
 
 def test_an_added_force_has_its_unit(ax, made):
     rows = shapes().assign(unit="mN m")
-    draw_shape(ax, rows, {**made.closure["effects"][0], "acts_on": "force", "operation": "add"}, TORQUE)
+    draw_shape(
+        ax, rows, NO_POINTS, {**made.closure["effects"][0], "acts_on": "force", "operation": "add"}, TORQUE
+    )
     assert ax.get_ylabel() == "added torque (mN m)"
 
 
@@ -361,7 +364,7 @@ def test_directions_are_two_and_named(ax, made):
         .head(5)
         .assign(channel="direction", x=x, value=0.1 * x, lo95=0.1 * x - 0.02, hi95=0.1 * x + 0.02)
     )
-    draw_shape(ax, rows, made.closure["effects"][0], Units())
+    draw_shape(ax, rows, NO_POINTS, made.closure["effects"][0], Units())
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["backward", "forward"]
     npt.assert_allclose(ax.containers[0].lines[0].get_ydata(), [-10.0, 10.0])
 

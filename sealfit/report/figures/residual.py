@@ -30,7 +30,7 @@ from sealfit.report.notation import (
     symbol_plain,
     together,
 )
-from sealfit.report.style import Key, Panel, Plot
+from sealfit.report.style import Key, Panel, Plot, Tables
 from sealfit.report.summary import by_gain
 from sealfit.tables import CALENDAR
 from sealfit.units import Units
@@ -100,7 +100,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
+def before_after(tables: Tables, closure: Mapping, config: Config) -> Plot | None:
     """Return the errors before and after with the noise floor, or None if no error is known."""
     if not any(known(closure["before"][key]) for key, _ in ERRORS):
         return None
@@ -130,12 +130,12 @@ def before_after(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: C
 
 
 # ---------------------------------------------------------------- finding
-def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
+def finding(tables: Tables, closure: Mapping, config: Config) -> Plot | None:
     """Return the evidence for the verdict: the residual along one variable, and the panels of the errors.
 
     The variable is that of the effect that reduces the held-out error most, or, without an effect, the most
-    significant one. Of the direction it is the signed speed, over
-    which an offset, a factor and viscous friction of one direction differ. None if there is no residual.
+    significant one. In place of the direction it is the signed speed, over which an offset, a factor and
+    viscous friction of one direction differ. None if there is no residual.
     """
     errors, channels = before_after(tables, closure, config), tables["channels"]
     if errors is None or channels.empty:
@@ -149,7 +149,7 @@ def finding(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config
     return Plot("finding", title, (panel, *errors.panels), (*STAGES, *floor))
 
 
-def _own_panel(name: str, tables: Mapping[str, pd.DataFrame], config: Config) -> Panel:
+def _own_panel(name: str, tables: Tables, config: Config) -> Panel:
     """Return a panel of the residual along a channel, on a scale of its own; see `finding`."""
     rows = tables["channels"][tables["channels"]["channel"] == name]
     if name == "direction":
@@ -159,7 +159,7 @@ def _own_panel(name: str, tables: Mapping[str, pd.DataFrame], config: Config) ->
     return replace(panel, title=f"{panel.title}, negative backward") if backward else panel
 
 
-def refused(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
+def refused(tables: Tables, closure: Mapping, config: Config) -> Plot | None:
     """Return the residual along the variables of effects that were not accepted, a panel for each variable.
 
     Beside another variable, the direction has none. None if there is no panel.
@@ -217,7 +217,7 @@ def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
     ax.set_xlabel(f"variance (({unit})²)" if " " in unit else f"variance ({unit}²)")
 
 
-def variance_levels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+def variance_levels(tables: Tables, config: Config) -> Plot | None:
     """Return the residual's variance by level, or None of properties."""
     levels = tables["levels"]
     whole = levels[levels["channel"].isna() & levels["sd_N"].notna()]
@@ -255,19 +255,11 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     ):
         spread = rows[f"{stage}_half_N"].fillna(0.0).to_numpy(float)
         places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
+        face, above = ("white", 2) if stage == "before" else (colour, 3)
         points, *_ = ax.errorbar(
-            places,
-            mean,
-            spread,
-            color=colour,
-            marker=marker,
-            markerfacecolor="white" if stage == "before" else colour,
-            linestyle="-" if numeric else "",
-            linewidth=0.8,
-            zorder=2 if stage == "before" else 3,
-            rasterized=len(rows) > style.MOST_MARKS,
-            **size,
-        )
+            places, mean, spread, color=colour, marker=marker, markerfacecolor=face, zorder=above,
+            linestyle="-" if numeric else "", linewidth=0.8, rasterized=len(rows) > style.MOST_MARKS, **size,
+        )  # fmt: skip
         if len(rows) <= style.MOST_MARKS:
             names = [number(value, 4) for value in x] if numeric else categories(rows, channel)
             texts = (f"{number(m, 3)} ± {number(s, 2)}" for m, s in zip(mean, spread, strict=True))
@@ -294,19 +286,15 @@ def categories(rows: pd.DataFrame, channel: str) -> list[str]:
     return rows["label"].astype(str).tolist()
 
 
-def channel_order(tables: Mapping[str, pd.DataFrame]) -> list[str]:
+def channel_order(tables: Tables) -> list[str]:
     """Return the channels by the p-value of what they explain of the residual, the smallest first."""
-    tests = tables["levels"]
+    tests, names = tables["levels"], tables["channels"]["channel"].unique()
     tests = tests[(tests["stage"] == "before") & tests["p_value"].notna()]
-    first = tests.sort_values(["p_value", "sd_N"], ascending=[True, False])["channel"].tolist()
-    names = tables["channels"]["channel"]
-    return [
-        *(name for name in dict.fromkeys(first) if name in set(names)),
-        *names[~names.isin(first)].unique(),
-    ]
+    first = tests.sort_values(["p_value", "sd_N"], ascending=[True, False])["channel"]
+    return [name for name in dict.fromkeys([*first, *names]) if name in names]
 
 
-def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+def residual_channels(tables: Tables, config: Config) -> Plot | None:
     """Return the residual along every channel, before and after, or None of properties."""
     channels = tables["channels"]
     if channels.empty:
@@ -320,11 +308,7 @@ def residual_channels(tables: Mapping[str, pd.DataFrame], config: Config) -> Plo
 
 
 def _channel_panel(
-    rows: pd.DataFrame,
-    name: str,
-    tables: Mapping[str, pd.DataFrame],
-    config: Config,
-    span: tuple[float, float] | None = None,
+    rows: pd.DataFrame, name: str, tables: Tables, config: Config, span: tuple[float, float] | None = None
 ) -> Panel:
     """Return a panel of the mean residual along a channel; `span` is that of its axis of forces."""
     rows = rows.sort_values("x") if rows["x"].notna().all() else rows
@@ -352,9 +336,7 @@ def _span(channels: pd.DataFrame) -> tuple[float, float]:
 
 
 # ---------------------------------------------------------------- shapes of effects
-def draw_shape(
-    ax: Axes, rows: pd.DataFrame, effect: Mapping, units: Units, points: pd.DataFrame | None = None
-) -> None:
+def draw_shape(ax: Axes, rows: pd.DataFrame, points: pd.DataFrame, effect: Mapping, units: Units) -> None:
     """Draw an effect along one channel: its form with the 95 % band, and the free shape it was compared with.
 
     `rows` are those of table `shapes` of this effect and channel, `effect` is its entry in closure.json. The
@@ -374,7 +356,7 @@ def draw_shape(
         ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
         if channel not in CALENDAR and style.is_logarithmic(x, LOG_SPAN):
             style.log_axis(ax)
-        elif points is not None and len(points):
+        elif len(points):
             style.value_ticks(ax, points["x"].to_numpy(float))
     else:
         x = np.arange(len(rows))
@@ -382,7 +364,7 @@ def draw_shape(
         ax.errorbar(x, value, spread, color=style.AFTER, fmt="o", elinewidth=1.4, capsize=2.0)
         ax.plot(x, free, color=style.FLOOR, marker="_", linestyle="", markersize=12)
         style.category_ticks(ax, categories(rows, channel))
-    if points is not None and len(points):
+    if len(points):
         places = points["x"] if numeric else np.arange(len(points)) + 0.15
         ax.errorbar(
             places, scale * points["value"], Z95 * scale * points["se"], color=style.FLOOR, fmt="o",
@@ -410,7 +392,7 @@ def shape_label(
     return f"added {force}{tail}" if target == "force" else f"change of {symbol(target)}{tail}"
 
 
-def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> Plot | None:
+def effect_shapes(tables: Tables, closure: Mapping, config: Config) -> Plot | None:
     """Return the shape of every effect, a panel for each channel it is drawn along; None if there is none."""
     shapes, points = tables["shapes"], tables["shape_points"]
     if shapes.empty:
@@ -423,12 +405,12 @@ def effect_shapes(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: 
         effect = effects[int(index)]
         rows = rows.sort_values("x") if rows["x"].notna().all() else rows
         own = points[(points["effect"] == index) & (points["channel"] == channel)]
-        draw = partial(draw_shape, rows=rows, effect=effect, units=config.units, points=own)
-        scale = shape_scale(effect)
+        draw = partial(draw_shape, rows=rows, points=own, effect=effect, units=config.units)
+        values = shape_scale(effect) * rows["value"]
         words = ("candidate: " if effect["candidate"] else "") + effect_label(effect, config.units)
         alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
-        alt += f"{shape_label(rows, effect, config.units)} from {number(scale * rows['value'].min())} to "
-        alt += f"{number(scale * rows['value'].max())}."
+        alt += f"{shape_label(rows, effect, config.units)} "
+        alt += f"from {number(values.min())} to {number(values.max())}."
         number_of = f"{place[int(index)] + 1}. " if len(effects) > 1 else ""
         panels.append(Panel(number_of + capital(words), alt, draw))
     legend = [Key("effect, 95 % band", style.AFTER)]
