@@ -6,7 +6,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape, quoteattr
 
@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 
 from sealfit.config import Config
 from sealfit.report.notation import ConditionNames, given, plain
-from sealfit.report.style import Plot, compose, look
+from sealfit.report.style import Plot, Tables, compose, look
 
 PRINT = 300  # pixels of a PNG file in an inch
 NEAR = 8.0  # points: size of the place around a marker at which its text is shown
@@ -58,7 +58,7 @@ def inline(svg: str, name: str, alt: str) -> Markup:
     return Markup(svg.replace("<svg", f'<svg role="img" aria-label={quoteattr(alt)}', 1))
 
 
-def run_traces(tables: Mapping[str, pd.DataFrame], config: Config) -> dict:
+def run_traces(tables: Tables, config: Config) -> dict:
     """Return the measured force and the model's along every run, which the page draws on a click.
 
     The model is that of the first of tables `residuals_after` and `residuals_before` that has rows. Returned

@@ -21,14 +21,8 @@ from sealfit.report import notation, parameter_tables, words
 from sealfit.report.drawing import Drawn, draw, inline, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
-from sealfit.report.notation import (
-    ConditionNames,
-    capital,
-    channel_label,
-    count,
-    given,
-    true_units,
-)
+from sealfit.report.notation import ConditionNames, capital, channel_label, count, given, true_units
+from sealfit.report.style import Tables
 from sealfit.report.summary import of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
 from sealfit.tables import FITTED, SCHEMAS
@@ -39,7 +33,7 @@ RANK = {"error": 0, "warning": 1, "info": 2}  # of a severity, in the order of t
 TEMPLATES = Environment(autoescape=True, undefined=StrictUndefined, loader=PackageLoader("sealfit", "report"))
 
 
-def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[str]:
+def campaign_facts(tables: Tables, config: Config) -> list[str]:
     """Return the campaign in a few short phrases: files, runs, conditions, speeds, load."""
     steady, inputs, units = tables["steady"], tables["inputs"], config.units
     used = steady[steady["used"].astype(bool)]
@@ -49,9 +43,8 @@ def campaign_facts(tables: Mapping[str, pd.DataFrame], config: Config) -> list[s
         repeats = used.groupby("run_id")["file"].nunique()
         facts.append("no repeats" if repeats.max() == 1 else f"{_range(repeats)} repeats per run")
         speed = used["speed_set_mm_s"].fillna(used["speed_mm_s"].abs()).astype(float)
-        facts.append(f"{units.quantity('speed')} {_range(speed)} {units.unit('speed')}")
-        if used["direction"].nunique() > 1:
-            facts[-1] += ", both directions"
+        both = ", both directions" if used["direction"].nunique() > 1 else ""
+        facts.append(f"{units.quantity('speed')} {_range(speed)} {units.unit('speed')}{both}")
         if used["load_N"].notna().any():
             facts.append(f"{units.quantity('load')} {_range(used['load_N'], 4)} {units.unit('load')}")
         else:
@@ -96,8 +89,7 @@ def _finding(group: list[Fault], config: Config) -> dict:
     row["column"] = channel_label(first.column, config.units) if first.column else ""
     row["check"] = first.check.replace("_", " ")
     if len(group) == 1:
-        numbers = {"stroke": first.stroke, "line": first.line}
-        places = [f"{what} {n}" for what, n in numbers.items() if n is not None]
+        places = [f"{what} {row[what]}" for what in ("stroke", "line") if row[what] is not None]
         return {**row, "place": ", ".join(places)}
     row |= {"file": how_many(group), "value": None, "place": "; ".join(examples(group))}
     return row if one_reason(group) else {**row, "reason": ""}
@@ -121,12 +113,7 @@ class Report:
     figures: dict[str, Drawn]
 
 
-def build_report(
-    tables: Mapping[str, pd.DataFrame],
-    closure: Mapping | None,
-    provenance: Mapping,
-    config: Config,
-) -> Report:
+def build_report(tables: Tables, closure: Mapping | None, provenance: Mapping, config: Config) -> Report:
     """Return the report of one campaign.
 
     `tables` are those of OUT by name, which may be missing or empty; `closure` and `provenance` are its JSON
@@ -156,7 +143,7 @@ def build_report(
     return Report(html, figures)
 
 
-def _of_properties(tables: Mapping[str, pd.DataFrame]) -> dict:
+def _of_properties(tables: Tables) -> dict:
     """Return the head of the page of properties."""
     properties = of_properties(tables["property_values"], tables["aging_fit"], tables["aging_laws"])
     known = [p for one in properties if (p := one["lack_of_fit_p"]) is not None]
@@ -181,9 +168,7 @@ def _of_property(one: Mapping) -> Markup:
     return said.replace(", E ", Markup(", <i>E</i>&nbsp;"))
 
 
-def answered(
-    tables: Mapping[str, pd.DataFrame], closure: Mapping | None
-) -> tuple[dict[str, pd.DataFrame], Mapping | None]:
+def answered(tables: Tables, closure: Mapping | None) -> tuple[Tables, Mapping | None]:
     """Return tables and closure.json as the page uses them; see `with_after_fits`."""
     tables = with_after_fits(tables)
     if closure is not None and len(tables["steady"]) and tables["steady"]["load_N"].isna().all():
@@ -191,7 +176,7 @@ def answered(
     return tables, closure
 
 
-def with_after_fits(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+def with_after_fits(tables: Tables) -> Tables:
     """Return all tables, with the fits after the loop in place of those before it, if there are any.
 
     Those before then have the suffix `_before`. A missing table is an empty one with its columns.
@@ -206,7 +191,7 @@ def with_after_fits(tables: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFram
     return found
 
 
-def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Config) -> dict:
+def _of_loop(tables: Tables, closure: Mapping, config: Config) -> dict:
     """Return the head of the page, and the effects at whose reference state the fits are."""
     added = [effect for effect in closure["effects"] if not effect["candidate"]]
     return {
@@ -221,13 +206,12 @@ def _of_loop(tables: Mapping[str, pd.DataFrame], closure: Mapping, config: Confi
     }
 
 
-def _fitted(tables: Mapping[str, pd.DataFrame], config: Config) -> list[parameter_tables.ParameterTable]:
+def _fitted(tables: Tables, config: Config) -> list[parameter_tables.ParameterTable]:
     """Return the tables of fitted parameters; those of the goodness of fit come last."""
     found = []
     for name in parameter_tables.TITLES:
         fit = tables[name]
-        if name == "dynamic_fit":
-            fit = fit[fit["quantity"] == "dynamic"]
+        fit = fit[fit["quantity"] == "dynamic"] if name == "dynamic_fit" else fit
         found += parameter_tables.parameter_tables(fit, name, config, tables.get(f"{name}_before"))
     return sorted(found, key=lambda table: table.statistics)
 

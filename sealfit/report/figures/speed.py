@@ -27,7 +27,7 @@ from sealfit.report.notation import (
     plain,
     short,
 )
-from sealfit.report.style import Key, Panel, Plot
+from sealfit.report.style import Key, Panel, Plot, Tables
 from sealfit.units import Units
 
 # ---------------------------------------------------------------- force against speed
@@ -68,19 +68,12 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
             backward = (curve["direction"] < 0).any()
             ax.plot(speed, curve["after"], color=line.colour, linestyle="--" if backward else "-")
         for direction, points in line.points.groupby("direction") if len(line.points) else ():
+            marker, face = ("o", line.colour) if direction > 0 else ("<", "white")
             drawn, *_ = ax.errorbar(
-                points["speed"],
-                points["force"],
-                points["sd"].fillna(0.0),
-                color=line.colour,
-                fmt="o" if direction > 0 else "<",
-                markersize=3.4,
-                markerfacecolor=line.colour if direction > 0 else "white",
-                markeredgewidth=0.9,
-                elinewidth=0.8,
-                capsize=0.0 if dense else 1.5,
-                rasterized=dense,
-            )
+                points["speed"], points["force"], points["sd"].fillna(0.0), color=line.colour, fmt=marker,
+                markersize=3.4, markerfacecolor=face, markeredgewidth=0.9, elinewidth=0.8,
+                capsize=0.0 if dense else 1.5, rasterized=dense,
+            )  # fmt: skip
             if not dense:
                 explain(drawn, [_of_run(row, line.label, units) for row in points.to_dict("records")])
     if log:
@@ -98,7 +91,7 @@ def _of_run(row: Mapping, condition: str, units: Units) -> str:
     return "\n".join([force, f"{condition}, {speed}", row["run_id"], row["files"]])
 
 
-def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+def force_speed(tables: Tables, config: Config) -> Plot | None:
     """Return force against speed for every condition, a panel per series, or None if nothing was measured."""
     points, curves = run_points(tables["steady"]), curve_lines(tables)
     conditions = pd.unique(pd.concat([points["condition"], curves["condition"]], ignore_index=True))
@@ -137,35 +130,27 @@ def force_speed(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | No
     panels = []
     for title, group in groups.items():
         shared = [c for c in unaged if c not in group and rubber.get(c) in {rubber.get(g) for g in group}]
-        lines = [
-            Line(
-                names(c),
-                style.BLACK if is_unaged(c) else colour[names.parts(c)[last]],
-                own_curves.get(c, ()),
-                own_points.get(c, points.iloc[:0]),
-            )
-            for c in [*shared, *group]
-        ]
+        lines = []
+        for c in [*shared, *group]:
+            own = own_curves.get(c, ()), own_points.get(c, points.iloc[:0])
+            lines.append(Line(names(c), style.BLACK if is_unaged(c) else colour[names.parts(c)[last]], *own))
         draw = partial(draw_force_speed, lines=lines, units=config.units, log=log)
         panels.append(Panel(title, _force_alt(title, lines, config), draw, limits=limits))
     legend = [Key(short(names(c)), style.BLACK) for c in style.spread(unaged, style.MOST_KEYS)]
-    for level in style.spread(levels, style.MOST_KEYS):
-        legend.append(Key(short(names(f"{last}={level}")), colour[level]))
-    for what, signs, marks in (
-        ("run means", set(points["direction"]), {1: "point", -1: "left"}),
-        ("model", set(curves["direction"]), {1: "line", -1: "dashed"}),
-    ):
-        named = (
-            {1: f"{what}, forward", -1: f"{what}, backward"} if len(signs) > 1 else dict.fromkeys(signs, what)
-        )
-        legend += [Key(named[sign], style.FLOOR, marks[sign]) for sign in (1, -1) if sign in signs]
+    keys = style.spread(levels, style.MOST_KEYS)
+    legend += [Key(short(names(f"{last}={level}")), colour[level]) for level in keys]
+    kinds = (("run means", points, ("point", "left")), ("model", curves, ("line", "dashed")))
+    for what, rows, marks in kinds:
+        signs = rows["direction"].unique()
+        for sign, way, mark in zip((1, -1), ("forward", "backward"), marks, strict=True):
+            if sign in signs:
+                legend.append(Key(f"{what}, {way}" if len(signs) > 1 else what, style.FLOOR, mark))
     if curves["lo"].notna().any():
         legend.append(Key("95 % band", style.FLOOR, "band"))
     gap = (curves["after"] - curves["before"]).abs().max()
     if gap > 1e-9 * max(curves["after"].abs().max(), 1e-300):
         legend.append(Key("declared model", style.FLOOR, "dotted"))
-    quantity = config.units.quantity("force")
-    title = f"{capital(quantity)} against {config.units.quantity('speed')}"
+    title = f"{capital(config.units.quantity('force'))} against {config.units.quantity('speed')}"
     height = style.HEIGHT if len(groups) > 2 else TALL
     return Plot("force_speed", title, tuple(panels), tuple(legend), note, height)
 
@@ -193,23 +178,15 @@ def run_points(steady: pd.DataFrame) -> pd.DataFrame:
     return found.reset_index()
 
 
-def curve_lines(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+def curve_lines(tables: Tables) -> pd.DataFrame:
     """Return the curves of the loop by magnitude of the speed."""
-    curves = tables["curves"]
+    curves = tables["curves"].rename(columns={"load_N": "load"})
     sign = np.sign(curves["speed_mm_s"]).replace(0.0, 1.0)
     ends = curves[["force_after_lo95_N", "force_after_hi95_N"]].mul(sign, axis=0)
-    return pd.DataFrame(
-        {
-            "condition": curves["condition"],
-            "direction": sign,
-            "load": curves["load_N"],
-            "speed": curves["speed_mm_s"].abs(),
-            "before": curves["force_before_N"] * sign,
-            "after": curves["force_after_N"] * sign,
-            "lo": ends.min(axis=1),
-            "hi": ends.max(axis=1),
-        }
-    ).sort_values(["condition", "direction", "speed"])
+    before, after = curves["force_before_N"] * sign, curves["force_after_N"] * sign
+    found = curves[["condition", "load"]].assign(direction=sign, speed=curves["speed_mm_s"].abs())
+    found = found.assign(before=before, after=after, lo=ends.min(axis=1), hi=ends.max(axis=1))
+    return found.sort_values(["condition", "direction", "speed"])
 
 
 def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict[str, list[str]]:
@@ -250,10 +227,8 @@ def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], un
         x, force, error = curve["distance_mm"], curve["force_N"], curve["force_se_N"].fillna(0.0)
         marker, face, line = ("o", colour, "-") if direction > 0 else ("<", "white", "--")
         style.draw_band(ax, x, force - error, force + error, colour)
-        ax.plot(
-            x, force, linestyle="", marker=marker, markersize=2.6, color=colour, markerfacecolor=face,
-            markeredgewidth=0.7,
-        )  # fmt: skip
+        look = {"color": colour, "markerfacecolor": face, "markersize": 2.6, "markeredgewidth": 0.7}
+        ax.plot(x, force, marker, **look)
         ax.plot(x, curve["model_N"], color=colour, linestyle=line)
     ax.set_xlim(0.0, _reach(curves))
     ax.set_xlabel(plain(units.label("distance_mm")))
@@ -270,7 +245,7 @@ def _reach(curves: pd.DataFrame) -> float:
     return float(BEYOND * max(ends))
 
 
-def starts(tables: Mapping[str, pd.DataFrame], config: Config) -> Plot | None:
+def starts(tables: Tables, config: Config) -> Plot | None:
     """Return the pre-sliding force of up to six conditions at up to three speeds each; None without one."""
     curves = tables["dynamic_curves"]
     if curves.empty:
