@@ -82,8 +82,7 @@ def _rows_left_out(faults: pd.DataFrame) -> int:
 
 def of_fit(fit: pd.DataFrame, of: str) -> dict:
     """Return the range of each parameter over the conditions or series of `fit` in which it is identified."""
-    rows = fit[fit["quantity"] != STATISTICS]
-    ranges = []
+    rows, ranges = fit[fit["quantity"] != STATISTICS], []
     keys = ["quantity", "parameter", "unit"]
     for (quantity, parameter, unit), group in rows.groupby(keys, sort=False, dropna=False):
         identified = group["identified"].astype(bool)
@@ -92,18 +91,9 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
         why = "".join(lacking["reason"].mode()[:1])  # the most frequent reason
         if lacking["reason"].nunique() > 1:
             why = f"For example, {lacking.loc[lacking['reason'] == why, of].iloc[0]}: {why}"
-        ranges.append(
-            {
-                "quantity": quantity,
-                "parameter": parameter,
-                "unit": unit or "",
-                "min": float(known.min()) if len(known) else None,
-                "max": float(known.max()) if len(known) else None,
-                "identified": len(known),
-                "of": len(group),
-                "reason": why,
-            }
-        )
+        low, high = (float(known.min()), float(known.max())) if len(known) else (None, None)
+        row = {"quantity": quantity, "parameter": parameter, "unit": unit or "", "min": low, "max": high}
+        ranges.append({**row, "identified": len(known), "of": len(group), "reason": why})
     return {of: int(fit[of].nunique()), "parameters": ranges}
 
 
@@ -208,23 +198,20 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
 
 def verdict_clauses(closure: Mapping, units: Units) -> list[str]:
     """Return what the verdict says beside the effects that were added, in clauses; some may be empty."""
-    kind, quality = closure["verdict"], quality_clause(closure)
+    kind, quality, along = closure["verdict"], quality_clause(closure), residual_clause(closure, units)
+    untold = untold_clause(closure, units)
     if kind == "nothing_missing":
-        said = ["no effect beyond the declared model is significant", quality, power_clause(closure, units)]
-    elif kind == "cannot_tell":
-        untold = untold_clause(closure, units)
-        said = [quality, f"these files do not decide whether an effect is missing: {untold}"]
-    elif kind == "closed":
-        remains = "no significant residual remains"
-        if closure["left"]["significant"]:
-            remains = f"what remains{residual_clause(closure, units)} is less than repeats scatter by"
-        elif has_weak_evidence(closure["left"]):
-            remains = f"the evidence of what remains{residual_clause(closure, units)} is weak"
-        untold = untold_clause(closure, units)
-        said = [remains, quality, f"not decided by these files: {untold}" if untold else ""]
-    else:
-        said = [f"a significant residual remains{residual_clause(closure, units)}", quality]
-    return said
+        return ["no effect beyond the declared model is significant", quality, power_clause(closure, units)]
+    if kind == "cannot_tell":
+        return [quality, f"these files do not decide whether an effect is missing: {untold}"]
+    if kind == "unexplained":
+        return [f"a significant residual remains{along}", quality]
+    remains = "no significant residual remains"
+    if closure["left"]["significant"]:
+        remains = f"what remains{along} is less than repeats scatter by"
+    elif has_weak_evidence(closure["left"]):
+        remains = f"the evidence of what remains{along} is weak"
+    return [remains, quality, f"not decided by these files: {untold}" if untold else ""]
 
 
 def residual_clause(closure: Mapping, units: Units) -> str:
@@ -269,19 +256,10 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
             {"name": p.name, "unit": parameter_unit(p.unit, likeliest, units), "meaning": p.meaning}
             for p in effect.parameters
         ]
-        listed.append(
-            {
-                "id": effect.id,
-                "label": effect.label.replace("{x}", "a channel x").replace("{z}", "a channel z"),
-                "form": effect.form,
-                "equation": effect.equation,
-                "reads": list(effect.reads),
-                "acts_on": ways,
-                "physical": effect.physical,
-                "source": effect.source,
-                "parameters": parameters,
-            }
-        )
+        label = effect.label.replace("{x}", "a channel x").replace("{z}", "a channel z")
+        named = {"id": effect.id, "label": label, "form": effect.form, "equation": effect.equation}
+        named |= {"reads": list(effect.reads), "acts_on": ways, "physical": effect.physical}
+        listed.append({**named, "source": effect.source, "parameters": parameters})
     return listed
 
 
@@ -361,13 +339,10 @@ def untold_clause(closure: Mapping, units: Units) -> str:
     ][:NAMED]
     for entry in [s for s in closure["sensitivity"] if s["cannot_tell"]][:NAMED]:
         smallest, files = entry["smallest_pct"], entry["files_needed"]
-        if smallest is None:
-            size, more = "no effect is detectable", f"; at least {files} files are needed"
-        else:
-            size, more = (
-                f"detection limit {_two_digits(smallest)} % of the force",
-                f"; 1 % needs about {_two_digits(files)} files",
-            )
+        size, more = "no effect is detectable", f"; at least {files} files are needed"
+        if smallest is not None:
+            size = f"detection limit {_two_digits(smallest)} % of the force"
+            more = f"; 1 % needs about {_two_digits(files or 0)} files"
         variable = f"{units.label(entry['variable'])} {level_words(entry['level'])}"
         texts.append(f"{variable} ({size}{more if files else ''})")
     return ", ".join(texts)

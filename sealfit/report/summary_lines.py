@@ -189,14 +189,10 @@ def closure_lines(part: Mapping) -> list[str]:
         found.append(line("", f"{status}{effect['label']}: {values}"))
         if not effect["candidate"]:
             found.append(line("", f"  reference state of the coefficients: {effect['reference']}"))
-    rows = (
-        ("rmse", "rmse_N"),
-        ("held out", "heldout_rmse_N"),
-        ("run means", "rmse_runs_N"),
-        ("largest", "max_abs_N"),
-    )
+    held_out = ("held out", "heldout_rmse_N")
     if before["heldout_rmse_N"] is None and before["heldout_extrapolated_rmse_N"] is not None:
-        rows = (rows[0], ("held out, all extrapolated", "heldout_extrapolated_rmse_N"), *rows[2:])
+        held_out = ("held out, all extrapolated", "heldout_extrapolated_rmse_N")
+    rows = (("rmse", "rmse_N"), held_out, ("run means", "rmse_runs_N"), ("largest", "max_abs_N"))
     texts = [f"{name} {_number(before[key])} -> {_number(after[key])}" for name, key in rows]
     found.append(line(f"error ({unit})", "; ".join(texts)))
     if part["noise_floor_N"] is not None:
@@ -213,9 +209,8 @@ def _setting(name: str, value: object, units: Mapping[str, str]) -> str:
     """Return a setting of a run, e.g. "speed_mm_s 20 rpm"; the unit where the name does not say it."""
     text = value if isinstance(value, str) else f"{value:.4g}"
     unit = units.get(name, "")
-    return (
-        f"{name} {text}" if name.endswith(f"_{unit.replace('/', '_')}") else f"{name} {text} {unit}".rstrip()
-    )
+    named = name.endswith(f"_{unit.replace('/', '_')}")
+    return f"{name} {text}" if named else f"{name} {text} {unit}".rstrip()
 
 
 def has_weak_evidence(left: Mapping) -> bool:
@@ -255,9 +250,8 @@ def effects_lines(listed: Mapping) -> list[str]:
         for p in effect["parameters"]:
             found.append(f"    {p['name']}{' [' + p['unit'] + ']' if p['unit'] else ''}: {p['meaning']}")
     if listed.get("added", ()) is None:
-        found.append(
-            "The loop of this OUT has not been run or is out of date, so its effects are not listed."
-        )
+        text = "The loop of this OUT has not been run or is out of date, so its effects are not listed."
+        found.append(text)
     if listed.get("note"):
         found.append(f"note: {listed['note']}")
     return found

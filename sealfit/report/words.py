@@ -82,19 +82,18 @@ def error_clause(closure: Mapping, config: Config) -> str:
     """Return the held-out error before and after, and the noise floor, in a clause."""
     unit = config.units.unit("force")
     held = f"rms error on held-out {closure['heldout_unit']}s"
-    errors = (
-        ("heldout_rmse_N", held),
-        ("heldout_extrapolated_rmse_N", f"{held}, all of them extrapolated,"),
-        ("rmse_N", "in-sample rms error (nothing could be held out)"),
-    )
-    key, what = next((error for error in errors if known(closure["before"][error[0]])), errors[-1])
+    errors = {
+        "heldout_rmse_N": held,
+        "heldout_extrapolated_rmse_N": f"{held}, all of them extrapolated,",
+        "rmse_N": "in-sample rms error (nothing could be held out)",
+    }
+    key = next((key for key in errors if known(closure["before"][key])), "rmse_N")
     before, after, floor = closure["before"][key], closure["after"][key], closure["noise_floor_N"]
     texts = together([before, after, floor])
-    if before == after or not known(after):
-        change = f"the {what} is {of_unit(texts[0], unit)}"
-    else:
+    change = f"the {errors[key]} is {of_unit(texts[0], unit)}"
+    if before != after and known(after):
         way = "falls" if after < before else "rises"
-        change = f"the {what} {way} from {of_unit(texts[0], unit)} to {of_unit(texts[1], unit)}"
+        change = f"the {errors[key]} {way} from {of_unit(texts[0], unit)} to {of_unit(texts[1], unit)}"
     end = f": {of_unit(texts[2], unit)}" if known(floor) else " unknown: there are no repeats"
     return f"{change} (noise floor{end})"
 
@@ -143,10 +142,8 @@ def left_over(closure: Mapping, config: Config) -> Markup:
         beside = f"; the noise floor is {of_unit(ground, unit)}" if known(floor) else ""
         said.append(f"the rms error of all bins is {of_unit(size, unit)}{beside}")
         if known(floor) and known(left["rmse_N"]) and 0 < left["rmse_N"] < rmse:
-            excess = of_unit(number(left["rmse_N"], 2), unit)
-            said.append(
-                f"the excess over the noise floor is {excess} (root of the difference of the squares)"
-            )
+            excess = f"{of_unit(number(left['rmse_N'], 2), unit)} (root of the difference of the squares)"
+            said.append(f"the excess over the noise floor is {excess}")
     where = in_words(residual_clause(closure, config.units), closure, config)
     if left["significant"]:
         said.append(Markup("a significant residual remains{}").format(where))
@@ -175,7 +172,7 @@ def _sentences(*clauses: str | Markup) -> Markup:
 
 
 def error_rows(closure: Mapping, config: Config) -> list[dict]:
-    """Return the rows of the table before and after: label, note, before, after, change."""
+    """Return the rows of the table before and after: label, unit, before, after, change."""
     floor, stages, found = closure["noise_floor_N"], ("before", "after"), []
     for key, label in ERRORS.items():
         before, after = (closure[stage][key] for stage in stages)
@@ -186,18 +183,10 @@ def error_rows(closure: Mapping, config: Config) -> list[dict]:
         label, unit = label.format(held=closure["heldout_unit"]), config.units.of(key)
         found.append({"label": label, "unit": unit, "before": texts[0], "after": texts[1], "change": change})
     p = {stage: _p(closure[stage]["lack_of_fit_p"]) for stage in stages}
-    floor_text = number(floor, 2) if known(floor) else "unknown"
-    return [
-        *found,
-        {"label": "lack of fit, p", "unit": "", **p, "change": ""},
-        {
-            "label": "noise floor: error of a perfect model",
-            "unit": config.units.unit("force"),
-            "before": floor_text,
-            "after": floor_text,
-            "change": "",
-        },
-    ]
+    found.append({"label": "lack of fit, p", "unit": "", **p, "change": ""})
+    floors = dict.fromkeys(stages, number(floor, 2) if known(floor) else "unknown")
+    label, unit = "noise floor: error of a perfect model", config.units.unit("force")
+    return [*found, {"label": label, "unit": unit, **floors, "change": ""}]
 
 
 def _p(value: float | None) -> str:
@@ -240,14 +229,10 @@ def curve_of(effect: Mapping, shapes: pd.DataFrame, closure: Mapping, config: Co
     step = 1 if rows["x"].isna().any() else max(1, (len(rows) - 1) // (CURVE_PLACES - 1))
     rows, scale = rows.iloc[::step], shape_scale(effect)  # every category, and some places along a number
     places = rows["label"].where(rows["x"].isna(), rows["x"].map(given))
-    values = [
-        measured(*(scale * v for v in row)) for row in rows[["value", "lo95", "hi95"]].itertuples(index=False)
-    ]
-    return {
-        "place": channel_label(rows["channel"].iloc[0], config.units),
-        "value": with_symbols(shape_label(rows, effect, config.units, str)),
-        "rows": [(place, *texts) for place, texts in zip(places, values, strict=True)],
-    }
+    values = scale * rows[["value", "lo95", "hi95"]]
+    texts = [(place, *measured(*own)) for place, own in zip(places, values.to_numpy().tolist(), strict=True)]
+    place, value = rows["channel"].iloc[0], shape_label(rows, effect, config.units, str)
+    return {"place": channel_label(place, config.units), "value": with_symbols(value), "rows": texts}
 
 
 def rivals_of(effect: Mapping, config: Config) -> list[Markup]:
