@@ -31,8 +31,7 @@ from sealfit.errors import (
     told,
 )
 
-# ---------------------------------------------------------------- options
-# Arguments and options that several commands share.
+# ---------------------------------------------------------------- options that several commands share
 
 Campaign = Annotated[Path, Argument(metavar="CAMPAIGN", help="Folder of runs.csv and trace files.")]
 Results = Annotated[Path, Argument(metavar="OUT", help="Folder of results of `run`, or of the steps before.")]
@@ -40,21 +39,18 @@ Out = Annotated[Path, Option("--out", help="Folder of results; created if it is 
 ConfigFile = Annotated[Path | None, Option("--config", help="Rig config (TOML); else the default.")]
 Workers = Annotated[int | None, Option("--workers", min=1, help="Processes. [default: all cores]")]
 Scheduler = Annotated[
-    str | None,
-    Option("--scheduler", metavar="ADDRESS", help="Dask scheduler: tcp://host:port, or its file."),
+    str | None, Option("--scheduler", metavar="ADDRESS", help="Dask scheduler: tcp://host:port, or its file.")
 ]
 Force = Annotated[bool, Option("--force", help="Redo steps that are up to date, too.")]
 Strict = Annotated[bool, Option("--strict", help="Stop with exit code 1 at any fault of the campaign.")]
 Profile = Annotated[bool, Option("--profile", help="Print seconds and rows per step.")]
 EffectsFolder = Annotated[
-    Path | None,
-    Option("--effects-folder", metavar="FOLDER", help="Your own effects. Python is run from it."),
+    Path | None, Option("--effects-folder", metavar="FOLDER", help="Your own effects. Python is run from it.")
 ]
 Json = Annotated[bool, Option("--json", help="Print exactly one JSON object on stdout.")]
 
 
-# ---------------------------------------------------------------- ending
-# How a command ends: what it prints, as text or as one JSON object, and its exit code.
+# ---------------------------------------------------------------- what a command prints, and its exit code
 
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)  # what the system refuses to open
 BUG = 70  # EX_SOFTWARE of sysexits.h
@@ -103,8 +99,7 @@ def exit_code(app: typer.Typer) -> int:
             return _misuse(error)
         traceback.print_exception(error)
         said = " ".join("".join(traceback.format_exception_only(error)).split())
-        bug = {"reason": said, "kind": "bug"}
-        return _fail(SealfitError("this is a bug.", fix=REPORT), BUG, **bug)
+        return _fail(SealfitError("this is a bug.", fix=REPORT), BUG, reason=said, kind="bug")
 
 
 def _misuse(error: Exception) -> int:
@@ -147,8 +142,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: rich takes longer to load than all the rest
 )
-
-
 command = partial(app.command, cls=Command)
 
 
@@ -161,8 +154,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _sealfit(
     version: Annotated[
-        bool,
-        Option("--version", callback=_print_version, is_eager=True, help="Print the version and end."),
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
     ] = False,
 ) -> None:
     pass

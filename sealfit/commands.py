@@ -43,15 +43,10 @@ def init(folder: Path, output: Path, *, force: bool = False) -> dict:
         raise OutError("is there already.", file=output, fix=fix)
     made = draft(folder)
     replace_file(output, made.text)
-    return {
-        "config": str(output),
-        "folder": str(folder),
-        "files": made.files,
-        "motion": made.motion,
-        "guesses": [asdict(guess) for guess in made.guesses],
-        "doubts": [doubt.as_dict() for doubt in made.doubts],
-        "next": shlex.join(["sealfit", "check", str(folder), "--config", str(output)]),
-    }
+    found = {"config": str(output), "folder": str(folder), "files": made.files, "motion": made.motion}
+    guesses, doubts = [asdict(guess) for guess in made.guesses], [doubt.as_dict() for doubt in made.doubts]
+    command = shlex.join(["sealfit", "check", str(folder), "--config", str(output)])
+    return {**found, "guesses": guesses, "doubts": doubts, "next": command}
 
 
 def check(
@@ -62,10 +57,7 @@ def check(
     scheduler: str | None = None,
     progress: Silent | None = None,
 ) -> tuple[dict, list[Fault]]:
-    """Read everything, write nothing, and return what was found and every fault.
-
-    ConfigError if the config cannot be used.
-    """
+    """Read everything, write nothing, and return what was found and every fault."""
     from sealfit.ingest.campaign import ingest_campaign
     from sealfit.report import summary
 
@@ -91,11 +83,9 @@ def predict(
 ) -> dict:
     """Write the answers to `points` (CSV) to `output` (CSV); return how many rows, and the effects in them.
 
-    `effects_folder` is run: it holds the user's own effects, which the model may need.
-
-    StaleError if the loop has not been closed on the campaign as it stands, or with other effects of the
-    user's own. RequestError if the points cannot be read, lack a column that the model needs, or the model
-    needs the user's own effects and no folder of them is given. OutError if the answers cannot be written.
+    `effects_folder`, which holds the user's own effects, is run. StaleError if the loop has not been closed
+    on the campaign as it stands, or with other effects. RequestError if the points cannot be read or lack a
+    column, or the user's own effects are needed and not given. OutError if the answers cannot be written.
     """
     from sealfit.closure.prediction_csv import points_of, read_points, write_answers
 
@@ -152,8 +142,7 @@ def require_model(name: str) -> None:
 def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     """Return the days to a threshold of a quantity, by the likeliest law and by its rivals, with intervals.
 
-    StaleError if the conditions are not fitted, or the loop is not closed (`model` "after"), or stale.
-    RequestError if the request does not fit the campaign.
+    StaleError if the fits of the model are stale. RequestError if the request does not fit the campaign.
     """
     from sealfit.fit.aging.joint_law import rivals_of
     from sealfit.fit.aging.lifetime import answer, finite_ends, goal_of, over_laws
@@ -195,26 +184,21 @@ def _laws_of(store: Store, asked: LifetimeRequest, model: str) -> tuple[list[Joi
 
 def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, SteadyFit], list[dict]]:
     """Return a model's table `steady`, the fit of its conditions, and the effects taken out of them."""
-    if model == "before":
-        store.require("fit-steady")
-        return _conditions_of(store, ""), []
+    suffix, added = "", []
     try:
-        store.require("close-loop")
+        store.require("fit-steady" if model == "before" else "close-loop")
     except StaleError as error:
-        if any(store.why_stale(step) for step in store.up_to("fit-steady")):
+        if store.why_stale("fit-steady"):
             raise
         other = "or ask the declared model, without effects: --model before"
         raise StaleError(error.message, file=error.file, fix=f"{error.fix} ({other})") from error
-    closure = store.read_json("closure")
-    added = [effect for effect in closure["effects"] if not effect["candidate"]]
-    suffix = "_after" if added or closure["outlier_files"] else ""
-    taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
-    return _conditions_of(store, suffix), taken_out
-
-
-def _conditions_of(store: Store, suffix: str) -> tuple[pd.DataFrame, SteadyFit]:
+    if model == "after":
+        closure = store.read_json("closure")
+        added = [effect for effect in closure["effects"] if not effect["candidate"]]
+        suffix = "_after" if added or closure["outlier_files"] else ""
     fit = {name: store.read(f"{name}{suffix}") for name in FITS["fit-steady"]}
-    return store.read(f"steady{suffix}"), fit
+    taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
+    return (store.read(f"steady{suffix}"), fit), taken_out
 
 
 def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict:
@@ -234,8 +218,8 @@ def effects(out: Path | None = None, effects_folder: Path | None = None) -> dict
     known = EFFECTS | load_user_effects(store.effects)
     closed = not store.why_stale("close-loop")
     added = [effect["id"] for effect in store.read_json("closure")["effects"]] if closed else None
-    listed = {"effects": summary.of_effects(known.values(), store.config.units), "added": added}
-    return {**listed, "note": _note_on_effects(store)}
+    listed = summary.of_effects(known.values(), store.config.units)
+    return {"effects": listed, "added": added, "note": _note_on_effects(store)}
 
 
 def _note_on_effects(store: Store) -> str | None:

@@ -37,10 +37,8 @@ BESIDE = tuple(table.name for table in schemas.BESIDE)
 UNREPORTED = (  # of many rows, and the report needs nothing of them but a few traces
     "traces", "traces_mean", "bins", "steady_after", *BESIDE, *(f"{name}_after" for name in BESIDE),
 )  # fmt: skip
-FAULTY = ("warning", "error")  # severities that count as a fault
 
-# How many rows a step worked on, and what they are.
-Counted = tuple[int, str]
+Counted = tuple[int, str]  # how many rows a step worked on, and what they are
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +141,10 @@ def _do_steps(store: Store, steps: tuple[str, ...], options: Options, progress: 
 
 def faults_of(quality: pd.DataFrame) -> list[Fault]:
     """Return the faults that a quality table holds; rows of severity "info" are none."""
-    rows = quality[quality["severity"].isin(FAULTY)]
-    return [Fault.of_row(row) for row in rows.to_dict("records")]
+    return [Fault.of_row(row) for row in quality[quality["severity"] != "info"].to_dict("records")]
 
 
 # ---------------------------------------------------------------- the work of each step
-# Each returns how many rows of what it saw.
 
 
 def _ingest(store: Store, staged: Staged, options: Options, progress: Silent) -> Counted:

@@ -14,7 +14,6 @@ from typing import TextIO
 from sealfit.errors import Fault, grouped, told
 
 # ---------------------------------------------------------------- progress
-# What a command says while it works: plain lines, or one that moves where somebody watches a terminal.
 
 OnFile = Callable[[int, int], None]
 BAR = 20  # characters of the bar's width
@@ -34,10 +33,7 @@ class Silent:
         self.say(f"warning: {text}")
 
     def faults(self, faults: Iterable[Fault]) -> None:
-        """List the faults found in a campaign, those of all of it first; only the first if they are many.
-
-        One that many files share is one line.
-        """
+        """List the faults found in a campaign, those of all of it first; only the first if they are many."""
         groups = grouped(fault for fault in faults if fault.severity != "info")
         groups.sort(key=lambda group: group[0].file is not None)
         for group in groups[:FAULTS_SHOWN]:
@@ -173,7 +169,6 @@ def for_notebook() -> Lines:
 
 
 # ---------------------------------------------------------------- profiling
-# Where a command's time goes: seconds and rows of every step, and of the parts of a step that take long.
 
 
 @dataclass

@@ -277,8 +277,7 @@ LEVELS = table(
     Column("level", "sample | stroke | file | run | specimen", TEXT),
     Column("channel", "null for the whole level; else a channel that varies at it", TEXT),
     Column(
-        "sd_N",
-        "standard deviation of the residual at this level, or of the part that the channel explains",
+        "sd_N", "standard deviation of the residual at this level, or of the part that the channel explains"
     ),
     Column("share", "share of the residual's variance"),
     Column("df", "degrees of freedom"),

@@ -794,7 +794,7 @@ def full(*_args, **_kwargs):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("place", ["parquet.write", "staged_writes.sync"])
+@pytest.mark.parametrize("place", ["parquet.write_arrow", "staged_writes.sync"])
 @pytest.mark.parametrize("step", STEPS)
 def test_a_full_disk_is_one_line_and_leaves_out_as_it_was(out, campaign, monkeypatch, step, place):
     do_all(out, campaign)
