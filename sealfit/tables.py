@@ -67,7 +67,10 @@ RUN_ORDER = Column("run_order", "place of the file in the order of started_at; n
 ELAPSED = Column("elapsed_h", "time since the campaign's first file; null if not given")
 CALENDAR = ("run_order", "elapsed_h")  # both from started_at
 
-KEYS = (FILE, RUN, REPEAT, STROKE, DIRECTION, SPECIMEN, CONDITION, SERIES, RUBBER)
+_CONDITION = (CONDITION, SERIES, RUBBER)
+_SETTINGS = (SPEED, SPEED_SET, LOAD)
+_WHEN = (RUN_ORDER, ELAPSED)
+KEYS = (FILE, RUN, REPEAT, STROKE, DIRECTION, SPECIMEN, *_CONDITION)
 
 # ---------------------------------------------------------------- ingest
 INPUTS = table(
@@ -83,11 +86,8 @@ INPUTS = table(
 RUNS = table(
     "runs",
     *KEYS,
-    SPEED,
-    SPEED_SET,
-    LOAD,
-    RUN_ORDER,
-    ELAPSED,
+    *_SETTINGS,
+    *_WHEN,
     Column("started_at", "start of the file, ISO 8601, as given where it is; null if not given", TEXT),
     Column("used", "false where the stroke was left out; quality says why", BOOL),
     open_=True,
@@ -131,9 +131,7 @@ TRACES_MEAN = table(
 STEADY = table(
     "steady",
     *KEYS,
-    SPEED,
-    SPEED_SET,
-    LOAD,
+    *_SETTINGS,
     Column("force_N", "friction force: mean over the steady window, without presliding_N"),
     PRESLIDING,
     Column("force_sd_N", "standard deviation of the samples in the window"),
@@ -144,8 +142,7 @@ STEADY = table(
     Column("displacement_to_mm", "end of the steady window"),
     DISTANCE,
     TIME,
-    RUN_ORDER,
-    ELAPSED,
+    *_WHEN,
     Column("outlier", "true where this repeat disagrees with its run beyond pooled scatter", BOOL),
     Column("used", "false where the config leaves an outlier out of the fits", BOOL),
     open_=True,
@@ -165,8 +162,7 @@ BINS = table(
     DISPLACEMENT,
     DISTANCE,
     TIME,
-    RUN_ORDER,
-    ELAPSED,
+    *_WHEN,
     open_=True,
 )
 
@@ -188,7 +184,7 @@ _FIT = (
     Column("identified", "false where these data do not determine it", BOOL),
     Column("reason", "why it is not determined, or a remark such as mu_s < mu_c", TEXT),
 )
-STEADY_FIT = table("steady_fit", CONDITION, SERIES, RUBBER, *_FIT, open_=True)
+STEADY_FIT = table("steady_fit", *_CONDITION, *_FIT, open_=True)
 AGING_FIT = table("aging_fit", SERIES, RUBBER, *_FIT, open_=True)
 _OTHER = Column("other", "the other parameter; the parameter itself for a variance", TEXT)
 _COVARIANCE = (
@@ -198,7 +194,7 @@ _COVARIANCE = (
 )
 _PARAMETER = Column("parameter", "parameter, in the field's symbol", TEXT)
 STEADY_COVARIANCE = table(
-    "steady_covariance", CONDITION, SERIES, RUBBER, MODEL, _PARAMETER, _OTHER, *_COVARIANCE, open_=True
+    "steady_covariance", *_CONDITION, MODEL, _PARAMETER, _OTHER, *_COVARIANCE, open_=True
 )
 AGING_COVARIANCE = table(
     "aging_covariance",
@@ -213,9 +209,7 @@ AGING_COVARIANCE = table(
 )
 STEADY_SHIFT = table(
     "steady_shift",
-    CONDITION,
-    SERIES,
-    RUBBER,
+    *_CONDITION,
     MODEL,
     Column("source", "sensor: it reads one standard uncertainty too high | 1, 2, ...: of the effects", TEXT),
     _PARAMETER,
@@ -224,7 +218,7 @@ STEADY_SHIFT = table(
     Column("identified", "false where these data do not determine the parameter", BOOL),
     open_=True,
 )
-DYNAMIC_FIT = table("dynamic_fit", CONDITION, SERIES, RUBBER, DIRECTION, SPEED_SET, *_FIT, open_=True)
+DYNAMIC_FIT = table("dynamic_fit", *_CONDITION, DIRECTION, SPEED_SET, *_FIT, open_=True)
 
 STEADY_AFTER = table(
     "steady_after",
@@ -356,9 +350,7 @@ AGING_LAWS = table(
 )
 PROPERTY_VALUES = table(
     "property_values",
-    CONDITION,
-    SERIES,
-    RUBBER,
+    *_CONDITION,
     Column("aging_days", "aging time"),
     Column("quantity", "property: the column's name", TEXT),
     Column("value", "value of one specimen"),
