@@ -1,8 +1,4 @@
-"""Rig configs: `configs/*.toml`, checked on load, unknown keys refused.
-
-A config says what one rig's files look like; the default, inside the package, reads exactly the table of the
-README.
-"""
+"""Rig configs: `configs/*.toml`, checked on load, unknown keys refused."""
 
 from __future__ import annotations
 
@@ -34,7 +30,6 @@ from sealfit.units import Conversion, Units, conversion
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 MOST = 10**9  # largest whole number of a config: no file has more lines
 LONGEST_PATTERN = 1000  # characters; a longer one takes long to compile
-
 
 Table = TypeVar("Table", bound=BaseModel)
 
@@ -89,8 +84,7 @@ Condition = Annotated[str, AfterValidator(partial(_expression, condition=True))]
 class FileColumn(Strict):
     """A column of a file: `force_N = "Kraft"`, or with its unit `force_N = {name = "Kraft", unit = "kgf"}`.
 
-    `name` is what the file calls it, or its position from 1; `unit` is that of its numbers in the file where
-    it is another than ours. The numbers are converted to our unit when they are read.
+    `name` is what the file calls it, or its position from 1; its numbers are converted when they are read.
     """
 
     name: str | Annotated[StrictInt, Field(ge=1)]
@@ -128,17 +122,13 @@ class TraceFormat(Strict):
     """How one trace file is written."""
 
     format: Literal["csv", "xlsx", "tdms", "mat", "parquet"] | None = None
-    """What the files are where their endings do not say it: `"csv"`, `"xlsx"`, `"tdms"`, `"mat"` or
-    `"parquet"`.
-    """
+    """What files are whose ending does not say it: `"csv"`, `"xlsx"`, `"tdms"`, `"mat"` or `"parquet"`."""
     sheet: str | int | None = None
     """Excel: name or number, from 1, of the sheet with the data; none: the only one with cells in it."""
     group: str | None = None
     """TDMS: the group of channels; none: the only one, or the only one with the columns below."""
     variable: str | None = None
-    """MATLAB: the struct or matrix with the data, `"S.field"` for one in a struct, `"(vectors)"` for vectors
-    by themselves; none: as `group`.
-    """
+    """MATLAB: struct or matrix, `"S.field"` in a struct, `"(vectors)"` for vectors; none: as `group`."""
     encoding: Annotated[str, AfterValidator(_encoding)] = "auto"
     """`utf-8`, `latin-1`, `utf-16`, or `auto`: byte-order mark, then UTF-8, then Latin-1."""
     delimiter: Annotated[str, AfterValidator(_delimiter)] = ","
@@ -166,9 +156,7 @@ class TraceFormat(Strict):
             name: FileColumn(name=name) for name in ("time_s", "displacement_mm", "force_N")
         }
     )
-    """Our name = the file's name, or its position from 1; with the unit that its numbers are in: `force_N =
-    {name = "Kraft", unit = "kgf"}`.
-    """
+    """Our name = the file's, or its position from 1; with its unit: `{name = "Kraft", unit = "kgf"}`."""
     rate_Hz: float | str | None = None
     """Rows per second of files without a column of time: it counts from 0 at the first row of data. Where
     files differ, an expression over what runs.csv, its name or its header says of each: `"1000 * rate_kHz"`.
@@ -267,13 +255,9 @@ class Files(Strict):
     without is taken as it stands.
     """
     started_at: StartedAt | None = None
-    """Columns, or parts of names, of the date and the time of day where these are two: `{date = "Datum", time
-    = "Uhrzeit"}`.
-    """
+    """Date and time of day, if these are two columns or parts: `{date = "Datum", time = "Uhrzeit"}`."""
     runs_columns: FileColumns = Field(default_factory=dict)
-    """Our name = the name in runs.csv; with a unit as in `[trace.columns]`: `load_N = {name = "Last", unit =
-    "kgf"}`.
-    """
+    """Our name = the name in runs.csv; with a unit: `load_N = {name = "Last", unit = "kgf"}`."""
     runs_table: str | None = None
     """Table to read in place of runs.csv: a `.csv`, `.xlsx` or `.parquet` file in the folder."""
     runs_sheet: str | int | None = None
@@ -437,9 +421,7 @@ class Config(Strict):
     rubber: list[str] = Field(default_factory=list)
     """Columns that identify the rubber."""
     position_origin: Literal["rig", "file"] = "rig"
-    """`"file"`: the origin of the position differs between files, so the phase of a ripple is separate for
-    each file.
-    """
+    """`"file"`: the origin of the position, and so the phase of a ripple, differs between files."""
     trace: TraceFormat = TraceFormat()
     files: Files = Files()
     runs: Runs = Runs()
@@ -481,8 +463,7 @@ class Config(Strict):
             for name, unit in columns.items():
                 if not unit:
                     continue
-                # A channel of the campaign's own has no unit of ours: it keeps its numbers, and labels show
-                # its unit.
+                # A channel of the campaign's own keeps its numbers, and labels show its unit.
                 to = units.of(name) or self._kept_units.setdefault(name, unit)
                 try:
                     self._conversions.setdefault(table, {})[name] = conversion(unit, to)
@@ -528,19 +509,12 @@ class Config(Strict):
 
 
 def load_config(path: Path | None = None) -> Config:
-    """Return the config at `path`, or the default that ships inside the package.
-
-    ConfigError if the file is missing, is not TOML, or has a key or value that is not allowed; one line per
-    fault.
-    """
+    """Return the config at `path`, or the default that ships inside the package; ConfigError for a fault."""
     return parse_config(read_config(path), "default.toml" if path is None else str(path))
 
 
 def read_config(path: Path | None = None) -> str:
-    """Return the text of the config at `path`, or of the default that ships inside the package.
-
-    ConfigError if the file cannot be read or is not UTF-8.
-    """
+    """Return the text of the config at `path`, or of the default in the package; errors as `read_toml`."""
     if path is None:
         return files("sealfit").joinpath("configs/default.toml").read_text("utf-8")
     return read_toml(path, "Check --config.")
