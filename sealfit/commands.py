@@ -117,19 +117,15 @@ def answers_to(points: pd.DataFrame, store: Store) -> pd.DataFrame:
 
 @dataclass(frozen=True, slots=True)
 class LifetimeRequest:
-    """What `lifetime` is asked: the end of life is a value (`threshold`) or a loss in percent of the start.
-
-    With `years` the temperature is sought at which a seal lasts so long. Without `law` the likeliest one
-    answers.
-    """
+    """What `lifetime` is asked."""
 
     quantity: str = "mu_s"
-    threshold: float | None = None
-    loss_pct: float | None = None
+    threshold: float | None = None  # value at which the life ends
+    loss_pct: float | None = None  # or loss, in percent of the start
     temperature_C: float | None = None
     compression_ratio_pct: float | None = None
-    years: float | None = None
-    law: str | None = None
+    years: float | None = None  # seek the temperature at which a seal lasts so long
+    law: str | None = None  # None: the likeliest one
     model: str = "after"
 
 

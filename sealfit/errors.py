@@ -185,10 +185,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
-    """Return a fix for a missing path: the nearest name beside it, or beside its missing folder; "" if none.
-
-    `fits` says which files or folders can be meant.
-    """
+    """Return a fix for a missing path: the nearest name that `fits`, beside it or its folder; "" if none."""
     parent = path.absolute().parent
     missing = None
     while not parent.is_dir():
@@ -321,9 +318,8 @@ MORE_MEMORY = "Use fewer workers (--workers 1), or a computer with more memory."
 def memory_ran_out(error: BaseException) -> bool:
     """Whether an error, or one that led to it, says that the system had no memory left.
 
-    Libraries say so in several ways: a shared object that cannot be mapped is an ImportError, a mapped file
-    an OSError, a thread a RuntimeError, or an exception of Arrow's own; a module in C that is loaded and
-    gives up is a SystemError.
+    A shared object that cannot be mapped is an ImportError, a mapped file an OSError, a thread a RuntimeError
+    or an exception of Arrow's own; a module in C that is loaded and gives up is a SystemError.
 
     >>> memory_ran_out(ImportError("libm.so: failed to map segment from shared object"))
     True

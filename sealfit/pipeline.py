@@ -63,8 +63,7 @@ def run(
 ) -> dict:
     """Run the out-of-date steps among `steps`, in order, and return the summary of all of them.
 
-    `options` are fields of `Options`. CampaignError, ConfigError, OutError or FitError for whatever the user
-    has to fix.
+    `options` are fields of `Options`. SealfitError for whatever the user has to fix.
     """
     chosen, source = Options(**options), ConfigCopy.at(config)
     checked = source.parse()

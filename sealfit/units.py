@@ -1,8 +1,7 @@
 """The true unit of every column: what a slot such as `force_N` holds.
 
-A config may declare another quantity and unit. Column names are fixed (design: "Units"); `Units.of` gives
-the true unit, and that is what the Parquet metadata and every label show. Numbers of files that are in other
-units are converted by `conversion`, once, when they are read.
+A config may declare another quantity and unit. Column names are fixed; `Units.of` gives the true unit.
+Numbers of files that are in other units are converted by `conversion`, once, when they are read.
 """
 
 from __future__ import annotations

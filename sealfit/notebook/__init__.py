@@ -120,10 +120,9 @@ def _stored(table: str, meaning: str) -> property:
 class Results:
     """What sealfit found in a campaign: tables, plots, predictions and lifetimes.
 
-    Everything is read when it is asked for. If it is missing, or the campaign, the config or the program has
-    changed since, StaleError says which command brings it up to date. `attrs["units"]` of every table has the
-    unit of a column. Parameters and laws are those of the answer: with the loop's effects taken out, where it
-    added some.
+    Everything is read when it is asked for. StaleError says which command brings up to date what is missing
+    or stale. `attrs["units"]` of every table has the unit of a column. Parameters and laws are those of the
+    answer: with the loop's effects taken out, where it added some.
     """
 
     def __init__(self, out: str | Path, effects_folder: str | Path | None = None):
@@ -171,18 +170,12 @@ class Results:
     bins = _stored("bins", "A row per bin of a steady window: what the joint model is fitted to.")
 
     def residuals(self, model: str = "after") -> pd.DataFrame:
-        """Return a row per bin: measured minus model, fitted and held out; `model` is "after" or "before".
-
-        RequestError if there is no such model.
-        """
+        """Return a row per bin: measured minus model; `model` is "after" or "before", else RequestError."""
         commands.require_model(model)
         return self.table(f"residuals_{model}")
 
     def traces(self, condition: str | None = None) -> pd.DataFrame:
-        """Return a row per sample of every trace, or of those of one condition, as table `runs` spells it.
-
-        RequestError if no such condition was tested; the fix names the nearest.
-        """
+        """Return a row per sample, of one condition if it is given; RequestError if it was not tested."""
         return self._of_condition("traces", condition)
 
     def mean_traces(self, condition: str | None = None) -> pd.DataFrame:
@@ -190,10 +183,7 @@ class Results:
         return self._of_condition("traces_mean", condition)
 
     def table(self, name: str) -> pd.DataFrame:
-        """Return any table of OUT as it is stored, with `attrs["meaning"]` of its columns.
-
-        RequestError if there is no such table; the fix names the nearest, or all.
-        """
+        """Return any table of OUT, with `attrs["meaning"]` of its columns; RequestError if there is none."""
         return self._table(self._current(_step_of(name)), name)
 
     # ------------------------------------------------------------ what follows

@@ -71,10 +71,7 @@ def quality_counts(quality: pd.DataFrame) -> list[dict]:
 
 
 def quality_findings(quality: pd.DataFrame, config: Config) -> tuple[list[dict], int]:
-    """Return the findings other than mere information, the most severe first, and the number of rows.
-
-    What many files share is one row with a count and examples.
-    """
+    """Return the findings, the most severe first, one row for what many files share; and their number."""
     told = quality[(quality["severity"] != "info") | (quality["action"].fillna("kept") != "kept")]
     told = told.sort_values("severity", key=lambda names: names.map(RANK).fillna(9), kind="stable")
     groups = grouped(Fault.of_row(row) for row in told.to_dict("records"))

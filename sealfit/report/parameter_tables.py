@@ -96,10 +96,7 @@ class ParameterTable:
 
 
 def break_aways(dynamic_fit: pd.DataFrame) -> tuple[list[dict], int]:
-    """Return the break-away forces above the sliding force that the page has, and the number of all.
-
-    Each is the row of its ratio to the sliding force; the force itself has the suffix `_N`.
-    """
+    """Return the break-aways above sliding that the page has, as ratio and force (`_N`), and their number."""
     rows = dynamic_fit[dynamic_fit["quantity"] == "break_away"]
     ratios, forces = (rows[rows["parameter"] == parameter] for parameter in ("F_ba/F", "F_ba"))
     ratios = ratios[ratios["identified"].astype(bool) & (ratios["reason"].fillna("") == "")]

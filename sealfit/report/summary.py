@@ -306,10 +306,7 @@ def quality_clause(closure: Mapping) -> str:
 
 
 def power_clause(closure: Mapping, units: Units) -> str:
-    """Return the smallest detectable effects of the least sensitive variables, in a clause.
-
-    It is empty if none is known.
-    """
+    """Return the smallest detectable effects of the least sensitive variables, in a clause; or ""."""
     known = [s for s in closure["sensitivity"] if s["smallest_N"] is not None]
     texts = [
         f"{_two_digits(s['smallest_pct'])} % for {units.label(s['variable'])} {level_words(s['level'])}"

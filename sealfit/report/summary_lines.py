@@ -21,10 +21,7 @@ MOST_E = 300.0
 
 
 def lines(summary: Mapping) -> list[str]:
-    """Return the summary of one or more steps, as lines, the verdict first.
-
-    Where the loop added effects, the fits without their contribution come first, then those before the loop.
-    """
+    """Return the summary of steps as lines, the verdict first; fits after the loop precede those before."""
     writers = {
         "close_loop": closure_lines,
         "ingest": ingest_lines,

@@ -291,10 +291,7 @@ class Store:
     # ------------------------------------------------------------ writing
     @contextlib.contextmanager
     def step(self, name: str) -> Iterator[Staged]:
-        """Give a place for the files of step `name`; all are moved when the block ends without an error.
-
-        OutError if the disk is full or refuses; OUT then holds what it held before.
-        """
+        """Give a place for the files of a step, which are moved at the end; OutError leaves OUT as it was."""
         began = time.monotonic()
         staged = Staged(self.out, self.config.units, name)
         try:

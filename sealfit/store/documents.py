@@ -198,10 +198,7 @@ _DOCUMENTS = {"closure": TypeAdapter(CLOSURE), "model": TypeAdapter(MODEL)}
 
 
 def read_document(name: str, text: str) -> dict:
-    """Return the content of closure.json ("closure") or model.json ("model") from its text.
-
-    ValueError if the text is no JSON, or the document is none that a loop writes.
-    """
+    """Return closure.json ("closure") or model.json from its text; ValueError if no loop writes such."""
     document = json.loads(text, parse_int=lambda digits: (int if len(digits) < INTEGER else float)(digits))
     _DOCUMENTS[name].validate_python(document)
     return document

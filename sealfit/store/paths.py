@@ -25,11 +25,7 @@ def runs_tables(folder: Path, config: Config) -> list[str]:
 
 
 def campaign_folder(path: Path, config: Config) -> Path:
-    """Return `path` if it is a folder that can be a campaign.
-
-    CampaignError, whose fix names the likeliest, if there is no such folder, or no table of runs in it where
-    the config needs one.
-    """
+    """Return `path`; CampaignError if there is no such folder, or no table of runs that the config needs."""
     if not path.is_dir():
         what, fix = "there is no such folder.", did_you_mean(path) or FIX_PATH
         if path.is_file():

@@ -182,10 +182,9 @@ LOCK = ".lock"
 
 @contextlib.contextmanager
 def taken(path: Path, option: str = "--out") -> Iterator[int]:
-    """Open and lock the file at `path`, and give its descriptor; it is created if missing.
+    """Open (or create) and lock the file at `path`, and give its descriptor; a link is replaced by a file.
 
-    A link is replaced by a file of its own. OutError, whose fix names the `option`, if another process has
-    locked it, or if it cannot be written.
+    OutError, whose fix names the `option`, if another process has locked it, or if it cannot be written.
     """
     handle = _take(path, option)
     try:
@@ -272,10 +271,7 @@ def _sign(handle: int, path: Path) -> None:
 
 
 def replace_file(output: Path, text: str) -> None:
-    """Write the file that --output names completely or not at all.
-
-    What a killed process left of an earlier one is replaced. OutError if it cannot be written.
-    """
+    """Write the file that --output names completely or not at all; OutError if it cannot be written."""
     staged = output.with_name(f".{output.name}.part")
     with taken(staged, "--output") as handle, disk(output, "--output"):
         try:

@@ -23,10 +23,7 @@ OF_TABLES = (variance_levels, residual_channels, force_speed, aging, master_curv
 
 
 def draw_all(tables: Tables, closure: Mapping | None, config: Config) -> dict[str, Plot]:
-    """Return every plot that these tables give, by name; one without data is not there.
-
-    All tables are present, some perhaps empty; `closure` is closure.json, None of properties.
-    """
+    """Return the plots of tables, some perhaps empty, and closure.json (None of properties), by name."""
     plots = [] if closure is None else [make(tables, closure, config) for make in OF_LOOP]
     plots += [make(tables, config) for make in OF_TABLES]
     return {plot.name: plot for plot in plots if plot is not None}

@@ -160,10 +160,7 @@ def _own_panel(name: str, tables: Tables, config: Config) -> Panel:
 
 
 def refused(tables: Tables, closure: Mapping, config: Config) -> Plot | None:
-    """Return the residual along the variables of effects that were not accepted, a panel for each variable.
-
-    Beside another variable, the direction has none. None if there is no panel.
-    """
+    """Return the residual along each variable of effects that were not accepted; None without a panel."""
     drawn = dict.fromkeys(tables["channels"]["channel"])
     entries = [entry["channels"] for entry in closure["refused"]]
     names = {name for own in entries for name in own if name != "direction" or len(own) == 1}
@@ -234,10 +231,7 @@ def variance_levels(tables: Tables, config: Config) -> Plot | None:
 
 # ---------------------------------------------------------------- residual by channel
 def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> None:
-    """Draw the mean residual along one channel before and after, with 95 % intervals from whole units.
-
-    `rows` are those of table `channels` of this channel.
-    """
+    """Draw the mean residual along one channel, `rows` of table `channels`, with 95 % intervals."""
     numeric = rows["x"].notna().all() and channel != "direction"
     x = rows["x"].to_numpy(float) if numeric else np.arange(len(rows), dtype=float)
     log = numeric and channel not in CALENDAR and style.is_logarithmic(x, LOG_SPAN)

@@ -54,10 +54,7 @@ class Line:
 
 
 def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool = False) -> None:
-    """Draw force against speed of several conditions: model with its band, declared model dotted, run means.
-
-    With `log` the speed axis is logarithmic.
-    """
+    """Draw force against speed of conditions: model with its band, declared model dotted, and run means."""
     dense = sum(len(line.points) for line in lines) > style.MOST_MARKS
     for line in lines:
         for curve in line.curves:
@@ -217,10 +214,7 @@ BEYOND = 1.5  # of that distance is shown
 
 
 def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], units: Units) -> None:
-    """Draw a condition's mean pre-sliding force over the distance slid, its standard error, and the model.
-
-    `curves` are rows of table `dynamic_curves`, `colours` those of the commanded speeds.
-    """
+    """Draw rows of table `dynamic_curves` of a condition, in the colours of the commanded speeds."""
     for (speed, direction), curve in curves.groupby(["speed_set_mm_s", "direction"], dropna=False, sort=True):
         curve = curve.sort_values("distance_mm")
         colour = colours.get(speed, style.BLACK)
