@@ -267,9 +267,10 @@ def _report(store: Store, staged: Staged, options: Options, progress: Silent) ->
     with timed("page"):
         report = build_report(tables, closure, manifest.provenance(store.state), store.seen_config("report"))
     with timed("writing plots", rows=len(report.figures), of="plots"):
-        for name, figure in report.figures.items():
-            staged.figure(name, figure)
-    staged.text("report.html", report.html)
+        for name, drawn in report.figures.items():
+            for form, content in drawn.items():
+                staged.file(f"plots/{name}.{form}", content)
+    staged.file("report.html", report.html)
     return sum(len(table) for table in tables.values()), "rows of tables"
 
 

@@ -191,7 +191,7 @@ class Parts:
         assert set(tables) >= {"steady", "steady_fit", "aging_curves", "curves"}
         return SimpleNamespace(
             html=f"<p>{closure['verdict']}</p>",
-            figures={"one": SimpleNamespace(svg="<svg/>", pdf=b"%PDF", png=b"PNG")},
+            figures={"one": {"png": b"PNG", "pdf": b"%PDF", "svg": "<svg/>"}},
         )
 
     def predict(self, model, points, own):

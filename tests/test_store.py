@@ -477,11 +477,11 @@ def test_what_a_step_no_longer_writes_is_removed(out, campaign):
     with Store.writing(out, campaign, ConfigCopy.at(None)) as store:
         with store.step("ingest") as staged:
             staged.inputs = {}
-            staged.text("plots/old.svg", "old")
-            staged.text("plots/both.svg", "one")
+            staged.file("plots/old.svg", "old")
+            staged.file("plots/both.svg", "one")
         with store.step("ingest") as staged:
             staged.inputs = {}
-            staged.text("plots/both.svg", "two")
+            staged.file("plots/both.svg", "two")
     assert sorted(p.name for p in (out / "plots").iterdir()) == ["both.svg"]
     assert (out / "plots/both.svg").read_text() == "two"
 
@@ -501,7 +501,7 @@ def test_a_new_folder_is_on_the_disk_before_files_are_moved_into_it(out, campaig
     monkeypatch.setattr(os, "replace", noting("move", replace))
     with Store.writing(out, campaign, ConfigCopy.at(None)) as store, store.step("ingest") as staged:
         staged.inputs = {}
-        staged.text("plots/new.svg", "new")
+        staged.file("plots/new.svg", "new")
     assert ("sync", out, True) in done[: done.index(("move", out / "plots/new.svg", True))]
 
 
@@ -613,7 +613,7 @@ def test_every_folder_in_which_a_step_puts_files_is_synced(tmp_path, campaign, m
     monkeypatch.setattr("sealfit.store.staged_writes.sync", lambda path: synced.append(Path(path)))
     with Store.writing(out, campaign, ConfigCopy.at(None)) as store, store.step("ingest") as staged:
         staged.table("steady", small("steady"))
-        staged.text("plots/a.svg", "<svg/>")
+        staged.file("plots/a.svg", "<svg/>")
     assert {tmp_path, out.parent, out, out / "plots"} <= set(synced)
 
 

@@ -7,7 +7,6 @@ import math
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -26,21 +25,12 @@ MOST_BINS = 30_000  # of all runs that a page has, about 1 MB; of more, every se
 LARGEST_STEP = 5  # traces of which fewer than every fifth bin would be left are not in the page
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A plot as SVG, as PNG and as PDF."""
-
-    svg: str
-    png: bytes
-    pdf: bytes
-
-
-def draw(plot: Plot) -> Drawn:
-    """Return a plot, drawn; equal plots give equal bytes."""
+def draw(plot: Plot) -> dict[str, str | bytes]:
+    """Return a plot as "png", "pdf" and "svg"; equal plots give equal bytes."""
     figure = compose(plot)
     png = saved(figure, "png", {"Software": None}, dpi=PRINT)
     pdf = saved(figure, "pdf", {"CreationDate": None, "Creator": None, "Producer": None})
-    return Drawn(_svg(figure), png, pdf)
+    return {"png": png, "pdf": pdf, "svg": _svg(figure)}
 
 
 def explain(points: Line2D, texts: Sequence[str]) -> None:

@@ -18,7 +18,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
 from sealfit.report import notation, parameter_tables, words
-from sealfit.report.drawing import Drawn, draw, inline, run_traces
+from sealfit.report.drawing import draw, inline, run_traces
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
 from sealfit.report.notation import ConditionNames, capital, channel_label, count, given, true_units
@@ -104,10 +104,10 @@ def name_of(provenance: Mapping, config: Config) -> str:
 
 @dataclass(frozen=True)
 class Report:
-    """The page, and its plots by name."""
+    """The page, and its plots by name and format."""
 
     html: str
-    figures: dict[str, Drawn]
+    figures: dict[str, dict[str, str | bytes]]
 
 
 def build_report(tables: Tables, closure: Mapping | None, provenance: Mapping, config: Config) -> Report:
@@ -124,7 +124,7 @@ def build_report(tables: Tables, closure: Mapping | None, provenance: Mapping, c
     images = {}
     for name, plot in plots.items():
         alt = f"{plot.title}: {' '.join(panel.alt for panel in plot.panels)}"
-        images[name] = inline(figures[name].svg, name, alt)
+        images[name] = inline(figures[name]["svg"], name, alt)
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
     html = TEMPLATES.get_template("template.html").render(

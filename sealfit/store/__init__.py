@@ -140,7 +140,7 @@ class Store:
         if tidy != kept:
             staged = Staged(self.out, self.config.units, "state")
             try:
-                staged.text(STATE, to_json(tidy.as_dict(), indent=None))
+                staged.file(STATE, to_json(tidy.as_dict(), indent=None))
                 with disk(self.out):
                     staged.replace_state()
             finally:
@@ -308,8 +308,8 @@ class Store:
         done = manifest.Done(key, __version__, now, round(seconds, 3), files, checksums)
         earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
         state = replace(self.state, inputs=inputs, steps={**earlier, name: done})
-        staged.text(STATE, to_json(state.as_dict(), indent=None))
-        staged.text(PROVENANCE, to_json(manifest.provenance(state), indent=None))
+        staged.file(STATE, to_json(state.as_dict(), indent=None))
+        staged.file(PROVENANCE, to_json(manifest.provenance(state), indent=None))
         with undisturbed(), disk(self.out):
             staged.commit()
             self.state = state

@@ -22,8 +22,6 @@ from sealfit.units import Units
 if TYPE_CHECKING:
     import pandas as pd
 
-    from sealfit.report.drawing import Drawn
-
 PROVENANCE = "provenance.json"
 PARQUET = ".parquet"
 
@@ -54,17 +52,12 @@ class Staged:
 
     def json(self, name: str, document: Mapping) -> None:
         """Write `document` as `<name>.json`; numbers that are not finite become null."""
-        self.text(f"{name}.json", to_json(document))
+        self.file(f"{name}.json", to_json(document))
 
-    def text(self, name: str, text: str) -> None:
-        """Write a text file; bytes of paths that are not UTF-8 become escapes, which JSON reads back."""
-        self._write(name, lambda path: path.write_bytes(text.encode("utf-8", "backslashreplace")))
-
-    def figure(self, name: str, figure: Drawn) -> None:
-        """Write a drawn figure as `plots/<name>.png`, `.pdf` and `.svg`."""
-        self._write(f"plots/{name}.png", lambda path: path.write_bytes(figure.png))
-        self._write(f"plots/{name}.pdf", lambda path: path.write_bytes(figure.pdf))
-        self.text(f"plots/{name}.svg", figure.svg)
+    def file(self, name: str, content: str | bytes) -> None:
+        """Write a file; bytes of paths that are not UTF-8 become escapes, which JSON reads back."""
+        raw = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+        self._write(name, lambda path: path.write_bytes(raw))
 
     def folder(self) -> Path:
         """Return the folder in which other processes may write files of this step; see `adopt`."""

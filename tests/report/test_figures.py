@@ -392,7 +392,7 @@ def test_ticks_stand_at_the_values_where_they_fit(ax):
 def test_any_column_name_can_be_drawn(label):
     rows = [{"channel": label, "label": label, "n": 1, "before_N": 1.0, "after_N": 0.0}] * 2
     panel = Panel(label, "alt", lambda ax: draw_channel(ax, table("channels", rows), label, Units()))
-    text = draw(Plot("p", label, (panel,), (Key(label, "#000000"),))).svg
+    text = draw(Plot("p", label, (panel,), (Key(label, "#000000"),)))["svg"]
     ElementTree.fromstring(text)
     assert text.count("<svg") == 1
     assert "<script>" not in text
@@ -402,7 +402,7 @@ def test_letters_that_the_font_lacks_become_text():
     panel = Panel("温度", "alt", lambda ax: ax.plot([0, 1], [0, 1]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert "温度" in draw(Plot("one", "", (panel,))).svg
+        assert "温度" in draw(Plot("one", "", (panel,)))["svg"]
 
 
 def test_the_same_tables_give_the_same_bytes(made):
@@ -412,7 +412,7 @@ def test_the_same_tables_give_the_same_bytes(made):
 
 def test_a_drawing_holds_all_that_it_uses_and_is_an_element_of_the_page(made):
     drawn = draw(draw_all(made.tables, made.closure, made.config)["aging"])
-    for svg in (drawn.svg, inline(drawn.svg, "aging", "what it shows")):
+    for svg in (drawn["svg"], inline(drawn["svg"], "aging", "what it shows")):
         element = ElementTree.fromstring(svg)
         names = [one.get("id") for one in element.iter() if one.get("id")]
         used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', svg))
@@ -421,11 +421,11 @@ def test_a_drawing_holds_all_that_it_uses_and_is_an_element_of_the_page(made):
     assert all(name.startswith("aging-") for name in names)
     assert element.get("aria-label") == "what it shows"
     assert "<style" not in svg
-    assert drawn.png.startswith(b"\x89PNG")
+    assert drawn["png"].startswith(b"\x89PNG")
 
 
 def test_markers_have_their_texts_as_titles(made):
-    svg = draw(draw_all(made.tables, made.closure, made.config)["aging"]).svg
+    svg = draw(draw_all(made.tables, made.closure, made.config)["aging"])["svg"]
     titles = re.findall(r"<use [^>]*><title>([^<]*)</title></use>", svg)
     assert len(titles) == 2 * 2 * 4  # series, coefficients, days
     assert titles[0].startswith("μ_s 0.")

@@ -76,9 +76,9 @@ def test_many_days_of_a_series_are_thinned():
 
 def test_many_points_are_drawn_as_pixels(only_drawings):
     few, many = draw(drawn_of(steady_rows((1, 2)))), draw(drawn_of(steady_rows((1, 2), runs=200)))
-    assert "<image" not in few.svg
-    assert "<image" in many.svg
-    assert len(many.svg) < 4 * len(few.svg)
+    assert "<image" not in few["svg"]
+    assert "<image" in many["svg"]
+    assert len(many["svg"]) < 4 * len(few["svg"])
 
 
 # ---------------------------------------------------------------- tables

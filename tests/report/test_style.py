@@ -33,9 +33,9 @@ def test_settings_of_the_user_change_nothing():
     before = draw(PLOT)
     with mpl.rc_context(HOSTILE):
         after = draw(PLOT)
-    assert after.svg == before.svg
-    assert after.png == before.png
-    assert after.pdf == before.pdf
+    assert after["svg"] == before["svg"]
+    assert after["png"] == before["png"]
+    assert after["pdf"] == before["pdf"]
 
 
 def test_text_is_text_in_files_for_print():
@@ -50,14 +50,14 @@ def test_a_matplotlibrc_changes_nothing(tmp_path):
     program = (
         "import sys; sys.path[:0] = sys.argv[1:]; import matplotlib, test_style; "
         "from sealfit.report.drawing import draw;"
-        "assert matplotlib.rcParams['font.size'] == 21; sys.stdout.write(draw(test_style.PLOT).svg)"
+        "assert matplotlib.rcParams['font.size'] == 21; sys.stdout.write(draw(test_style.PLOT)['svg'])"
     )
     environment = {**os.environ, "MATPLOTLIBRC": str(tmp_path)}
     here = os.path.dirname(__file__)
     done = subprocess.run(
         [sys.executable, "-c", program, here], capture_output=True, text=True, check=True, env=environment
     )
-    assert done.stdout == draw(PLOT).svg
+    assert done.stdout == draw(PLOT)["svg"]
 
 
 def test_settings_are_as_before_afterwards():
