@@ -51,10 +51,7 @@ def run(
     **options
         `force`, `strict`, `scheduler` and `progress` of `sealfit.pipeline.run`.
 
-    Raises
-    ------
-    SealfitError
-        Whatever the user has to fix: the message says where, what and how.
+    SealfitError for whatever the user has to fix: the message says where, what and how.
     """
     one_thread()
     options.setdefault("progress", progress.for_notebook())

@@ -49,9 +49,7 @@ def verdict(closure: Mapping, units: Units) -> pd.DataFrame:
         "fit_quality": quality["state"],
         "error_over_scatter": quality["ratio"],
         "lack_of_fit_p": quality["p_value"],
-        "left_rmse_N": left["rmse_N"],
-        "left_level": left["level"],
-        "left_channel": left["channel"],
+        **{f"left_{name}": left[name] for name in ("rmse_N", "level", "channel")},
         "left_p": left["p_value"],
     }
     return with_units(pd.DataFrame([row]), units)
@@ -116,8 +114,7 @@ def _frame(rows: list, columns: list[str] | None, numbers: Sequence[str], units:
 def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], config: Config) -> pd.DataFrame:
     """Return a row per condition and parameter of Eqs. 1 to 14; unaged rubber has them in each of its series.
 
-    `fits` are tables `steady_fit` and `dynamic_fit` of the answer, and `before` the same without effects, for
-    the column of that name. The config names the condition columns.
+    `fits` are tables `steady_fit` and `dynamic_fit` of the answer, and `before` the same without effects.
     """
     rows = _with_before(_of(fits, OF_CONDITIONS), _of(before, OF_CONDITIONS), ["condition", "parameter"])
     if config.aging and "aging_days" in rows:
@@ -133,8 +130,7 @@ def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], con
 def laws(fit: pd.DataFrame, before: pd.DataFrame, config: Config) -> pd.DataFrame:
     """Return a row per series, quantity and parameter of Eq. 15: mu_0, a, b, c of mu_s, mu_c or a property.
 
-    `fit` is table `aging_fit` of the answer, and `before` the same without effects, for the column of that
-    name. The config names the columns that tell series apart.
+    `fit` is table `aging_fit` of the answer, and `before` the same without effects.
     """
     rows, earlier = (own[own["quantity"] != STATISTICS] for own in (fit, before))
     rows = _with_before(rows, earlier, ["series", "quantity", "parameter"])

@@ -51,9 +51,8 @@ def inline(svg: str, name: str, alt: str) -> Markup:
 def run_traces(tables: Tables, config: Config) -> dict:
     """Return the measured force and the model's along every run, which the page draws on a click.
 
-    The model is that of the first of tables `residuals_after` and `residuals_before` that has rows. Returned
-    are labels `x` and `y`, and `runs`: by run_id its label and its strokes with file, x, force and model at
-    every `every`-th bin. There are no runs of properties, or where there are too many bins.
+    Returned are labels `x` and `y`, and `runs`: by run_id its label and its strokes with file, x, force and
+    model at every `every`-th bin. There are no runs of properties, or where there are too many bins.
     """
     units = config.units
     made = {"x": plain(units.label("displacement_mm")), "y": plain(units.label("force_N")), "runs": {}}

@@ -29,8 +29,7 @@ ROUNDING = 1e-12  # of coefficients of about 1 and forces of some N
 def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> list[dict]:
     """Return each quantity's laws with the lowest BIC, and the separate laws, a row of the page for each.
 
-    A row has what table `aging_laws` says of a law, and its parameters by name. `before` is that table
-    without the loop's effects; its best law follows that of `aging_laws`.
+    A row has what table `aging_laws` says, and the parameters by name. The best law of `before` follows.
     """
     found = []
     earlier = {} if before is None else {row["key"]: row for row in law_rows(before) if row["rank"] == 1}
@@ -108,10 +107,9 @@ def break_aways(dynamic_fit: pd.DataFrame) -> tuple[list[dict], int]:
 def parameter_tables(
     fit: pd.DataFrame, name: str, config: Config, before: pd.DataFrame | None = None
 ) -> list[ParameterTable]:
-    """Return the parameters in `fit`, one of the tables in `TITLES`, and its statistics as another table.
+    """Return the parameters in `fit`, one of the tables in `TITLES`, and its statistics, if they have rows.
 
-    `before` is the same table without the loop's effects, for its values beside those of `fit`. A table
-    without rows is not there.
+    `before` is the same table without the loop's effects, for its values beside those of `fit`.
     """
     key, names = "series" if name == "aging_fit" else "condition", ConditionNames.of(config)
     every = sorted(fit[key].unique(), key=names.place)

@@ -277,11 +277,7 @@ class State:
 
     @classmethod
     def read(cls, out: Path) -> State | None:
-        """Return the state kept in `out`, or None if it has none.
-
-        OutError if state.json is not one that this version of sealfit wrote, or Arrow cannot open files in
-        `out`.
-        """
+        """Return the state kept in `out`, or None; OutError if this version of sealfit cannot read it."""
         path = out / STATE
         if any("\ud800" <= character <= "\udfff" for character in str(out)):
             raise OutError("is a path that is not UTF-8.", file=out, fix="Choose another --out.")

@@ -45,8 +45,7 @@ def draw_aging(
     """Draw the coefficients of one series over aging time: the law with its band, and each condition's fit.
 
     `points` are the fits per condition, with columns quantity, aging_days, value, lo95, hi95; `curves` are
-    rows of table `aging_curves`, and `before` those of the same table without the loop's effects.
-    `quantities` are those of all series, in the order of their colours.
+    rows of table `aging_curves`, and `before` of that without effects; `quantities` are those of all series.
     """
     for k, quantity in enumerate(quantities):
         colour, marker = style.CYCLE[k % len(style.CYCLE)], "os^Dv"[k % 5]
@@ -258,8 +257,7 @@ def draw_master_curve(
 ) -> None:
     """Draw one quantity's values over scaled aging time, and the law with its 95 % band.
 
-    `rows` are rows of table `master_curve`, `colours` those of the aging temperatures. Of `before`, rows of
-    the same table without the loop's effects, the law is drawn.
+    `rows` are of table `master_curve`, and `before` of that without effects; `colours` by temperature.
     """
     values, law = rows[rows["kind"] == "value"], rows[rows["kind"] == "law"].sort_values("scaled_days")
     aged = values[values["scaled_days"] > 0]

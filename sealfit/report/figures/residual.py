@@ -172,8 +172,7 @@ def refused(tables: Tables, closure: Mapping, config: Config) -> Plot | None:
 def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     """Return the mean residuals at each commanded speed and direction, as rows of table `channels`.
 
-    Where no speed was commanded, measured ones that agree to two digits are one. Intervals are from the
-    strokes' means.
+    Measured speeds stand for others to two digits. Intervals are from the strokes' means.
     """
     found, stroke = {}, ["run_id", "file", "stroke"]
     for stage, residuals in (("before", before), ("after", after)):
@@ -333,8 +332,7 @@ def _span(channels: pd.DataFrame) -> tuple[float, float]:
 def draw_shape(ax: Axes, rows: pd.DataFrame, points: pd.DataFrame, effect: Mapping, units: Units) -> None:
     """Draw an effect along one channel: its form with the 95 % band, and the free shape it was compared with.
 
-    `rows` are those of table `shapes` of this effect and channel, `effect` is its entry in closure.json. The
-    partial residuals are `points`, rows of table `shape_points`.
+    `rows` of table `shapes` and `points` of table `shape_points` are those of this effect and channel.
     """
     channel, scale = rows["channel"].iloc[0], shape_scale(effect)
     numeric = rows["x"].notna().all() and channel != "direction"
