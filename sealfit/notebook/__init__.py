@@ -72,16 +72,9 @@ def fit_properties(
 ) -> Results:
     """Fit the aging laws of properties of specimens, as `sealfit fit-aging --values` does.
 
-    Parameters
-    ----------
-    values, out, config : str or Path
-        CSV, Excel or Parquet file with a row per specimen, folder of results, and config.
-    properties : sequence of str
-        Columns of the properties; by default the only one there is.
-    batch : str
-        Column that names the batch of a specimen.
-    **options
-        `force` and `progress` of `sealfit.pipeline.fit_properties`. Errors as `run`.
+    `values` is a CSV, Excel or Parquet file with a row per specimen, `properties` are its columns of
+    properties (by default the only one there is), and `batch` is that of the specimens' batch. `options` are
+    `force` and `progress` of `sealfit.pipeline.fit_properties`. All else is as for `run`.
     """
     one_thread()
     options.setdefault("progress", progress.for_notebook())
@@ -212,20 +205,11 @@ class Results:
         temperature_C: float | None = None,
         **options: object,
     ) -> Lifetime:
-        """Return the days until a quantity reaches a threshold, as `sealfit lifetime` does.
+        """Return the days until mu_s, mu_c, F_s, F_c or a property reaches a threshold.
 
-        Parameters
-        ----------
-        quantity : str
-            mu_s, mu_c, F_s, F_c, or a property.
-        threshold, loss_pct : float
-            Value at which life ends, or percent of the start that may be lost: one of the two.
-        temperature_C : float, optional
-            Temperature of use, in degrees Celsius; needed where several were tested.
-        **options
-            `compression_ratio_pct`, `years` (find the temperature that lasts so long), `law` and `model`.
-
-        RequestError if the request does not fit the campaign.
+        Life ends at the value `threshold`, or when `loss_pct` percent of the start are lost. `temperature_C`
+        of use is needed where several were tested. `options` are `compression_ratio_pct`, `years` (find the
+        temperature that lasts so long), `law` and `model`. RequestError if it does not fit the campaign.
         """
         asked = commands.LifetimeRequest(quantity, threshold, loss_pct, temperature_C, **options)
         return Lifetime(commands.lifetime(self.out, asked))

@@ -191,8 +191,7 @@ def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
 def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
     """Draw the residual variance at every level, before and after; beside each bar its standard deviation."""
     whole = levels[levels["channel"].isna()]
-    names = [*LEVELS, *(name for name in dict.fromkeys(whole["level"]) if name not in LEVELS)]
-    names = [name for name in reversed(names) if name in set(whole["level"])]
+    names = [name for name in reversed(LEVELS) if name in set(whole["level"])]
     sd = {(row.stage, row.level): row.sd_N for row in whole.itertuples()}
     texts = dict(zip(sd, together(list(sd.values())), strict=True))
     largest = max([value**2 for value in sd.values() if known(value)], default=1.0) or 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, cycle
 
@@ -41,16 +41,12 @@ LOG_SPAN = 20.0  # speeds that span this factor are drawn on a logarithmic axis
 
 @dataclass(frozen=True)
 class Line:
-    """One condition in a panel of force against speed, all in the direction of motion (magnitudes).
-
-    `curves` holds, per direction and load, columns direction, speed, before, after, lo, hi; `points` speed,
-    force, sd, direction.
-    """
+    """One condition in a panel of force against speed, all in the direction of motion (magnitudes)."""
 
     label: str
     colour: str
-    curves: tuple[pd.DataFrame, ...] = ()
-    points: pd.DataFrame = field(default_factory=pd.DataFrame)
+    curves: tuple[pd.DataFrame, ...]  # one for a direction and load: direction, speed, before, after, lo, hi
+    points: pd.DataFrame  # speed, force, sd, direction
 
 
 def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool = False) -> None:
@@ -64,7 +60,7 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
                 ax.plot(speed, curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
             backward = (curve["direction"] < 0).any()
             ax.plot(speed, curve["after"], color=line.colour, linestyle="--" if backward else "-")
-        for direction, points in line.points.groupby("direction") if len(line.points) else ():
+        for direction, points in line.points.groupby("direction"):
             marker, face = ("o", line.colour) if direction > 0 else ("<", "white")
             drawn, *_ = ax.errorbar(
                 points["speed"], points["force"], points["sd"].fillna(0.0), color=line.colour, fmt=marker,
