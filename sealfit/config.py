@@ -27,6 +27,7 @@ from pydantic import (
 from sealfit.errors import ConfigError, did_you_mean, nearest, shortened
 from sealfit.units import Conversion, Units, conversion
 
+MEASURED = ("time_s", "displacement_mm", "force_N")  # columns of a trace file, by default
 AGING_CONDITION = ["temperature_C", "compression_ratio_pct", "aging_days"]
 MOST = 10**9  # largest whole number of a config: no file has more lines
 LONGEST_PATTERN = 1000  # characters; a longer one takes long to compile
@@ -151,11 +152,7 @@ class TraceFormat(Strict):
     """How the first line below the data begins, such as "*** END"; it and all lines below are not read."""
     drop_first_rows: int = Field(0, ge=0, le=MOST)
     """Data rows to leave out at the start of each file."""
-    columns: FileColumns = Field(
-        default_factory=lambda: {
-            name: FileColumn(name=name) for name in ("time_s", "displacement_mm", "force_N")
-        }
-    )
+    columns: FileColumns = Field(default_factory=lambda: {name: FileColumn(name=name) for name in MEASURED})
     """Our name = the file's, or its position from 1; with its unit: `{name = "Kraft", unit = "kgf"}`."""
     rate_Hz: float | str | None = None
     """Rows per second of files without a column of time: it counts from 0 at the first row of data. Where
@@ -198,7 +195,7 @@ class TraceFormat(Strict):
         for key in ("columns", "compute"):
             if isinstance(own := table.get(key), dict) and "time_s" in own:
                 raise ValueError(f"both rate_Hz and {key}.time_s give the time. Take one of them out")
-        return {"columns": {name: name for name in ("displacement_mm", "force_N")}} | table
+        return {"columns": {name: name for name in MEASURED[1:]}} | table
 
     @model_validator(mode="after")
     def _can_be_read(self) -> TraceFormat:
@@ -309,6 +306,9 @@ class Runs(Strict):
     """Columns of one value, number or word, for files that have none: `{load_N = 49.03}`. Constants and
     columns whose name starts with `_` are for expressions only.
     """
+
+
+Slot = Literal["force", "displacement", "speed", "load", "time"]
 
 
 class Quantity(Strict):
@@ -425,9 +425,7 @@ class Config(Strict):
     trace: TraceFormat = TraceFormat()
     files: Files = Files()
     runs: Runs = Runs()
-    quantities: dict[Literal["force", "displacement", "speed", "load", "time"], Quantity] = Field(
-        default_factory=dict
-    )
+    quantities: dict[Slot, Quantity] = Field(default_factory=dict)
     """Another quantity in a slot (`force`, `displacement`, `speed`, `load`, `time`): `force = {quantity =
     "torque", unit = "mN m"}`. Column names stay; labels, summaries and metadata show the true unit.
     """

@@ -91,8 +91,7 @@ def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode()
 
 
-# ---------------------------------------------------------------- groups
-# A fault that many files share is one message.
+# ---------------------------------------------------------------- a fault that many files share
 
 EXAMPLES = 3  # places that such a message names; no more files than that are named each by itself
 RUNS_TABLES = ("runs.csv", "runs.xlsx", "runs.parquet")  # their lines are trace files
@@ -171,8 +170,7 @@ def _shared(fault: Fault) -> tuple:
     return (fault.check, fault.severity, fault.action, fault.column, fault.file in RUNS_TABLES, words)
 
 
-# ---------------------------------------------------------------- the nearest
-# What somebody who mistyped a name most likely means.
+# ---------------------------------------------------------------- what a mistyped name most likely means
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -105,8 +105,7 @@ _MEANING = {
 }
 
 
-# ---------------------------------------------------------------- conversion
-# Units of files to ours, by pint.
+# ---------------------------------------------------------------- conversion by pint
 
 _FAR = 1000.0  # a scale with an offset is read here and at 0: its factor then keeps all digits
 
@@ -219,7 +218,6 @@ def _nearest(unit: str, dimension: Hashable) -> str:
 
 
 # ---------------------------------------------------------------- spellings
-# What a unit of a header or a file's name measures, and how a config spells it.
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,8 +22,7 @@ from numpy.typing import ArrayLike
 
 from sealfit.report.notation import count, plain, short, symbol_math
 
-# ---------------------------------------------------------------- excerpts
-# Selection of the panels, rows and legend keys that are shown for a large campaign.
+# ---------------------------------------------------------------- what is shown of a large campaign
 
 MOST_PANELS = 12  # of a figure
 MOST_KEYS = 16  # of a legend
@@ -131,8 +130,6 @@ WIDTH, HEIGHT = 3.5, 2.6  # inches of a panel: three side by side are as wide as
 ROW = 3  # panels side by side
 DPI = 150  # of a figure on a screen
 
-Mark = Literal["line", "dotted", "dashed", "band", "point", "open", "left", "bar"]
-
 
 @dataclass(frozen=True)
 class Key:
@@ -140,7 +137,7 @@ class Key:
 
     label: str
     colour: str
-    mark: Mark = "line"
+    mark: Literal["line", "dotted", "dashed", "band", "point", "open", "left", "bar"] = "line"
     symbol: bool = False  # the label is a parameter's name, shown as its symbol
 
 
@@ -194,16 +191,10 @@ def compose(plot: Plot, kind: type[Figure] = Figure) -> Figure:
         for ax in axes:
             ax.remove()
         legend = figure.legend(
-            handles=[_handle(key) for key in plot.legend],
-            loc="outside upper left",
-            title=plain(plot.title),
-            title_fontproperties={"weight": "bold", "size": 10},
-            ncols=entries,
-            handlelength=1.8,
-            columnspacing=1.4,
-            labelspacing=0.35,
-            fontsize=8,
-        )
+            handles=[_handle(key) for key in plot.legend], loc="outside upper left", title=plain(plot.title),
+            title_fontproperties={"weight": "bold", "size": 10}, ncols=entries, handlelength=1.8,
+            columnspacing=1.4, labelspacing=0.35, fontsize=8,
+        )  # fmt: skip
         legend.set_alignment("left")
         return figure
 

@@ -47,11 +47,9 @@ from sealfit.report.summary import (
 MOST_TESTS = 40
 CURVE_PLACES = 7  # of a free shape that a card lists
 FREE = {
-    "smooth": "free smooth shape",
-    "levels": "one level per category",
-    "surface": "free smooth surface",
-    "slopes": "one slope per category",
-}
+    "smooth": "free smooth shape", "levels": "one level per category",
+    "surface": "free smooth surface", "slopes": "one slope per category",
+}  # fmt: skip
 
 
 def verdict(closure: Mapping, config: Config) -> Markup:

@@ -243,7 +243,6 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 
 
 # ---------------------------------------------------------------- the master curve
-# The values of all conditions over aging time scaled by the rate at their temperature.
 
 MARKERS = "os^Dv<>"
 QUANTITIES = {

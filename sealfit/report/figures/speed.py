@@ -201,7 +201,6 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
 
 
 # ---------------------------------------------------------------- the pre-sliding rise
-# The mean force from the start of motion at selected speeds, and the dynamic model.
 
 MOST_START_PANELS = 6
 MOST_SPEEDS = 3
