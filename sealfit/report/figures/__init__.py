@@ -5,21 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from sealfit.config import Config
-from sealfit.report.figures.aging import aging, master_curve, traces_mean
-from sealfit.report.figures.residual import (
-    before_after,
-    effect_shapes,
-    finding,
-    refused,
-    residual_channels,
-    variance_levels,
-)
-from sealfit.report.figures.speed import force_speed, starts
+from sealfit.report.figures import aging, residual, speed
 from sealfit.report.style import Plot, Tables
 
 # The figures of closure.json, and those of the tables alone, in the order of the report.
-OF_LOOP = (finding, before_after, effect_shapes, refused)
-OF_TABLES = (variance_levels, residual_channels, force_speed, aging, master_curve, starts, traces_mean)
+OF_LOOP = (residual.finding, residual.before_after, residual.effect_shapes, residual.refused)
+OF_TABLES = (
+    residual.variance_levels, residual.residual_channels, speed.force_speed, aging.aging, aging.master_curve,
+    speed.starts, aging.traces_mean,
+)  # fmt: skip
 
 
 def draw_all(tables: Tables, closure: Mapping | None, config: Config) -> dict[str, Plot]:
