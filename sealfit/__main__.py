@@ -19,7 +19,7 @@ def main() -> None:
             raise
         print(f"sealfit: {MEMORY} {MORE_MEMORY}", file=sys.stderr)
         sys.exit(1)
-    cli.main()
+    sys.exit(cli.exit_code(cli.app))
 
 
 if __name__ == "__main__":

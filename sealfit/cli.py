@@ -434,8 +434,3 @@ def _options(workers: int | None, scheduler: str | None, **more: object) -> dict
         either = "use either --workers (this computer) or --scheduler (a Dask cluster), not both."
         raise typer.BadParameter(either)
     return {"workers": workers or run_map.cores(), "scheduler": scheduler, **more}
-
-
-def main() -> None:
-    """Run the command line and exit with 0, 1 (input or request), 2 (usage), 70 (a bug) or 130 (Ctrl-C)."""
-    sys.exit(exit_code(app))

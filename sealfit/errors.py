@@ -48,9 +48,7 @@ class Fault:
             parts.append(f"column '{self.column}'")
         if self.value is not None and (shown := _shown(self.value)) not in self.reason.split():
             parts.append(shown)
-        head = ": ".join(parts)
-        text = f"{head}: {self.reason}" if head else self.reason
-        return printable(f"{text} {self.fix}".strip())
+        return printable(f"{': '.join([*parts, self.reason])} {self.fix}".strip())
 
     def as_dict(self) -> dict:
         """Return the fault as plain values, as `--json` prints it; a long cell is cut."""

@@ -55,7 +55,7 @@ def sealfit(monkeypatch, capsys):
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["sealfit", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            sys.exit(cli.exit_code(cli.app))
         return Ended(ended.value.code or 0, capsys.readouterr())
 
     return call
@@ -286,7 +286,7 @@ def test_the_terminal_gets_no_control_characters_from_names(sealfit, campaign, o
 
 
 def test_a_reader_that_leaves_early_is_no_fault():
-    program = "import sys; sys.argv = ['sealfit', '--help']; from sealfit.cli import main; main()"
+    program = "import sys; sys.argv = ['sealfit', '--help']; from sealfit.__main__ import main; main()"
     read = subprocess.run(
         ["bash", "-c", f'{sys.executable} -c "{program}" | true'], capture_output=True, text=True
     )

@@ -127,10 +127,7 @@ class Results:
     effect_parameters = _of_closure(frames.effect_parameters)
     scatter = _of_closure(frames.scatter)
     sensitivity = _of_closure(frames.sensitivity)
-    effect_curves = _stored(
-        "shapes",
-        "A row per effect, channel and place along it: what the effect does there, with its 95 % band.",
-    )
+    effect_curves = _stored("shapes", "A row per effect, channel and place: its value, with the 95 % band.")
 
     # ------------------------------------------------------------ fits
     @property
@@ -153,9 +150,7 @@ class Results:
 
     # ------------------------------------------------------------ data
     runs = _stored("runs", "A row per stroke, with all that is known of its file and run.")
-    quality = _stored(
-        "quality", "A row per finding in the data: where, what, what was done about it, and how to fix it."
-    )
+    quality = _stored("quality", "A row per finding: where, what, what was done about it, and how to fix it.")
     steady = _stored("steady", "A row per stroke: means over its steady window.")
     bins = _stored("bins", "A row per bin of a steady window: what the joint model is fitted to.")
 

@@ -31,7 +31,7 @@ def sealfit(monkeypatch, capsys, tmp_path):
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["sealfit", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            sys.exit(cli.exit_code(cli.app))
         return ended.value.code or 0, *capsys.readouterr()
 
     return call
