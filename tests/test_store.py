@@ -4,6 +4,7 @@ import math
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -595,6 +596,14 @@ def test_without_locks_a_process_that_runs_is_not_disturbed(out, campaign, monke
         do_all(out, campaign)
     assert stale(out) == []
     assert not (out / LOCK).exists()
+
+
+def test_without_locks_a_number_that_no_process_has_holds_nothing(out, campaign, monkeypatch):
+    do_all(out, campaign)
+    (out / LOCK).write_text(json.dumps({"host": socket.gethostname(), "pid": 10**30}))
+    with without_locks(monkeypatch):
+        do_all(out, campaign)
+    assert stale(out) == []
 
 
 def test_results_written_while_they_are_read_are_not_mixed(out, campaign):
