@@ -549,10 +549,7 @@ def parse_toml(model: type[Table], text: str, name: str | Path, fix: str) -> Tab
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None, source: str = "") -> str:
-    """Return a sentence per fault of a config or SPEC; one of `model`'s keys is named for an unknown key.
-
-    Each of several faults begins with its line in the text `source`.
-    """
+    """Return a sentence per fault, with its line in `source` and, for an unknown key, the nearest one."""
     lines = []
     for fault in error.errors():
         if error.error_count() > 1 and (line := _line(fault, source)):

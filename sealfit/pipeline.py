@@ -275,10 +275,7 @@ def _report(store: Store, staged: Staged, options: Options, progress: Silent) ->
 
 
 def reported(store: Store) -> tuple[dict[str, pd.DataFrame], dict | None]:
-    """Return what the report shows and draws of the tables, by name, and closure.json, None of properties.
-
-    OutError if closure.json lacks an effect whose shape is in the tables.
-    """
+    """Return the tables of the report, and closure.json (None of properties); OutError if they disagree."""
     if store.state.properties is not None:
         return {name: store.read(name) for name in OF_PROPERTIES}, None
     tables = {name: store.read(name) for name in TABLES if name not in UNREPORTED}

@@ -1,7 +1,4 @@
-"""Every column of every table, once: name, meaning and type.
-
-A name such as `force_N` is a slot; `sealfit.units` says what unit it truly holds.
-"""
+"""Every column of every table, once: name, meaning and type; `sealfit.units` has the true unit of a slot."""
 
 from __future__ import annotations
 

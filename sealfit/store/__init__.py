@@ -27,16 +27,13 @@ if TYPE_CHECKING:
 
 
 class Store:
-    """One OUT folder with the campaign and the config it belongs to.
-
-    `kept` is the state as stored. The config has the folder `effects` of the command line, and no other.
-    """
+    """One OUT folder with the campaign and the config it belongs to; `kept` is the state as stored."""
 
     def __init__(self, out: Path, state: State, kept: State | None, effects: Path | None):
         self.out, self.state, self._kept, self.effects = out, state, kept, effects
         config = state.config.parse()
         self._names_effects = config.loop.effects_folder is not None
-        own = {"effects_folder": None if effects is None else str(effects)}
+        own = {"effects_folder": None if effects is None else str(effects)}  # that of the command line only
         self.config: Config = config.model_copy(update={"loop": config.loop.model_copy(update=own)})
         self.warnings: list[str] = []
         self._checksums: dict[str, str | None] = {}  # of files that this process has read

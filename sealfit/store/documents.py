@@ -1,8 +1,7 @@
 """The shape of closure.json and model.json, checked when they are read.
 
 OUT may come from somebody else: a document whose checksum is right may still lack a key, or hold a text in
-place of a number, a number that is not finite, or a matrix of another size. Keys that are not listed here are
-ignored.
+place of a number, or a matrix of another size. Keys that are not listed here are ignored.
 """
 
 from __future__ import annotations

@@ -254,16 +254,13 @@ class Properties:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The content of state.json; `properties` where the results are of such a table and not of traces.
-
-    `own_effects` has the SHA-256 of the user's own effects, by file name.
-    """
+    """The content of state.json."""
 
     campaign: Path
     config: ConfigCopy
-    properties: Properties | None = None
+    properties: Properties | None = None  # where the results are of such a table and not of traces
     inputs: Fingerprints = field(default_factory=dict)
-    own_effects: dict[str, str | None] = field(default_factory=dict)
+    own_effects: dict[str, str | None] = field(default_factory=dict)  # SHA-256 by file name
     steps: dict[str, Done] = field(default_factory=dict)
 
     @property

@@ -67,10 +67,8 @@ def own_effects_folder(given: Path | None, config: ConfigCopy | None, *data: Pat
     """Return the folder of the user's own effects, without symbolic links; None if none is named.
 
     `given` is what --effects-folder says; it comes before the config, which is the one that the command line
-    names, never one that a folder of results keeps. `data` are the campaign and the folder of results.
-
-    ConfigError if there is no such folder, if it or one of its files lies in `data`, or if a config that lies
-    there names it.
+    names, never one that a folder of results keeps. ConfigError if there is no such folder, if it or one of
+    its files lies in `data` (the campaign and OUT), or if a config that lies there names it.
     """
     folder, said = given, OPTION
     if given is None and config is not None:
