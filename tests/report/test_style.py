@@ -40,9 +40,9 @@ def test_settings_of_the_user_change_nothing():
 
 def test_text_is_text_in_files_for_print():
     drawn = draw(PLOT)
-    assert ">force (N)</text>" in drawn.svg
-    assert b"/TrueType" in drawn.pdf or b"/CIDFontType2" in drawn.pdf
-    assert b"/Type3" not in drawn.pdf
+    assert ">force (N)</text>" in drawn["svg"]
+    assert b"/TrueType" in drawn["pdf"] or b"/CIDFontType2" in drawn["pdf"]
+    assert b"/Type3" not in drawn["pdf"]
 
 
 def test_a_matplotlibrc_changes_nothing(tmp_path):
