@@ -198,19 +198,19 @@ def verdict_sentence(closure: Mapping, units: Units) -> str:
 
 def verdict_clauses(closure: Mapping, units: Units) -> list[str]:
     """Return what the verdict says beside the effects that were added, in clauses; some may be empty."""
-    kind, quality, along = closure["verdict"], quality_clause(closure), residual_clause(closure, units)
-    untold = untold_clause(closure, units)
+    kind, quality = closure["verdict"], quality_clause(closure)
     if kind == "nothing_missing":
         return ["no effect beyond the declared model is significant", quality, power_clause(closure, units)]
+    untold = untold_clause(closure, units)
     if kind == "cannot_tell":
         return [quality, f"these files do not decide whether an effect is missing: {untold}"]
     if kind == "unexplained":
-        return [f"a significant residual remains{along}", quality]
+        return [f"a significant residual remains{residual_clause(closure, units)}", quality]
     remains = "no significant residual remains"
     if closure["left"]["significant"]:
-        remains = f"what remains{along} is less than repeats scatter by"
+        remains = f"what remains{residual_clause(closure, units)} is less than repeats scatter by"
     elif has_weak_evidence(closure["left"]):
-        remains = f"the evidence of what remains{along} is weak"
+        remains = f"the evidence of what remains{residual_clause(closure, units)} is weak"
     return [remains, quality, f"not decided by these files: {untold}" if untold else ""]
 
 
