@@ -201,11 +201,11 @@ def verdict_clauses(closure: Mapping, units: Units) -> list[str]:
     kind, quality = closure["verdict"], quality_clause(closure)
     if kind == "nothing_missing":
         return ["no effect beyond the declared model is significant", quality, power_clause(closure, units)]
+    if kind == "unexplained":
+        return [f"a significant residual remains{residual_clause(closure, units)}", quality]
     untold = untold_clause(closure, units)
     if kind == "cannot_tell":
         return [quality, f"these files do not decide whether an effect is missing: {untold}"]
-    if kind == "unexplained":
-        return [f"a significant residual remains{residual_clause(closure, units)}", quality]
     remains = "no significant residual remains"
     if closure["left"]["significant"]:
         remains = f"what remains{residual_clause(closure, units)} is less than repeats scatter by"
