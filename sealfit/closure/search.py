@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealfit.closure import criteria
 from sealfit.closure.channels import (
     FINER,
     Channel,
@@ -24,22 +25,6 @@ from sealfit.closure.channels import (
     unit_of,
     without_trends,
 )
-from sealfit.closure.criteria import (
-    CONSTANT_IN_RUNS,
-    FEW_DF,
-    FINE_DF,
-    FINE_UNITS,
-    FREE_DF,
-    JACKKNIFE_UNITS,
-    LEAST_ERROR_DF_OF_RUNS,
-    LEAST_UNITS_OF_SLOPES,
-    LOGARITHMIC_SPAN,
-    MOST_CATEGORIES,
-    MOST_PAIRED,
-    PAIR_FACTOR,
-    SEARCHES,
-    TEMPORARY_FACTOR,
-)
 from sealfit.closure.multiplicity import adjust_all
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.small_sample_test import log_p_of_numbers
@@ -48,9 +33,6 @@ from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import POWER, Rows, open_columns
 from sealfit.fit.joint.variance_components import orthonormal
-
-# ---------------------------------------------------------------- search
-# Does a channel explain the residual? A free shape of each is tested on every quantity it may act on.
 
 TARGETS = (
     ("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply"),
@@ -67,7 +49,7 @@ def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Genera
     lasting = [c for c in candidates if not c.temporary]
     found = adjust_all(tests, lasting, rng) if lasting else []
     for c in adjust_all(tests, temporary, rng) if temporary else []:
-        found.append(replace(c, p_value=min(1.0, TEMPORARY_FACTOR * c.p_value)))
+        found.append(replace(c, p_value=min(1.0, criteria.TEMPORARY_FACTOR * c.p_value)))
     return sorted(found, key=lambda c: -c.evidence)
 
 
@@ -78,12 +60,12 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
         yield from _shape_candidates(tests, channel, np.ones((rows.force.size, 1)), TARGETS)
         return
     specimens = rows.groups.starts["specimen"].size
-    few_units = channel.numeric and channel.unit == "specimen" and specimens < JACKKNIFE_UNITS
-    shapes = free_columns(channel, FEW_DF if few_units else FREE_DF)
+    few_units = channel.numeric and channel.unit == "specimen" and specimens < criteria.JACKKNIFE_UNITS
+    shapes = free_columns(channel, criteria.FEW_DF if few_units else criteria.FREE_DF)
     parts = [slice(0, 1), slice(None)] if channel.numeric and shapes.shape[1] > 1 else [slice(None)]
     yield from _shape_candidates(tests, channel, shapes, TARGETS, parts)
     if (own := without_trends(channel, rows)) is not None:
-        yield from _shape_candidates(tests, own, free_columns(own, FREE_DF), TARGETS, parts)
+        yield from _shape_candidates(tests, own, free_columns(own, criteria.FREE_DF), TARGETS, parts)
     if few_units:
         yield from _each_column(tests, channel, kinks(channel))
     if channel.name == "elapsed_h":
@@ -91,8 +73,9 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
         for candidate in _each_column(tests, channel, intervals(channel, rows)):
             yield replace(candidate, temporary=True)
     units = rows.groups.starts[flip_level(channel.unit, rows)].size
-    if channel.numeric and units >= FINE_UNITS and np.unique(channel.values).size > 2 * FINE_DF:
-        yield from _shape_candidates(tests, channel, free_columns(channel, FINE_DF), MAIN_TARGETS)
+    fine = units >= criteria.FINE_UNITS and np.unique(channel.values).size > 2 * criteria.FINE_DF
+    if channel.numeric and fine:
+        yield from _shape_candidates(tests, channel, free_columns(channel, criteria.FINE_DF), MAIN_TARGETS)
     if channel.name == "elapsed_h" and day_and_night.effect.shown_by(channel.values):
         angle = 2 * np.pi * channel.values[:, None] / DAY_H
         yield from _shape_candidates(tests, channel, np.hstack([np.cos(angle), np.sin(angle)]), MAIN_TARGETS)
@@ -101,7 +84,7 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
 
 
 def _each_column(tests: ScoreTests, channel: Channel, shapes: np.ndarray) -> Iterator[Candidate]:
-    """Yield candidates of every single column, one for each place along a channel, on the main targets."""
+    """Yield candidates of every single column, one for each place along a channel."""
     if shapes.shape[1]:
         parts = [slice(k, k + 1) for k in range(shapes.shape[1])]
         for candidate in _shape_candidates(tests, channel, shapes, MAIN_TARGETS, parts):
@@ -167,10 +150,8 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool, lo
 
 
 # ---------------------------------------------------------------- pairs
-# Pairs of channels, for effects that are interactions.
-#
-# They are searched where no single channel explains the residual. The columns of a pair are interaction terms
-# only: the main effects of both channels have been tested before.
+# Pairs of channels, for effects that are interactions, where no single channel explains the residual. The
+# columns of a pair are interaction terms only: the main effects of both channels have been tested before.
 
 # The variable whose influence each coefficient describes.
 VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
@@ -189,14 +170,14 @@ def search_pairs(
     `MOST_PAIRED`.
     """
     own = set(open_columns(tests.fitted.rows.table))
-    left_out = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in own))[MOST_PAIRED:]
-    usable = [c for c in _usable(channels) if c.name not in left_out]
+    ranked = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in own))
+    usable = [c for c in _usable(channels) if c.name not in ranked[criteria.MOST_PAIRED :]]
     found = [c for pair in itertools.combinations(usable, 2) for c in _pair_candidates(tests, *pair)]
     if not found:
         return []
     singles = [c for c in singles if not c.temporary]
     pairs = [c for c in adjust_all(tests, [*found, *singles], rng) if c.pair]
-    return [replace(c, p_value=min(1.0, PAIR_FACTOR * c.p_value)) for c in pairs]
+    return [replace(c, p_value=min(1.0, criteria.PAIR_FACTOR * c.p_value)) for c in pairs]
 
 
 def equivalent_pairs(
@@ -214,17 +195,12 @@ def equivalent_pairs(
             continue
         members = _usable([channels[name] for name in sorted(pair)])
         found = _pair_candidates(tests, *members) if len(members) == 2 else []
-        strongest = [
-            max(own, key=lambda c: c.chi2)
-            for t in MAIN_TARGETS
-            if (own := [c for c in found if c.target == t])
-        ]
-        best[pair] = [
-            replace(
-                c, test_result=c.test_result._replace(chi2=max(c.chi2, single.chi2)), p_value=single.p_value
-            )
-            for c in strongest
-        ]
+        best[pair] = []
+        for target in MAIN_TARGETS:
+            if own := [c for c in found if c.target == target]:
+                strongest = max(own, key=lambda c: c.chi2)
+                test = strongest.test_result._replace(chi2=max(strongest.chi2, single.chi2))
+                best[pair].append(replace(strongest, test_result=test, p_value=single.p_value))
     return list(itertools.chain.from_iterable(best.values()))
 
 
@@ -233,7 +209,7 @@ def _usable(channels: Sequence[Channel]) -> list[Channel]:
         c
         for c in channels
         if not (c.grouping or c.added_only or c.name in NOT_IN_PAIRS)
-        and (c.numeric or np.unique(c.values).size <= MOST_CATEGORIES)
+        and (c.numeric or np.unique(c.values).size <= criteria.MOST_CATEGORIES)
     ]
 
 
@@ -290,7 +266,7 @@ def _scales(channel: Channel) -> list[np.ndarray]:
     """Return a channel, centred, and its logarithm if the range is wide (values from 0 are shifted first)."""
     x = channel.values
     scales = [x]
-    if x.min() >= 0 and x.max() > LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
+    if x.min() >= 0 and x.max() > criteria.LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
         scales.append(np.log(shifted_from_zero(x)))
     return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
 
@@ -301,18 +277,15 @@ def _centred(values: np.ndarray) -> np.ndarray:
 
 # ---------------------------------------------------------------- masked pairs
 # Two effects that mask each other: each is part of the other's error, and neither is significant alone.
-#
-# They are searched in few units, where nothing else is significant. Only simple pairs are tested: two
-# straight lines (an offset, for the direction) that share a channel or of which one is of the direction, and
-# a line along strokes with its change along a coarser channel. Steps and kinks are not tested: the best of
-# many places is more than one test. Both columns must change each unit along one direction, so that a unit
-# is one number; then
+# Searched in few units, where nothing else is significant. Only simple pairs are tested: two straight lines
+# (an offset, for the direction) that share a channel or of which one is of the direction, and a line along
+# strokes with its change along a coarser channel. Both columns must change each unit along one direction, so
+# that a unit is one number; then
 #
 # .. math:: F = \frac{(RSS_0 - RSS_{12}) / 2}{RSS_{12} / (d - 2)}
 #
-# tests both against the residual scatter of the units. The test is exact if that scatter is normal with one
-# variance. P-values are adjusted for the number of pairs (Bonferroni). In a significant pair each of the two
-# is significant given the other.
+# tests both against the residual scatter of the units, exactly if that is normal with one variance. P-values
+# are adjusted for the number of pairs (Bonferroni). Each of the two must be significant given the other.
 
 OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
 LEAST_SINGULAR = 1e-3  # Two unit columns with a smaller singular value are collinear.
@@ -339,12 +312,12 @@ def search_masked_pairs(
     """
     tested = [(two, _joint_test(tests, two, level)) for two, level in _pairs(tests, channels, candidates)]
     tested = [(two, test) for two, test in tested if test is not None]
-    found = [
-        MaskedPair(min(1.0, SEARCHES * len(tested) * float(np.exp(joint))), chi2, tuple(c.key for c in two))
-        for two, (joint, given, chi2) in tested
-        if given <= np.log(alpha)
-    ]
-    return sorted(pair for pair in found if pair.p_value <= alpha)
+    found = []
+    for two, (joint, given, chi2) in tested:
+        p_value = min(1.0, criteria.SEARCHES * len(tested) * float(np.exp(joint)))
+        if given <= np.log(alpha) and p_value <= alpha:
+            found.append(MaskedPair(p_value, chi2, tuple(c.key for c in two)))
+    return sorted(found)
 
 
 def _pairs(
@@ -360,8 +333,8 @@ def _pairs(
     lines = list({c.key: c for c in reversed(lines)}.values())
     products = [c for c in straight if c.pair]
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
-        shared = level[id(one)] == level[id(other)]
-        few_units = LEAST_UNITS_OF_SLOPES <= rows.groups.starts[level[id(one)]].size < JACKKNIFE_UNITS
+        shared, units = level[id(one)] == level[id(other)], rows.groups.starts[level[id(one)]].size
+        few_units = criteria.LEAST_UNITS_OF_SLOPES <= units < criteria.JACKKNIFE_UNITS
         if shared and few_units and _is_simple_pair(one, other, channels):
             yield (one, other), level[id(one)]
 
@@ -371,13 +344,8 @@ def _is_simple_pair(line: Candidate, other: Candidate, channels: Mapping[str, Ch
     name = line.channels[-1]
     if not other.pair:
         return name == other.channels[-1] or ("direction",) in (line.channels, other.channels)
-    inside = [channels[n].unit == "sample" for n in other.channels]
-    return (
-        name in other.channels
-        and channels[name].unit == "sample"
-        and not all(inside)
-        and line.acts_on == other.acts_on
-    )
+    inside = [n for n in other.channels if channels[n].unit == "sample"]  # along strokes
+    return inside == [name] and line.acts_on == other.acts_on
 
 
 def _joint_test(
@@ -387,26 +355,25 @@ def _joint_test(
 
     Of several variants the weakest result counts. None if they are no pair.
     """
-    fitted = tests.fitted
+    fitted, groups = tests.fitted, tests.fitted.rows.groups
     columns = np.column_stack([c.columns * fitted.slope(*c.target)[:, None] for c in two])
-    unit = min((c.unit for c in two), key=lambda name: fitted.rows.groups.starts[name].size)
+    unit = min((c.unit for c in two), key=lambda name: groups.starts[name].size)
     white = fitted.whitening(columns)
-    numbers = tests.cluster_tests[level].along(_larger_column(white, fitted.rows.groups, level))
+    larger = groups.sums(white**2, level).argmax(axis=1)[groups.codes[level]]  # both may change it along this
+    numbers = tests.cluster_tests[level].along(white[np.arange(len(white)), larger])
     found = []
     for left in tests.variants(columns, unit):
-        own = fitted.rows.groups.sums(numbers.direction[:, None] * left, level)
-        varies = (own**2).sum(axis=0) <= CONSTANT_IN_RUNS * (left**2).sum(axis=0)
+        own = groups.sums(numbers.direction[:, None] * left, level)
+        varies = (own**2).sum(axis=0) <= criteria.CONSTANT_IN_RUNS * (left**2).sum(axis=0)
         if varies.any() or not left.any(axis=0).all():
             return None
         made = numbers.root @ own
         made = made / np.sqrt((made**2).sum(axis=0))
         basis = orthonormal(made, LEAST_SINGULAR)
-        if basis.shape[1] < 2 or numbers.df - 2 < LEAST_ERROR_DF_OF_RUNS:
+        if basis.shape[1] < 2 or numbers.df - 2 < criteria.LEAST_ERROR_DF_OF_RUNS:
             return None
         joint = log_p_of_numbers(numbers.values[None, :], basis, 0.0, numbers.df)[0]
-        given = max(
-            _conditional_log_p(numbers.values, *made.T[order], numbers.df) for order in ([0, 1], [1, 0])
-        )
+        given = max(_conditional_log_p(numbers.values, *own, numbers.df) for own in (made.T, made.T[::-1]))
         explained = orthonormal(left, LEAST_SINGULAR).T @ fitted.white_residual
         found.append((joint, given, -float((explained**2).sum())))
     joint, given, chi2 = np.max(found, axis=0).tolist()
@@ -418,9 +385,3 @@ def _conditional_log_p(values: np.ndarray, one: np.ndarray, other: np.ndarray, d
     rest = one - (one @ other) * other
     left = values - (values @ other) * other
     return float(log_p_of_numbers(left[None, :], rest[:, None] / np.linalg.norm(rest), 0.0, df - 1)[0])
-
-
-def _larger_column(white: np.ndarray, groups, level: str) -> np.ndarray:
-    """Return the larger of two columns in each unit, (n,): the direction along which both may change it."""
-    size = groups.sums(white**2, level)
-    return white[np.arange(len(white)), size.argmax(axis=1)[groups.codes[level]]]

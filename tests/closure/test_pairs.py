@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from bins_helpers import THREE_FOLDS, make_bins, make_traces
 
-from sealfit.closure import search as search_module
 from sealfit.closure.channels import Channel, find_channels
 from sealfit.closure.forms import terms_of
 from sealfit.closure.loop import close_loop
@@ -95,7 +94,7 @@ def test_of_many_columns_those_that_explain_most_are_paired(monkeypatch):
     tests = ScoreTests(fit_declared(make_rows(bins, has_aging=True)))
     channels, rng = find_channels(tests.fitted.rows), np.random.default_rng(0)
     singles = search(tests, channels, rng)
-    monkeypatch.setattr(search_module, "MOST_PAIRED", 3)
+    monkeypatch.setattr("sealfit.closure.criteria.MOST_PAIRED", 3)
     paired = {name for c in search_pairs(tests, channels, singles, rng) for name in c.channels}
     own = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in columns))
     assert {name for name in paired if name in columns} == set(own[:3])
