@@ -24,23 +24,14 @@ from sealfit.fit.joint.rows import Rows
 from sealfit.fit.steady import FORCES
 from sealfit.tables import CALENDAR
 
-# ---------------------------------------------------------------- forms
-# The forms that are fitted for a candidate, and the grids of their nonlinear parameters.
-
 ADDED, MU = ("force", "add"), ("mu", "multiply")
-
 MOST_PLACES = 60  # Largest number of places of a jump on a grid, or of pairs of two jumps.
-
+# Number of mu_s, mu_c, v_s and sigma_2 that the speeds of a series determine, by the form of its curve.
 NUMBERS_ALONG_SPEED = {"full": 4, "interpolated": 3, "viscous": 2, "constant": 1}
-"""Number of mu_s, mu_c, v_s and sigma_2 that the speeds of a series determine, by the form of its curve."""
-
-PHASE_GRID = tuple(np.arange(4) * np.pi / 4)
-"""Phases of a ripple that are tried, in rad."""
-
+PHASE_GRID = tuple(np.arange(4) * np.pi / 4)  # Phases of a ripple that are tried, in rad.
 # Distance from 0, in ranges of the positions, beyond which the phase of a wave is given near the positions.
 # Phase and wavelength have a correlation of 1 - 4e-6 there; at 25,000 ranges the fit cannot tell them apart.
 FAR = 100.0
-
 # Channels along which the amplitude of a wave may change.
 CHANGES_A_WAVE = (
     "direction", "speed_mm_s", "load_N", "temperature_C", "compression_ratio_pct", "aging_days"
@@ -124,8 +115,14 @@ def _terms_of_single(
 
 def _may_follow(effect: Effect, channel: Channel, fitted: Fitted) -> bool:
     """Whether a form for any channel is fitted to this one."""
-    if not channel.numeric or channel.name == "direction" or not _in_domain(effect, channel.values):
+    if not channel.numeric or channel.name == "direction":
         return False
+    distinct = np.unique(channel.values)
+    sample = distinct[:: max(1, distinct.size // 50)]
+    with np.errstate(all="ignore"):
+        inputs = {CHANNEL: sample, "direction": 1.0, "x_ref": reference(channel.values)}
+        if not np.isfinite(effect.shape(inputs, **effect.start())).all():
+            return False
     if effect.id == "offset_slope":  # not along strokes, and not if the offset is in the model
         has_offset = any(term.effect.id == "zero_offset" for term in fitted.model.terms)
         return FINER[channel.unit] > FINER["stroke"] and not has_offset
@@ -137,8 +134,7 @@ def _all_read(
 ) -> bool:
     """Whether the campaign has the channels that an effect reads, and its values can show it.
 
-    Some of the channels may be constant (the one load of a campaign), unless the effect is then the same as
-    another one.
+    Some may be constant (the one load of a campaign), unless the effect is then the same as another one.
     """
     varying = {name for name in effect.reads if name in channels or name == CHANNEL}
     still = set(effect.reads) - varying
@@ -153,8 +149,7 @@ def _terms_of_pair(
 ) -> Iterator[tuple[Term, dict]]:
     """Yield the forms of a pair of channels: products, or a slope for each category.
 
-    Forms with main effects need `alone`. They would otherwise explain the specimens' scatter if that is not
-    known, or the Stribeck curve if there are few speeds.
+    Forms with main effects need `alone`: they may explain the specimens' scatter, or the Stribeck curve.
     """
     if not (one.numeric and other.numeric):
         number, category = (one, other) if one.numeric else (other, one)
@@ -180,11 +175,7 @@ def _terms_of_pair(
 
 
 def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = criteria.FREE_DF + 1) -> Term:
-    """Return the free shape of a channel: one level per category, or a spline.
-
-    A spline of up to five knots has them at quantiles and no penalty; one of more has even knots and a
-    penalty.
-    """
+    """Return the free shape of a channel: a level per category, or a spline, penalised if of many knots."""
     if channel.numeric:
         places = _knots(np.unique(channel.values), max(knots, criteria.FREE_DF + 1))
         means = natural(places, channel.values).mean(axis=0)
@@ -208,7 +199,7 @@ def surface_term(one: Channel, other: Channel, acts_on: str, operation: str) -> 
 def _knots(values: np.ndarray, count: int) -> tuple[float, ...]:
     """Return up to `count` knots for sorted values of a channel, or the distinct values if there are no more.
 
-    Even knots that are nearest to no value are left out: in a gap between the values nothing determines them.
+    Even knots in a gap between the values are left out: nothing determines them.
     """
     at, kept = scaled(values), [0]
     while (after := int(at.searchsorted(at[kept[-1]] + criteria.KNOTS_APART, "right"))) < at.size:
@@ -246,51 +237,32 @@ def periodic_terms(
         lengths, phases = (length,), (0.0,)
     names = {p.name: lengths if p.name == "lambda_" else phases for p in effect.nonlinear}
     units = rows.groups.starts["file"].size
+    test_result, no_columns = ScoreTestResult(0.0, 2, units, 0.0), np.empty((0, 0))
     for target in targets:
-        if target in effect.acts_on:
-            test_result = ScoreTestResult(0.0, 2, units, 0.0)
-            candidate = Candidate(
-                (peak.axis,), *target, "file", np.empty((0, 0)), test_result, p_value=peak.p_value
-            )
-            yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
-            for name in (name for name in CHANGES_A_WAVE if name in rows.table):
-                values = rows.unsigned(name)
-                if np.ptp(values) > 0:
-                    own = {**fixed, "z_ref": reference(values)}
-                    yield Term(changing, (peak.axis, name), *target, fixed=own), names, candidate
+        if target not in effect.acts_on:
+            continue
+        candidate = Candidate((peak.axis,), *target, "file", no_columns, test_result, peak.p_value)
+        yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
+        for name in CHANGES_A_WAVE:
+            if name in rows.table and np.ptp(values := rows.unsigned(name)) > 0:
+                own = {**fixed, "z_ref": reference(values)}
+                yield Term(changing, (peak.axis, name), *target, fixed=own), names, candidate
 
 
 def _near(effect: Effect, peak: Peak) -> Effect:
     """Return a periodic effect with the wavelength bounded to a fifth about that of a peak."""
-    bounds = (0.8 * peak.wavelength, 1.25 * peak.wavelength)
-    parameters = [
-        replace(p, bounds=bounds, start=peak.wavelength) if p.name == "lambda_" else p
-        for p in effect.parameters
-    ]
+    near = {"bounds": (0.8 * peak.wavelength, 1.25 * peak.wavelength), "start": peak.wavelength}
+    parameters = (replace(p, **near) if p.name == "lambda_" else p for p in effect.parameters)
     return replace(effect, parameters=tuple(parameters))
 
 
 def reference(values: np.ndarray) -> float:
     """Return a channel's reference value: its mean, rounded to three digits."""
-    mean = float(np.mean(values))
-    return float(f"{mean:.3g}")
-
-
-def _in_domain(effect: Effect, values: np.ndarray) -> bool:
-    """Whether a form is finite at every value of the channel."""
-    sample = np.unique(values)[:: max(1, np.unique(values).size // 50)]
-    with np.errstate(all="ignore"):
-        result = effect.shape(
-            {CHANNEL: sample, "direction": 1.0, "x_ref": reference(values)}, **effect.start()
-        )
-    return bool(np.isfinite(result).all())
+    return float(f"{float(np.mean(values)):.3g}")
 
 
 def _within_reach(effect: Effect, values: np.ndarray) -> Effect:
-    """Return a form with places inside the channel's range and widths of at most a few of its ranges.
-
-    A peak far outside is not distinguishable from a curve with a constant.
-    """
+    """Return a form with places inside the channel's range and widths of at most a few of its ranges."""
     low, high, span = float(values.min()), float(values.max()), float(np.ptp(values)) or 1.0
     limits = {"inside": (low, high), "between": (low, high), "span": (span / 1000, criteria.SPANS * span)}
     parameters = []
@@ -324,25 +296,20 @@ def grid_of(effect: Effect, values: np.ndarray) -> dict[str, tuple[float, ...]]:
     return grids
 
 
-WITHOUT_LOAD = {"mu": "friction", **FORCES}
-"""What is fitted in place of a coefficient where no load is given."""
-
-
 def describe(term: Term, rows: Rows) -> str:
     """Return the label of an effect, e.g. "ripple along displacement_mm, added to force"."""
     label = term.effect.label.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
-    target = term.acts_on if rows.has_load else WITHOUT_LOAD.get(term.acts_on, term.acts_on)
+    fitted_instead = {} if rows.has_load else {"mu": "friction", **FORCES}
+    target = fitted_instead.get(term.acts_on, term.acts_on)
     return f"{label}, {'added to' if term.operation == 'add' else 'factor on'} {target}"
 
 
 # ---------------------------------------------------------------- richer laws
-# Richer aging laws: each of the catalogue is fitted jointly and tested against the declared one.
-#
 # The declared law is flexible: with a and b free it explains most of the effect of a floor or an induction
-# time. The part orthogonal to its tangent space is small, and a dozen specimens give little evidence of it.
-# Each richer law is therefore fitted jointly from several starts, with its own estimate of the specimens'
-# scatter. With n specimens, p parameters of the declared law and q more, the restricted deviances D give the
-# ratio of the residual variances between specimens,
+# time, and a dozen specimens give little evidence of the rest. Each richer law of the catalogue is therefore
+# fitted jointly from several starts, with its own estimate of the specimens' scatter. With n specimens, p
+# parameters of the declared law and q more, the restricted deviances D give the ratio of the residual
+# variances between specimens,
 #
 # .. math::
 #     \log \frac{S_0}{S_1} = \frac{1}{n} \Big(D_0 - D_1 + n \log \frac{n - p}{n - p - q} - q \Big), \qquad
@@ -413,11 +380,8 @@ def _best(before: Fitted, term: Term) -> Fitted:
         (shape,) = mean_derivatives(term, {**effect.start(), number: day}, rows, only_linear=True)
         left = project(before, (before.slope(*MU) * shape)[:, None])[:, 0]
         size = float(left @ left)
-        start = {
-            **effect.start(),
-            amplitude: float(left @ before.white_residual) / size if size > 0 else 0.0,
-            number: day,
-        }
+        height = float(left @ before.white_residual) / size if size > 0 else 0.0
+        start = {**effect.start(), amplitude: height, number: day}
         model = before.model.with_term(term, {p.name: start[p.name] for p in effect.parameters})
         found.append(reestimated(before.refitted(model)))
     return min(found, key=lambda f: f.deviance)

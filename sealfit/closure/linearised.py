@@ -36,8 +36,9 @@ class Proposal:
     p_value: float
     column: np.ndarray  # (n,) what it adds to the force, whitened and projected
     source: tuple  # key of its candidate
-    # effective degrees of freedom of a penalised shape before it is refitted
-    linear_size: float | None = None
+    linear_size: float | None = (
+        None  # of a penalised shape: effective degrees of freedom before it is refitted
+    )
     fitted: Fitted | None = None
 
     @cached_property
@@ -45,11 +46,9 @@ class Proposal:
         """Effective degrees of freedom: its number of parameters, or fewer for a penalised free shape."""
         if self.linear_size is None:
             return float(len(self.term.effect.parameters))
-        return (
-            self.linear_size
-            if self.fitted is None
-            else effective_df(self.fitted, len(self.fitted.model.terms) - 1)
-        )
+        if self.fitted is None:
+            return self.linear_size
+        return effective_df(self.fitted, len(self.fitted.model.terms) - 1)
 
     @property
     def bic_penalty(self) -> float:
@@ -74,24 +73,19 @@ class Proposal:
 
     @property
     def rank(self) -> tuple:
-        """Sort key of equals: physical effect, closed form, free shape; then fewer parameters; then target.
-
-        A physical effect lists its usual target first.
-        """
+        """Sort key of equals: physical effect, closed form, free shape; fewer parameters; then target."""
         effect = self.term.effect
         kind = 0 if effect.physical else 2 if effect.id in UNNAMED else 1
         is_offset = self.source == ZERO_OFFSET  # amplifier offsets are commoner than one-sided friction
         position = -1 if is_offset else PREFERRED.index(self.term.acts_on)
-        return (kind, self.size, position, effect.acts_on.index(self.term.target) if effect.physical else 0)
+        usual = effect.acts_on.index(self.term.target) if effect.physical else 0  # its usual target is first
+        return (kind, self.size, position, usual)
 
 
 def linearised(
     fitted: Fitted, term: Term, search: Mapping[str, tuple], candidate: Candidate
 ) -> list[Proposal]:
-    """Return a term fitted to the residual in the tangent space of a model, at the best point of its grid.
-
-    The list is empty if none of the grid is identifiable. Amplitudes are fitted exactly.
-    """
+    """Return a term fitted in the tangent space of a model at the best point of its grid, if identifiable."""
     effect, rows = term.effect, fitted.rows
     points = [dict(zip(search, point, strict=True)) for point in itertools.product(*search.values())]
     point, most, shape = _best(fitted, term, points)
@@ -104,8 +98,11 @@ def linearised(
     size = None
     if term.smoothness is None:
         amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
-    else:
-        term, amplitude, size = _smooth(term, left, fitted.white_residual)
+    else:  # a free shape
+        normal, gradient, rough = left.T @ left, left.T @ fitted.white_residual, roughness_of(term)
+        smoothness = reml_smoothness(normal, gradient, rough, len(term.channels))
+        amplitude, size = penalised(normal, gradient, smoothness * rough)
+        term = replace(term, smoothness=smoothness)
     column = left @ amplitude
     chosen = {**effect.start(), **point, **dict(zip(effect.linear, amplitude.tolist(), strict=True))}
     values = {p.name: chosen[p.name] for p in effect.parameters}
@@ -114,24 +111,17 @@ def linearised(
     return [Proposal(term, values, candidate.unit, units, found, p_value, column, candidate.key, size)]
 
 
-def _shapes(term: Term, points: list[dict[str, float]], rows: Rows) -> np.ndarray:
-    """Return the shapes per unit amplitude at every point of a grid, (n, points * amplitudes)."""
-    start = term.effect.start()
-    with np.errstate(all="ignore"):
-        made = [mean_derivatives(term, {**start, **point}, rows, only_linear=True) for point in points]
-    return np.column_stack([column for columns in made for column in columns])
-
-
 def _best(
     fitted: Fitted, term: Term, points: list[dict[str, float]]
 ) -> tuple[dict[str, float], float, np.ndarray]:
     """Return the best point of a grid, the sum of squares it explains and its shapes, (n, amplitudes)."""
-    slope, count = fitted.slope(*term.target), len(term.effect.linear)
-    shapes = _shapes(term, points, fitted.rows)
-    parts = range(0, shapes.shape[1], PART * count)
-    chi2 = np.concatenate(
-        [_explained(fitted, slope[:, None] * shapes[:, k : k + PART * count], count) for k in parts]
-    )
+    slope, count, start = fitted.slope(*term.target)[:, None], len(term.effect.linear), term.effect.start()
+    with np.errstate(all="ignore"):
+        made = [mean_derivatives(term, {**start, **point}, fitted.rows, only_linear=True) for point in points]
+    shapes = np.column_stack(list(itertools.chain.from_iterable(made)))
+    wide = PART * count
+    parts = [slope * shapes[:, k : k + wide] for k in range(0, shapes.shape[1], wide)]
+    chi2 = np.concatenate([_explained(fitted, part, count) for part in parts])
     best = int(np.argmax(chi2))
     return points[best], float(chi2[best]), shapes[:, best * count : (best + 1) * count]
 
@@ -153,14 +143,6 @@ def middles(values: np.ndarray) -> np.ndarray:
     return (distinct[1:] + distinct[:-1]) / 2
 
 
-def _smooth(term: Term, left: np.ndarray, residual: np.ndarray) -> tuple[Term, np.ndarray, float]:
-    """Return a free shape with estimated smoothness, its amplitudes, and its effective degrees of freedom."""
-    normal, gradient, rough = left.T @ left, left.T @ residual, roughness_of(term)
-    smoothness = reml_smoothness(normal, gradient, rough, len(term.channels))
-    amplitude, size = penalised(normal, gradient, smoothness * rough)
-    return replace(term, smoothness=smoothness), amplitude, size
-
-
 def _explained(fitted: Fitted, columns: np.ndarray, count: int) -> np.ndarray:
     """Return the sum of squares that each group of `count` columns of the force explains, shape (points,)."""
     good = np.isfinite(columns).all(axis=0)
@@ -172,7 +154,7 @@ def _explained(fitted: Fitted, columns: np.ndarray, count: int) -> np.ndarray:
     score = np.einsum("npi,n->pi", white, fitted.white_residual)
     size, least = (np.einsum("pii->pi", a) for a in (gram, whole))
     kept = (size > IDENTIFIABLE * least) & good.reshape(-1, count)
-    score = np.where(kept, score / np.sqrt(np.where(kept, size, 1.0)), 0.0)
-    unit = np.where(kept, 1 / np.sqrt(np.where(kept, size, 1.0)), 0.0)
+    root = np.sqrt(np.where(kept, size, 1.0))
+    score, unit = np.where(kept, score / root, 0.0), np.where(kept, 1 / root, 0.0)
     inverse = np.linalg.pinv(gram * unit[:, :, None] * unit[:, None, :], rcond=1e-10, hermitian=True)
     return np.einsum("pi,pij,pj->p", score, inverse, score)

@@ -15,20 +15,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtr
 
+from sealfit.closure import criteria
 from sealfit.closure.channels import Channel
-from sealfit.closure.criteria import (
-    CHANGE_P,
-    CONTENDER_SHARE,
-    EQUAL_BIC,
-    HALF_OF_CALENDAR,
-    LARGE_CHANGE,
-    MOST_RELATIVE_ERROR,
-    REFIT_MARGIN,
-    RIVAL_BIC,
-    RIVAL_CORRELATION,
-    SAME_EFFECT,
-    SCATTER_FALL,
-)
 from sealfit.closure.errors_and_intervals import robust_covariance
 from sealfit.closure.forms import CHANGES_A_WAVE, periodic_terms, terms_of
 from sealfit.closure.linearised import ZERO_OFFSET, Proposal, linearised
@@ -55,24 +43,15 @@ def propose(
     effects: Mapping[str, Effect],
     also: Sequence[Proposal] = (),
 ) -> list[Proposal]:
-    """Return jointly refitted proposals for the channels that explain most of the residual, best first.
-
-    The `significant` candidates are sorted, strongest first. `also` are further proposals.
-    """
-    forms = [
-        (t, search, c)
-        for c in _contenders(significant)
-        for t, search in terms_of(c, channels, fitted, effects)
-    ]
+    """Return jointly refitted proposals, and `also` further ones, for `significant` sorted candidates."""
+    contenders = _contenders(significant)
+    forms = [(*form, c) for c in contenders for form in terms_of(c, channels, fitted, effects)]
     forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # the order of exact equals
     found = [*also, *(p for form in forms for p in linearised(fitted, *form))]
     calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
-    others = [p for p in found if not set(p.term.channels) & set(CALENDAR)]
-    if not (
-        calendar
-        and others
-        and max(p.chi2 for p in others) >= HALF_OF_CALENDAR * max(p.chi2 for p in calendar)
-    ):
+    others = [p for p in found if p not in calendar]
+    most, of_others = (max((p.chi2 for p in own), default=-np.inf) for own in (calendar, others))
+    if not calendar or of_others < criteria.HALF_OF_CALENDAR * most:
         return _ordered(fitted, _refitted(fitted, _best_few(found), found))
     others = _refitted(fitted, _best_few(others), others)
     calendar = _refitted(fitted, _best_few(calendar)[:CALENDAR_RIVALS])
@@ -80,11 +59,8 @@ def propose(
 
 
 def _calendar_last(fitted: Fitted, others: list[Proposal], calendar: list[Proposal]) -> list[Proposal]:
-    """Return refitted proposals in order: those along the calendar last, unless a named one fits much better.
-
-    Conditions are tested one after the other, so the calendar is correlated with them.
-    """
-    least = min(p.bic for p in others) - RIVAL_BIC
+    """Return refitted proposals in order, those of the calendar last unless a named one fits much better."""
+    least = min(p.bic for p in others) - criteria.RIVAL_BIC
     if any(p.named and p.bic < least for p in calendar):
         return _ordered(fitted, [*calendar, *others])
     return _ordered(fitted, others) + calendar
@@ -93,17 +69,14 @@ def _calendar_last(fitted: Fitted, others: list[Proposal], calendar: list[Propos
 def propose_ripples(
     fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
 ) -> list[Proposal]:
-    """Return jointly refitted proposals for a periodic component, best first.
-
-    Changes of its amplitude that are not the best are no rivals: none of them was found.
-    """
+    """Return jointly refitted proposals for a periodic component, best first."""
     forms = periodic_terms(fitted, peak, samples, effects)
     found = [p for form in forms for p in linearised(fitted, *form)]
     constant = [p for p in found if len(p.term.channels) == 1]
     refitted = _refitted(fitted, _best_few(found), found)
     refitted = [p for p in refitted if len(p.term.channels) == 1 or _changes(p)]
     best, *others = _ordered(fitted, refitted or _refitted(fitted, constant))
-    return [best, *(p for p in others if len(p.term.channels) == 1)]
+    return [best, *(p for p in others if len(p.term.channels) == 1)]  # other changes were not found
 
 
 def _changes(proposal: Proposal) -> bool:
@@ -113,7 +86,7 @@ def _changes(proposal: Proposal) -> bool:
     place += [p.name for p in proposal.term.effect.parameters].index("B")
     variance = max(fitted.covariance[place, place], robust_covariance(fitted, proposal.unit)[place, place])
     ratio = abs(fitted.model.values[-1]["B"]) / np.sqrt(variance)
-    return len(CHANGES_A_WAVE) * 2 * stdtr(proposal.units - 1, -ratio) <= CHANGE_P
+    return len(CHANGES_A_WAVE) * 2 * stdtr(proposal.units - 1, -ratio) <= criteria.CHANGE_P
 
 
 def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
@@ -122,16 +95,12 @@ def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
-    """Yield the candidates that explain nearly as much as the strongest, each once.
-
-    A constant offset comes first: a form that starts at zero would contain it.
-    """
-    if not significant:
-        return
-    best = next((c for c in significant if c.key == ZERO_OFFSET), significant[0])
+    """Yield the candidates that explain nearly as much as the strongest, or a constant offset, each once."""
+    offset = (c for c in significant if c.key == ZERO_OFFSET)  # a form that starts at zero would contain it
+    best = next(offset, significant[0]) if significant else None
     seen = set()
     for candidate in significant:
-        if candidate.chi2 < CONTENDER_SHARE * best.chi2 or candidate.key in seen:
+        if candidate.chi2 < criteria.CONTENDER_SHARE * best.chi2 or candidate.key in seen:
             continue
         if best.channels == ("direction",) and (candidate.pair or "direction" not in candidate.channels):
             continue
@@ -147,16 +116,17 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
     named form among them: the missing effect biases the model it is tested on.
     """
     kept: list[Proposal] = []
-    ranked = sorted(found, key=lambda p: p.bic - EQUAL_BIC * p.term.effect.physical)
+    ranked = sorted(found, key=lambda p: p.bic - criteria.EQUAL_BIC * p.term.effect.physical)
     for proposal in ranked:
-        kind = _kind(proposal)
-        same = [p for p in kept if _kind(p) == kind]
+        effect = proposal.term.effect
+        alike = [p for p in kept if p.term.effect.id == effect.id]
+        same = [p for p in alike if len(p.term.effect.parameters) == len(effect.parameters)]
         if len(same) >= 2 or any(p.term.key() == proposal.term.key() for p in same):
             continue
         if len(kept) < REFITTED or (not proposal.named and not same):
             kept.append(proposal)
     most = max((p.chi2 for p in found), default=0.0)
-    near = [p for p in ranked if p.chi2 >= CONTENDER_SHARE * most and p.named]
+    near = [p for p in ranked if p.chi2 >= criteria.CONTENDER_SHARE * most and p.named]
     mechanisms = {p.term.effect.id: p for p in reversed(near) if p.term.effect.physical}
     kept += [p for p in mechanisms.values() if all(p.term.effect.id != own.term.effect.id for own in kept)]
     for part in (attrgetter("term.target"), attrgetter("term.channels")):
@@ -167,57 +137,42 @@ def _best_few(found: list[Proposal]) -> list[Proposal]:
     return kept
 
 
-def _kind(proposal: Proposal) -> tuple[str, int]:
-    """Return what identifies a form: its id and number of parameters."""
-    return proposal.term.effect.id, len(proposal.term.effect.parameters)
-
-
 def _ordered(fitted: Fitted, found: list[Proposal]) -> list[Proposal]:
-    """Return proposals best first.
-
-    Among equals, those that leave earlier effects unchanged are first; then they are sorted by rank.
-    """
+    """Return proposals best first; of equals one that leaves earlier effects unchanged, then by rank."""
     if not found:
         return []
     found = sorted(found, key=lambda p: p.bic)
     best = found[0]
-    equals = [p for p in found if p.bic - best.bic < EQUAL_BIC or _simpler(p, best)]
+    equals = [p for p in found if p.bic - best.bic < criteria.EQUAL_BIC or _simpler(p, best)]
     candidates = [p for p in equals if determined(p)]
     fewest = min((p.size for p in candidates), default=0)
     candidates += [p for p in equals if p.term.effect.physical and p not in candidates and p.size <= fewest]
-    equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < EQUAL_BIC]
+    equal_fits = [p for p in found if p.fitted.deviance - best.fitted.deviance < criteria.EQUAL_BIC]
     if not any(p.term.effect.id == LINEAR for p in equal_fits):  # a straight line shows no mechanism
         # The BIC penalty is not decisive for physical effects of just these channels.
         own = [p for p in equal_fits if p.term.effect.physical and CHANNEL not in p.term.effect.reads]
         least = min((p.fitted.deviance for p in own), default=0.0)
-        candidates += [p for p in own if p.fitted.deviance - least < 2 * EQUAL_BIC and p not in candidates]
+        near = [p for p in own if p.fitted.deviance - least < 2 * criteria.EQUAL_BIC]
+        candidates += [p for p in near if p not in candidates]
     if candidates:
         first = min(candidates, key=lambda p: (_changes_earlier(fitted, p), p.rank, p.bic))
     else:
-        first = next((p for p in found if p.bic - best.bic < RIVAL_BIC and determined(p)), best)
+        first = next((p for p in found if p.bic - best.bic < criteria.RIVAL_BIC and determined(p)), best)
     return [first, *(p for p in found if p is not first)]
 
 
 def _changes_earlier(fitted: Fitted, proposal: Proposal) -> bool:
-    """Whether a proposal changes an amplitude of an earlier effect by more than a third.
-
-    Two effects that explain the same structure are harder to interpret than two separate ones.
-    """
+    """Whether a proposal changes an amplitude of an earlier effect by more than a third."""
+    model, later = fitted.model, proposal.fitted.model.values
     return any(
-        abs(now[p.name] - then[p.name]) > LARGE_CHANGE * abs(then[p.name])
-        for term, then, now in zip(
-            fitted.model.terms, fitted.model.values, proposal.fitted.model.values, strict=False
-        )
-        for p in term.effect.parameters
-        if p.linear
+        abs(now[name] - then[name]) > criteria.LARGE_CHANGE * abs(then[name])
+        for term, then, now in zip(model.terms, model.values, later, strict=False)
+        for name in term.effect.linear
     )
 
 
 def determined(proposal: Proposal) -> bool:
-    """Whether the data determine the nonlinear parameters of a form, to half of their value or better.
-
-    Otherwise the form is not distinguishable from a straight line or a constant.
-    """
+    """Whether the data determine the nonlinear parameters of a form, to half of their value or better."""
     fitted, effect = proposal.fitted, proposal.term.effect
     first = fitted.model.term_slice(len(fitted.model.terms) - 1).start
     covariance = np.maximum(fitted.covariance, robust_covariance(fitted, proposal.unit))
@@ -226,7 +181,7 @@ def determined(proposal: Proposal) -> bool:
             continue
         error, value = np.sqrt(covariance[first + k, first + k]), fitted.model.values[-1][parameter.name]
         place = CHANNEL in effect.reads and parameter.search in ("inside", "between")  # it may be near 0
-        if error > MOST_RELATIVE_ERROR * (np.ptp(parameter.bounds) if place else abs(value)):
+        if error > criteria.MOST_RELATIVE_ERROR * (np.ptp(parameter.bounds) if place else abs(value)):
             return False
     return True
 
@@ -238,7 +193,8 @@ def _simpler(proposal: Proposal, best: Proposal) -> bool:
     """
     gain = best.term.target == ("force", "multiply") and proposal.term.acts_on != "force"
     plain = proposal.rank[:2] < best.rank[:2] or proposal.source == ZERO_OFFSET or gain
-    return plain and correlation(proposal, best) > SAME_EFFECT and proposal.bic - best.bic < 2 * EQUAL_BIC
+    as_good = proposal.bic - best.bic < 2 * criteria.EQUAL_BIC
+    return plain and as_good and correlation(proposal, best) > criteria.SAME_EFFECT
 
 
 def correlation(one: Proposal, other: Proposal) -> float:
@@ -250,28 +206,24 @@ def correlation(one: Proposal, other: Proposal) -> float:
 def rivals(chosen: Proposal, found: Sequence[Proposal]) -> list[Proposal]:
     """Return proposals these data cannot distinguish from the chosen one: they add nearly the same force.
 
-    Those with a far larger BIC are none. They were fitted under the scatter of the best, which does not
-    contain their misfit, and their forces may be wrong by many times the noise.
+    Those with a far larger BIC are none: their forces may be wrong by many times the noise.
     """
-    return [p for p in found if p is not chosen and _rival(p, chosen)]
-
-
-def _rival(proposal: Proposal, chosen: Proposal) -> bool:
-    same_equation = proposal.term.key()[1:] == chosen.term.key()[1:]
-    if same_equation and abs(proposal.bic - chosen.bic) < 1e-3:
-        return False
-    similarity = correlation(proposal, chosen)
-    most = REFIT_MARGIN if similarity > SAME_EFFECT else RIVAL_BIC
-    return similarity > RIVAL_CORRELATION and proposal.bic - chosen.bic < most
+    kept = []
+    for p in found:
+        similarity, behind = correlation(p, chosen), p.bic - chosen.bic
+        most = criteria.REFIT_MARGIN if similarity > criteria.SAME_EFFECT else criteria.RIVAL_BIC
+        same = p is chosen or (p.term.key()[1:] == chosen.term.key()[1:] and abs(behind) < 1e-3)
+        if not same and similarity > criteria.RIVAL_CORRELATION and behind < most:
+            kept.append(p)
+    return kept
 
 
 def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal] = ()) -> list[Proposal]:
     """Return proposals fitted jointly with the model, best first.
 
-    Further named forms of the variables of the best are among them, from `more`: the missing effect biases
-    the model in whose tangent space they were ranked. The scatter is re-estimated for those near the best.
-    Nearness is the BIC under the scatter of the best. If most of the former scatter was the missing effect,
-    as the few likeliest proposals show, all are fitted under the re-estimated one.
+    Further named forms of the variables of the best are among them, from `more`. The scatter is re-estimated
+    for those whose BIC under the scatter of the best is near. If most of the former scatter was the missing
+    effect, as the few likeliest proposals show, all are fitted under the re-estimated one.
     """
     if not found:
         return []
@@ -281,17 +233,17 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal
     best, alone = _reestimated(first), _reestimated(first, noise=True)
     joint += [_joint(fitted, p) for p in likeliest[LIKELIEST:]]
     joint += [_joint(fitted, p) for p in _further_forms(min(joint, key=lambda p: p.bic), found, more)]
-    if first.fitted.deviance - alone.fitted.deviance > SCATTER_FALL:
+    if first.fitted.deviance - alone.fitted.deviance > criteria.SCATTER_FALL:
         joint = list(_refitted_under(fitted, joint, alone.fitted.scatter))
     refitted = sorted(joint, key=lambda p: p.bic)
     if refitted[0] is not first:
         best = _reestimated(refitted[0])
-    least = min(best.bic, refitted[0].bic)
-    scatter = best.fitted.scatter
-    near = [deviance_under(p.fitted, scatter) + p.bic_penalty < least + REFIT_MARGIN for p in refitted[1:]]
-    own = [_reestimated(p) for p, n in zip(refitted[1:], near, strict=True) if n]
-    far = [p for p, n in zip(refitted[1:], near, strict=True) if not n]
-    return [best, *own, *far[:LIKELIEST]]
+    most = min(best.bic, refitted[0].bic) + criteria.REFIT_MARGIN
+    own, far = [], []
+    for p in refitted[1:]:
+        near = deviance_under(p.fitted, best.fitted.scatter) + p.bic_penalty < most
+        (own if near else far).append(p)
+    return [best, *map(_reestimated, own), *far[:LIKELIEST]]
 
 
 def _further_forms(best: Proposal, tried: Sequence[Proposal], found: Sequence[Proposal]) -> list[Proposal]:
@@ -329,8 +281,7 @@ def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
 def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
     """Yield the fitted proposals, likeliest first, fitted under another scatter: the better of two starts.
 
-    One is their own fit. The other has v_s and b searched anew, as they may have been biased. That search is
-    made with the likeliest effect on each quantity; further effects on it start from its result.
+    One is their own fit. The other has v_s and b searched anew, with the likeliest effect on each quantity.
     """
     rows, loads = fitted.rows, fitted.loads
     begun: dict[tuple[str, str], np.ndarray] = {}

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -39,8 +40,8 @@ class Renaming:
     ) -> tuple[Fitted, list[AcceptedEffect]]:
         """Return a fit and its effects, each but the last renamed given all others.
 
-        An effect that keeps its name was confirmed while others were missing. If it has no gain on held-out
-        data given the others, it or a later one is removed: the one that explains least.
+        If one that keeps its name has no gain on held-out data given the others, it or a later one is
+        removed: the one that explains least.
         """
         for item in added[:-1]:
             number = next((k for k, a in enumerate(added) if a is item), None)
@@ -54,33 +55,29 @@ class Renaming:
                 continue
             same = proposals[0].term.key() == item.proposal.term.key()
             better = self._confirmed(without, proposals[:1] if same else proposals, item.round)
-            if better is None and self._unchanged(without, fitted, number, item) is None:
+            if better is None:
+                model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
+                unchanged = replace(item.proposal, fitted=fitted.refitted(model))
+                if self._confirmed(without, [unchanged], item.round) is not None:
+                    continue
                 later = range(number + 1, len(added))
                 left = [without, *(fitted.refitted(fitted.model.without_term(k)) for k in later)]
                 least = min(range(len(left)), key=lambda k: left[k].deviance)
                 fitted = fit(left[least].model, fitted.rows, fitted.scatter, turns=2)
                 added = [a for k, a in enumerate(added) if k != number + least]
-            elif better is not None and better.proposal.term.key() != item.proposal.term.key():
+            elif better.proposal.term.key() != item.proposal.term.key():
                 fitted = fit(better.proposal.fitted.model, fitted.rows, fitted.scatter, turns=2)
                 added = [*added[:number], *added[number + 1 :], better]
         return fitted, added
-
-    def _unchanged(
-        self, without: Fitted, fitted: Fitted, number: int, item: AcceptedEffect
-    ) -> AcceptedEffect | None:
-        """Return an effect of a fit with its own name, confirmed given the others; None if not confirmed."""
-        model = without.model.with_term(fitted.model.terms[number], fitted.model.values[number])
-        own = replace(item.proposal, fitted=fitted.refitted(model))
-        return self._confirmed(without, [own], item.round)
 
     def merged_with_earlier(
         self, fitted: Fitted, added: list[AcceptedEffect], new: AcceptedEffect, *, pending: bool = False
     ) -> tuple[list[AcceptedEffect], AcceptedEffect]:
         """Return the earlier effects and a new one, merged with an earlier one if possible.
 
-        The new one is not in `fitted` yet. Two effects are merged if a single one fits as well: a shape of
-        the same channel or of a proportional one, or a product or surface of two channels. While the other
-        effect of a masked pair is `pending`, only effects of the new one's own channel are merged with it.
+        The new one is not in `fitted` yet. A single one that fits as well may be a shape of the same channel
+        or of a proportional one, or a product or surface of two channels. While the other effect of a masked
+        pair is `pending`, only effects of the new one's own channel are merged with it.
         """
         for number, earlier in enumerate(added):
             if pending and self._channel(earlier) != self._channel(new):
@@ -95,9 +92,9 @@ class Renaming:
     ) -> AcceptedEffect | None:
         """Return one effect that fits as well as an earlier and a new one; None if there is none.
 
-        Two forms of one channel that are no physical effects are one shape: then the single effect only has
-        to fit as well, whatever its number of parameters. A surface in place of two such forms must lower the
-        held-out error more; in place of a physical effect its BIC must be smaller.
+        In place of two forms of one channel that are no physical effects its number of parameters is free. A
+        surface in place of two such forms must lower the held-out error more; in place of a physical effect
+        its BIC must be smaller.
         """
         names = self._channel(earlier), self._channel(new)
         effects = [item.proposal.term.effect for item in (earlier, new)]
@@ -117,8 +114,10 @@ class Renaming:
         if any(effect.physical for effect in effects):
             better += [p for p in surfaces if _lead(p, two) > p.bic_penalty - penalties + EQUAL_BIC]
         elif surfaces:
-            gain_N = self._gain_N(without, new.proposal)
-            better += [p for p in surfaces if _lead(p, two) > 0 and self._gain_N(without, p) > gain_N]
+            loop = self.context.config.loop
+            gain = partial(heldout_gain, without, loop=loop, samples=self.samples)
+            least = gain(new.proposal).rmse_N
+            better += [p for p in surfaces if _lead(p, two) > 0 and gain(p).rmse_N > least]
         better = sorted(better, key=lambda p: p.bic)
         return self._confirmed(without, better, new.round) if better else None
 
@@ -146,16 +145,13 @@ class Renaming:
         names = {name for p in parts for name in p.term.channels}
         along = set(ALONG) if names & set(ALONG) else set()
         near = [c for c in self.channels.values() if c.numeric and c.name in (names | along) - {"direction"}]
-        pairs = [
-            (one, other)
-            for one, other in itertools.combinations(near, 2)
-            if names <= {one.name, other.name} | (along if along & {one.name, other.name} else set())
-        ]
+        targets = dict.fromkeys((*MAIN_TARGETS, *(p.term.target for p in parts)))
         p_value = min(p.p_value for p in parts)
         found = []
-        for pair in pairs:
-            if main_effects_identifiable(pair, without):
-                for target in dict.fromkeys((*MAIN_TARGETS, *(p.term.target for p in parts))):
+        for pair in itertools.combinations(near, 2):
+            own = {channel.name for channel in pair}
+            if names <= own | (along if along & own else set()) and main_effects_identifiable(pair, without):
+                for target in targets:
                     term = surface_term(*pair, *target)
                     candidate = candidate_of(term, pair, without.rows, p_value)
                     found += linearised(without, term, {}, candidate)
@@ -173,15 +169,9 @@ class Renaming:
         found = sorted(finest.values(), key=lambda c: -c.chi2)
         own, values = fitted.model.terms[number], fitted.model.values[number]
         at_own_values = {p.name: (values[p.name],) for p in own.effect.nonlinear}
-        same_target = next((c for c in found if c.target == own.target), None)
-        own_form = ()
-        if same_target is not None:
-            own_form = linearised(without, own, at_own_values, same_target)
+        same_target = [c for c in found if c.target == own.target][:1]
+        own_form = [p for c in same_target for p in linearised(without, own, at_own_values, c)]
         return propose(without, found, self.channels, self.context.effects, own_form)
-
-    def _gain_N(self, without: Fitted, proposal: Proposal) -> float:
-        """Return by how much the model of a fitted proposal lowers the error on held-out data."""
-        return heldout_gain(without, proposal, self.context.config.loop, self.samples).rmse_N
 
     def _confirmed(
         self, without: Fitted, proposals: Sequence[Proposal], number: int
