@@ -168,22 +168,17 @@ class _HeldOut:
 
     @property
     def repeats(self) -> bool:
-        """Whether the search is repeated in each fold.
-
-        With few runs a fold has too little power; the effects of the full campaign are then refitted in each
-        fold.
-        """
+        """Whether the search is repeated in each fold: with few runs the effects are only refitted there."""
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
     def forces(
         self, selection: Selection, say: Callable[[str], None]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[Model] | None]:
-        """Return each row's force before and after, by fits without its group, and the models.
+        """Return each row's force before and after, fitted without its group; where determined; the models.
 
-        A force is NaN if its row was never held out. The third array is true where the rows not held out
-        determine both forces. The models are those of the repeated searches; None if the search is not
-        repeated. A repeated search has as many rounds as the full campaign needed for its last effect: with
-        less power it would go on for many rounds with small effects that it refuses.
+        A force is NaN if its row was never held out. The models are those of the repeated searches, or None.
+        A repeated search has as many rounds as the full campaign needed for its last effect: with less power
+        it would go on for many rounds with small effects that it refuses.
         """
         if not (selection.added and self.repeats):
             before, determined = self.refitted(selection.before)
@@ -222,10 +217,7 @@ class _HeldOut:
 def _searched(
     part: Subsample, samples: pd.DataFrame, context: Context, start: StartingFit, rounds: int, test: Rows
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Model]:
-    """Return the forces before and after at the test rows, where both are determined, and the model after.
-
-    The search is repeated without the strokes of these rows.
-    """
+    """Search without the test rows' strokes; return their forces, where determined, and the model after."""
     fine = _without(part.rows, test) if part.coarse is not part.rows else None
     seen = samples[~samples["stroke_id"].isin(test.table["stroke_id"])]
     train = _without(part.coarse, test)
@@ -236,11 +228,8 @@ def _searched(
 
 
 def _predicted(fitted: Fitted, part: Subsample, test: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Return the force at the test rows, and where the other rows determine it.
-
-    A model of some runs is fitted to all others first.
-    """
-    if not part.whole:
+    """Return the force at the test rows, and where the other rows determine it."""
+    if not part.whole:  # a model of some runs
         fitted = fit(fitted.model, _without(part.every, test), fitted.scatter, turns=0)
     force, tangent = evaluate(fitted.model, test)
     return force, mean_se(tangent, fitted.covariance) < DETERMINED * fitted.rmse_N
@@ -262,9 +251,8 @@ def _found_in_folds(selection: Selection, found: Sequence[Model]) -> bool:
     known = [pair for model in found for pair in zip(model.terms, model.values, strict=True)]
     shapes = [shape_of(term, values, rows) for term, values in known if "shift" not in term.fixed]
     terms = [item.proposal.term for item in selection.added]
-    own = [
-        shape_of(term, values, rows) for term, values in zip(terms, selection.after.model.values, strict=True)
-    ]
+    added = zip(terms, selection.after.model.values, strict=True)
+    own = [shape_of(term, values, rows) for term, values in added]
     return any(_same_shape(one, other) for one in own for other in shapes)
 
 
@@ -273,28 +261,19 @@ def _only_halved(
 ) -> tuple[Selection, BeforeAfter]:
     """Return the result where no fold found the effects: without them, unless they halve the held-out error.
 
-    They are refitted in each fold. A strong effect is part of the scatter of the runs that it is tested
-    against, and a fold has fewer runs.
+    A strong effect is part of the scatter that it is tested against, and a fold has fewer runs.
     """
     held, determined = heldout.refitted(selection.after)
     refitted = replace(models, held_after=held, determined=models.determined & determined)
     if refitted.halved:
         return selection, refitted
-    declared = models.before
-    covered = heldout.covered(declared.model)
-    models = replace(models, after=declared, held_after=models.held_before, covered=covered)
-    return _all_refused(selection, say), models
-
-
-def _all_refused(selection: Selection, say: Callable[[str], None]) -> Selection:
-    """Return a selection with all effects refused: their evidence is weak and no fold found them."""
-    say(
-        "removed, because no fold found them again: "
-        + "; ".join(describe(a.proposal.term, selection.after.rows) for a in selection.added)
-    )
+    covered = heldout.covered(models.before.model)
+    models = replace(models, after=models.before, held_after=models.held_before, covered=covered)
+    names = "; ".join(describe(a.proposal.term, selection.after.rows) for a in selection.added)
+    say(f"removed, because no fold found them again: {names}")
     reason = "its evidence is weak, and the repeated search finds it in no fold"
-    refused = [RefusedEffect(a.proposal, reason) for a in selection.added]
-    return replace(selection, after=selection.before, added=(), refused=(*selection.refused, *refused))
+    refused = (*selection.refused, *(RefusedEffect(a.proposal, reason) for a in selection.added))
+    return replace(selection, after=selection.before, added=(), refused=refused), models
 
 
 def _same_shape(one: np.ndarray, other: np.ndarray) -> bool:
@@ -309,9 +288,7 @@ def _only_gains(
 ) -> tuple[Selection, BeforeAfter]:
     """Return the result without the last effects that do not lower the error in sample and held out.
 
-    What is asked of the error depends on the evidence for the last effect alone. A removed effect was
-    significant. It is recorded as refused; the verdict is `unexplained` or, if its evidence is weak,
-    `cannot_tell`.
+    A removed effect is recorded as refused: the verdict is `unexplained`, or `cannot_tell` if it is weak.
     """
     refused = []
     while selection.added:
@@ -323,25 +300,18 @@ def _only_gains(
         reason = NEGATIVE if negative else "it does not lower the error, in sample or on held-out data"
         say(f"removed, because {reason}: {describe(last.term, selection.after.rows)}")
         refused.append(RefusedEffect(last, reason))
-        model = selection.after.model.without_term(len(selection.added) - 1)
-        own = (
-            fit(model, selection.after.rows, selection.after.scatter, turns=2)
-            if model.terms
-            else selection.before
-        )
+        own = selection.before
+        if len(selection.added) > 1:
+            model = selection.after.model.without_term(len(selection.added) - 1)
+            own = fit(model, selection.after.rows, selection.after.scatter, turns=2)
         selection = replace(selection, after=own, added=selection.added[:-1])
-        _, after = _on_all(models.before.rows, selection)
         if not selection.added:
             models = replace(models, after=models.before, held_after=models.held_before)
-        else:
-            held, determined = heldout.refitted(own)
-            models = replace(
-                models,
-                after=after,
-                held_after=held,
-                covered=heldout.covered(own.model),
-                determined=models.determined & determined,
-            )
+            break
+        _, after = _on_all(models.before.rows, selection)
+        held, determined = heldout.refitted(own)
+        models = replace(models, after=after, held_after=held, covered=heldout.covered(own.model))
+        models = replace(models, determined=models.determined & determined)
     strong = tuple(r for r in refused if not r.proposal.weak)
     if refused and selection.added:
         channels = searched(selection.channels.values(), selection.after.rows)
@@ -351,10 +321,7 @@ def _only_gains(
 
 
 def _level_of(added: Sequence[AcceptedEffect]) -> str | None:
-    """Return the coarsest level within whose groups the effects vary; None if one differs between specimens.
-
-    An effect within runs does not change the error between runs, which may be the largest part.
-    """
+    """Return the coarsest level within whose groups the effects vary; None if between specimens."""
     levels = [varies_within(a.proposal, PART_WITHIN) for a in added]
     return None if None in levels else max(levels, key=LEVELS.index)
 

@@ -9,16 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from sealfit.closure import criteria
 from sealfit.closure.channels import Channel, channels_of, searched
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
-from sealfit.closure.criteria import (
-    BINS_PER_WAVE,
-    EQUAL_BIC,
-    HALF_OF_CALENDAR,
-    MOST_PROPOSALS,
-    PAIRS_FROM_P,
-    WEAK_P,
-)
 from sealfit.closure.forms import AGING, richer_laws
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import propose, rivals
@@ -90,9 +83,9 @@ def select_effects(
 ) -> Selection:
     """Add effects until no channel explains the residual, and return the result.
 
-    The rows are merged along their strokes if there are many; ripples are then fitted to the `fine` ones, and
-    fixed. The samples are those of `steady_samples`. From a `start` the declared model needs no search. The
-    search of a fold ends after `rounds`; what is left is not determined then.
+    Of rows merged along their strokes the `fine` ones are for ripples. The samples are those of
+    `steady_samples`. From a `start` the declared model needs no search. The search of a fold ends after
+    `rounds`; what is left is not determined then.
     """
     loop = _LoopState(rows, samples, context, fine, start)
     last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds
@@ -120,7 +113,7 @@ class _LoopState:
         self.all_channels = {c.name: c for c in channels_of(rows, self.context.config)}
         self.channels = {c.name: c for c in searched(self.all_channels.values(), rows)}
         self.tests = ScoreTests(self.before)
-        self.last = self.first = self.search_single()
+        self.last = self.first = tuple(search(self.tests, list(self.channels.values()), self.rng))
         self.fitted = ripples.added_to(self.before, fine)
         self.added = list(ripples.added)
         self.ripple, self.samples, self.unconfirmed = ripples.found, ripples.samples, ripples.refused
@@ -136,10 +129,6 @@ class _LoopState:
     def alpha(self) -> float:
         """Family-wise error rate of the search."""
         return self.context.config.loop.family_error
-
-    def search_single(self) -> tuple[Candidate, ...]:
-        """Return every candidate of a single channel on the current model."""
-        return tuple(search(self.tests, list(self.channels.values()), self.rng))
 
     def propose(
         self, base: Fitted, candidates: Sequence[Candidate], also: Sequence[Proposal] = ()
@@ -157,7 +146,7 @@ class _LoopState:
         """Search, name and confirm once; return whether the loop is finished."""
         if self.fitted is not self.tests.fitted:
             self.tests, self.found = ScoreTests(self.fitted), None
-            self.last = self.search_single()
+            self.last = tuple(search(self.tests, list(self.channels.values()), self.rng))
         if self.found is None:  # else the last round added nothing
             found = self.found = self.search_model()
             self.context.say(
@@ -176,7 +165,7 @@ class _LoopState:
         accepted, failed = self.confirm(self.fitted, proposals, number)
         self.unconfirmed += failed[:1]
         if accepted is None:
-            keys = {p.source for p in proposals[:MOST_PROPOSALS]} or {c.key for c in open_}
+            keys = {p.source for p in proposals[: criteria.MOST_PROPOSALS]} or {c.key for c in open_}
             for one in failed:
                 if one.negligible:
                     self.negligible |= _no_stronger(open_, one.proposal) | {one.proposal.source}
@@ -188,7 +177,7 @@ class _LoopState:
         else:
             count, deviance = len(self.added), self.fitted.deviance
             self.add(accepted)
-            if len(self.added) == count and self.fitted.deviance > deviance - EQUAL_BIC:
+            if len(self.added) == count and self.fitted.deviance > deviance - criteria.EQUAL_BIC:
                 # It took the place of an earlier one and explains no more: the next round would be the same.
                 self.refused |= _no_stronger(open_, accepted.proposal) | {accepted.proposal.source}
         return False
@@ -200,7 +189,7 @@ class _LoopState:
         significant = [c for c in claimable if c.p_value <= self.alpha]
         aged = not significant or any(c.channels == (AGING,) for c in significant)
         laws = richer_laws(self.fitted, self.channels, self.context.effects) if aged else []
-        if significant and significant[0].p_value <= PAIRS_FROM_P:
+        if significant and significant[0].p_value <= criteria.PAIRS_FROM_P:
             return _SearchResult(claimable, laws, [], significant, [])
         pairs = search_pairs(self.tests, list(self.channels.values()), self.last, self.rng)
         pairs = _claimable(pairs, inconsistent)
@@ -213,9 +202,8 @@ class _LoopState:
 
     def add_pair_of_direction(self, number: int) -> bool:
         """Add two effects of the direction that mask each other; return whether that was done."""
-        two = next(
-            (pair for pair in self.found.masked if {key[0] for key in pair.keys} == {("direction",)}), None
-        )
+        of_direction = (p for p in self.found.masked if {key[0] for key in p.keys} == {("direction",)})
+        two = next(of_direction, None)
         if self.masked or two is None:
             return False
         pending = _pending_candidates([two], self.found.claimable)
@@ -247,9 +235,8 @@ class _LoopState:
         found = self.found
         if not self.masked:  # pairs are searched at a level below the p-values of the others
             self.masked = [pair for pair in found.masked if self.refused.isdisjoint(pair.keys)]
-        significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs)) or list(
-            found.significant
-        )
+        significant = _pending_candidates(self.masked, (*found.claimable, *found.pairs))
+        significant = significant or list(found.significant)
         significant += [c for c, _ in found.laws if c.p_value <= self.alpha and c.claimable]
         self.left = next((c for c in significant if c.key not in self.negligible), self.ripple)
         significant += equivalent_pairs(self.tests, significant, self.channels)
@@ -270,12 +257,10 @@ class _LoopState:
 
     def add(self, accepted: AcceptedEffect) -> None:
         """Add an effect and remove earlier ones that it makes redundant."""
-        source = accepted.proposal.source
+        source, merged = accepted.proposal.source, self.renaming.merged_with_earlier
         self.masked = [pair.without(source) for pair in self.masked if source in pair.keys]
         pending = any(pair.keys for pair in self.masked)
-        earlier, accepted = self.renaming.merged_with_earlier(
-            self.fitted, self.added, accepted, pending=pending
-        )
+        earlier, accepted = merged(self.fitted, self.added, accepted, pending=pending)
         added = [*earlier, accepted]
         own = accepted.proposal.fitted  # under its own scatter: the former one contains the missing effect
         self.fitted, self.added = _remove_redundant(fit(own.model, self.rows, own.scatter, turns=2), added)
@@ -290,7 +275,7 @@ class _LoopState:
         if not whole:
             return found
         left, inconclusive = self.left, None
-        if isinstance(left, Candidate) and left.key in self.refused and left.p_value > WEAK_P:
+        if isinstance(left, Candidate) and left.key in self.refused and left.p_value > criteria.WEAK_P:
             left = None  # it is listed as refused
         laws = self.found.laws
         tested = (*self.last, *(c for c, _ in laws))
@@ -307,13 +292,10 @@ class _LoopState:
 def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set[str]:
     """Return the significant channels whose slopes are not consistent between two to four specimens.
 
-    Their strongest candidate on mu or the force decides: on a wrong quantity the same effect differs by
-    specimen.
+    The strongest candidate on mu or the force decides: on a wrong quantity an effect differs by specimen.
     """
-    strongest: dict[str, Candidate] = {}
-    for c in candidates:  # strongest evidence first
-        if c.p_value <= alpha and c.target in MAIN_TARGETS:
-            strongest.setdefault(c.channels[-1], c)
+    known = [c for c in candidates if c.p_value <= alpha and c.target in MAIN_TARGETS]
+    strongest = {c.channels[-1]: c for c in reversed(known)}  # they are sorted, strongest evidence first
     return {name for name, c in strongest.items() if not c.consistent} - {"direction"}
 
 
@@ -338,10 +320,9 @@ def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candi
 def _related_candidates(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
     """Return further candidates that may explain the same structure as the significant ones.
 
-    The same channel on other quantities is one: the fits decide on which it acts. So are the channels along
-    strokes: time, distance and position are the same there but for the speed. Conditions that explain half of
-    what the calendar does on the same quantity are others: they are tested one after the other, so the
-    calendar is correlated with them, and a dozen specimens may give too little evidence.
+    These are the same channel on other quantities; time, distance and position for each other; and conditions
+    that explain half of what the calendar does: they are tested one after the other, so the calendar is
+    correlated with them, and a dozen specimens may give too little evidence.
     """
     found = []
     keys = {c.key for c in significant}
@@ -350,12 +331,10 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
             same_target = c.target == strong.target
             condition = strong.channels[0] in CALENDAR and c.unit == "specimen" and same_target
             one, other = c.channels[-1], strong.channels[-1]
-            same_channel = (
-                (one == other or {one, other} <= set(ALONG))
-                and not (c.pair or strong.pair)
-                and c.columns.shape == strong.columns.shape
-            )
-            if (condition or same_channel) and c.key not in keys and c.chi2 >= HALF_OF_CALENDAR * strong.chi2:
+            same_channel = one == other or {one, other} <= set(ALONG)
+            alike = not (c.pair or strong.pair) and c.columns.shape == strong.columns.shape
+            near = c.chi2 >= criteria.HALF_OF_CALENDAR * strong.chi2
+            if (condition or (same_channel and alike)) and near and c.key not in keys:
                 found.append(replace(c, p_value=strong.p_value))
                 keys.add(c.key)
     return found
@@ -368,26 +347,20 @@ def _no_stronger(candidates: Sequence[Candidate], proposal: Proposal) -> set[tup
 
 
 def _remove_redundant(fitted: Fitted, added: list[AcceptedEffect]) -> tuple[Fitted, list[AcceptedEffect]]:
-    """Return the fit without effects that a later one has made redundant by the BIC.
+    """Return the fit without effects that a later one has made redundant by the BIC, the weakest first.
 
-    The weakest is removed first, and after a removal all are tested again. Ripples that bins do not resolve
-    are kept: they were tested on the raw samples.
+    Ripples that bins do not resolve are kept: they were tested on the raw samples.
     """
-    while True:
-        without = {
-            k: fitted.refitted(fitted.model.without_term(k))
-            for k in range(len(added) - 1)
-            if not _finer_than_bins(fitted, k)
-        }
-        worth = {
-            k: other.deviance - fitted.deviance - added[k].proposal.bic_penalty
-            for k, other in without.items()
-        }
-        k = min(worth, key=worth.get, default=None)
-        if k is None or worth[k] >= 0:
-            return fitted, added
-        fitted = fit(without[k].model, fitted.rows, fitted.scatter, turns=1)
-        added = [*added[:k], *added[k + 1 :]]
+    without, worth = {}, {}
+    for k in range(len(added) - 1):
+        if not _finer_than_bins(fitted, k):
+            without[k] = fitted.refitted(fitted.model.without_term(k))
+            worth[k] = without[k].deviance - fitted.deviance - added[k].proposal.bic_penalty
+    k = min(worth, key=worth.get, default=None)
+    if k is None or worth[k] >= 0:
+        return fitted, added
+    fitted = fit(without[k].model, fitted.rows, fitted.scatter, turns=1)
+    return _remove_redundant(fitted, [*added[:k], *added[k + 1 :]])
 
 
 def _finer_than_bins(fitted: Fitted, number: int) -> bool:
@@ -396,4 +369,4 @@ def _finer_than_bins(fitted: Fitted, number: int) -> bool:
     if not effect.periodic:
         return False
     width = float(np.median(np.abs(fitted.rows.bin_width(fitted.model.terms[number].channels[0]))))
-    return values["lambda_"] < BINS_PER_WAVE * width
+    return values["lambda_"] < criteria.BINS_PER_WAVE * width

@@ -8,7 +8,7 @@ from bins_helpers import make_bins
 from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import AcceptedEffect
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.loop import _all_refused, _found_in_folds, _only_gains, _only_halved, _same_shape
+from sealfit.closure.loop import _found_in_folds, _only_gains, _only_halved, _same_shape
 from sealfit.closure.result import BeforeAfter
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
@@ -62,7 +62,10 @@ def test_evidence_that_is_not_weak_needs_no_fold_to_find_it_again(selection):
 
 
 def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selection):
-    own = _all_refused(selection, Silent().say)
+    before, every = selection.before, np.ones(selection.before.force.size, dtype=bool)
+    heldout = SimpleNamespace(refitted=lambda fitted: (before.force, every), covered=lambda model: every)
+    models = BeforeAfter(before, selection.after, before.force, before.force, every, every)
+    own, _ = _only_halved(selection, models, heldout, Silent().say)
     assert own.added == ()
     assert own.after is selection.before
     assert own.left_over is own.first  # the candidates of the last search are on another model
