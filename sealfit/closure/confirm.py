@@ -20,26 +20,23 @@ from sealfit.closure.ripples import agreement, pass_shifts
 from sealfit.config import Config, Loop
 from sealfit.effects.contract import Effect
 from sealfit.fit.joint import Fitted, fit, with_reml_smoothness
-from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
+from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import ALONG, LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
 from sealfit.progress import Silent
 from sealfit.tables import CALENDAR
 
+# Least and most settings for which interpolation is tested: fewer have no inner one, and more are dense.
 LEAST_SETTINGS, MOST_SETTINGS = 3, 15
-"""Least and most settings for which interpolation is tested: fewer have no inner one, and more are dense."""
 
 TOO_FINE = "it is smaller than the resolution of the recorded force"
 TOO_SMALL = f"it is less than {criteria.LEAST_SIZE:.2%} of the force"
 NO_GAIN = f"it lowers the error on held-out data by less than {criteria.LEAST_GAIN:.2%} of the force"
 NOT_HELD_OUT = "no rows can be held out to confirm it: repeat the runs"
+# Reasons of a refusal after which nothing is left to explain: the effect is too small to matter.
 NEGLIGIBLE = (TOO_FINE, TOO_SMALL, NO_GAIN)
-"""Reasons of a refusal after which nothing is left to explain: the effect is too small to matter."""
-
 NEGATIVE = "it multiplies a quantity by a negative number"
-
-WHOLE = ("mu", "force")
-"""Targets that are the whole friction."""
+WHOLE = ("mu", "force")  # Targets that are the whole friction.
 
 
 @dataclass(frozen=True)
@@ -67,8 +64,7 @@ def heldout_gain(before: Fitted, proposal: Proposal, loop: Loop, samples: pd.Dat
     """Return the gain of a proposal on held-out groups of its own unit.
 
     If files scatter by newtons, the RMSE hardly changes with a ripple of 0.1 N. The whitened sum of squares
-    does, because the offset and gain of a whole file or run have little weight in it. For the same reason
-    both are taken about the means of the groups within which the effect varies.
+    does. For the same reason both are taken about the means of the groups within which the effect varies.
     """
     if "shift" in proposal.term.fixed:
         return _gain_within_files(before, proposal, samples)
@@ -84,13 +80,9 @@ def heldout_gain(before: Fitted, proposal: Proposal, loop: Loop, samples: pd.Dat
 
 
 def gain_between_settings(before: Fitted, proposal: Proposal) -> Iterator[Gain]:
-    """Yield the gain of a proposal if all files at an inner setting of one of its channels are held out.
-
-    Forms of one parameter are not tested: they cannot follow single settings, and a line is nearly zero at
-    inner ones.
-    """
+    """Yield the gain of a proposal if all files at an inner setting of one of its channels are held out."""
     rows = before.rows
-    if len(proposal.term.effect.parameters) == 1:
+    if len(proposal.term.effect.parameters) == 1:  # it cannot follow single settings
         return
     for name in proposal.term.channels:
         values = rows.unsigned(name)
@@ -106,10 +98,9 @@ def _gain(
 ) -> Gain:
     """Return the gain on rows held out by `masks`, about the means of the groups of level `around` if given.
 
-    The means are over the rows of all folds: in one fold a specimen may have a single run, and nothing would
-    be left about its own mean. Both residuals are whitened by the scatter estimated with the proposal.
-    Without it the effect is part of the scatter, and a specimen has almost no weight. The residual without
-    the proposal is cached; `folds_of` is what the masks depend on.
+    The means are over the rows of all folds, as a specimen may have a single run in one. Both residuals are
+    whitened by the scatter estimated with the proposal; without it the effect is part of the scatter. The
+    residual without the proposal is cached; `folds_of` is what the masks depend on.
     """
     rows, after = before.rows, proposal.fitted
     left = np.full((2, rows.force.size), np.nan)
@@ -146,8 +137,7 @@ def _heldout_residual(before: Fitted, model: Model, out: np.ndarray, test: Rows)
 def varies_within(proposal: Proposal, share: float = criteria.MOST_WITHIN) -> str | None:
     """Return the finest level in whose groups a share of the variance of the effect's shape lies, or None.
 
-    The shape is used, not the added force. The force of a relative loss of friction along each stroke differs
-    between runs as friction does, and the declared model explains that part.
+    The added force differs between runs as friction does, and the declared model explains that part.
     """
     rows, term, model = proposal.fitted.rows, proposal.term, proposal.fitted.model
     if term.channels == ("direction",):
@@ -166,11 +156,7 @@ def about_means(values: np.ndarray, rows: Rows, level: str | None) -> np.ndarray
 
 
 def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame) -> Gain:
-    """Return the gain on one half of every file, with the phase of each pass estimated from the other half.
-
-    Halves are alternate pairs of forward and backward strokes, or halves of the stroke in a file with one or
-    two.
-    """
+    """Return the gain on one half of every file, with the phases of passes estimated from the other half."""
     rows, after, axis = before.rows, proposal.fitted, proposal.term.channels[0]
     in_turn = rows.table["stroke"].max() >= 4
     first, sample_first = (_first_half(table, in_turn) for table in (rows.table, samples))
@@ -185,10 +171,9 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
         old, new = (own - test.groups.means(own, "stroke")[test.codes("stroke")] for own in residuals)
         weight = rows.weight[out]
         squares += weight @ old**2, weight @ new**2
-    # The amplitude of a ripple differs between files, so each file is tested for the same wave in both
-    # halves.
     from scipy.stats import wilcoxon  # imported here: scipy.stats takes half a second to load
 
+    # The amplitude of a ripple differs between files: each is tested for the same wave in both halves.
     both = agreement(samples, sample_first, length, axis)
     there = both.size > 1 and wilcoxon(both, alternative="greater").pvalue < criteria.RIPPLE_CONFIRMED_P
     rmse = np.sqrt(squares)
@@ -196,7 +181,10 @@ def _gain_within_files(before: Fitted, proposal: Proposal, samples: pd.DataFrame
 
 
 def _first_half(table: pd.DataFrame, in_turn: bool) -> np.ndarray:
-    """Return which rows or samples (ordered by stroke) belong to the first half, shape (n,)."""
+    """Return which rows or samples (ordered by stroke) belong to the first half, shape (n,).
+
+    Halves are alternate pairs of forward and backward strokes, or else halves of each stroke.
+    """
     if in_turn:
         return ((table["stroke"].to_numpy() - 1) // 2 % 2) == 0
     strokes = table.groupby("stroke_id")["stroke_id"]
@@ -208,8 +196,7 @@ class AcceptedEffect:
     """An accepted effect: the proposal, its gain on held-out data and the rivals these data do not exclude.
 
     `left_N` is the RMSE on the held-out data with it, and the number beside each rival is that with the rival
-    instead; NaN if not computed. If the effect varies within files, runs or specimens, it is the RMSE about
-    their means.
+    instead; NaN if not computed.
     """
 
     proposal: Proposal
@@ -244,11 +231,7 @@ class Context:
 
 
 def confirmed(
-    fitted: Fitted,
-    proposals: Sequence[Proposal],
-    samples: pd.DataFrame,
-    context: Context,
-    number: int,
+    fitted: Fitted, proposals: Sequence[Proposal], samples: pd.DataFrame, context: Context, number: int
 ) -> tuple[AcceptedEffect | None, list[RefusedEffect]]:
     """Return the first of a round's best proposals that has a gain on held-out data; None if none has.
 
@@ -283,22 +266,15 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
         return TOO_FINE
     if size <= criteria.LEAST_SIZE * force:
         return TOO_SMALL
+    if not gain.known:
+        return NOT_HELD_OUT
     if not gain.real:
         small = size <= criteria.SMALL_SIZE * force and not proposal.term.effect.periodic
-        return _reason_without_gain(gain, small=small)
+        return NO_GAIN if small else "it does not lower the error on held-out data"
     if gain.rmse_N < criteria.LEAST_GAIN * force and not proposal.term.effect.periodic:
         return NO_GAIN
-    halved, p_value = gain.share > 1 - criteria.HALVED, proposal.p_value
-    if p_value > criteria.CURVE_P and not halved and _changes_the_curve(proposal):
-        return (
-            f"its p-value is above {criteria.CURVE_P:g}, and the scatter of such a coefficient is not known"
-        )
-    if p_value > criteria.WITHIN_P and not halved and _shape_along_strokes(proposal.term, fitted.rows):
-        above = f"its p-value is above {criteria.WITHIN_P:g}"
-        return f"{above}, and it is a shape along strokes without a mechanism"
-    if proposal.weak and gain.share < criteria.LEAST_FALL:
-        above = f"its p-value is above {criteria.WEAK_P:g}"
-        return f"{above}, and it lowers the held-out error by less than {criteria.LEAST_FALL:.0%}"
+    if reason := _reason_of_weak_evidence(proposal, gain, fitted.rows):
+        return reason
     if not all(g.real for g in gain_between_settings(fitted, proposal)):
         return "it does not predict held-out settings between those it was fitted to"
     if not proposal.term.effect.periodic and vague_between_speeds(fitted, proposal):
@@ -306,27 +282,29 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     return None
 
 
-def _reason_without_gain(gain: Gain, *, small: bool) -> str:
-    """Return the reason why a proposal is refused that lowers no held-out error."""
-    if not gain.known:
-        return NOT_HELD_OUT
-    return NO_GAIN if small else "it does not lower the error on held-out data"
+def _reason_of_weak_evidence(proposal: Proposal, gain: Gain, rows: Rows) -> str | None:
+    """Return the reason why a proposal with a gain is refused because of its p-value, or None."""
+    halved, p_value = gain.share > 1 - criteria.HALVED, proposal.p_value
+    above = "its p-value is above"
+    if p_value > criteria.CURVE_P and not halved and _changes_the_curve(proposal):
+        return f"{above} {criteria.CURVE_P:g}, and the scatter of such a coefficient is not known"
+    along_strokes = any(follows_strokes(name, rows) for name in proposal.term.channels)
+    if p_value > criteria.WITHIN_P and not halved and along_strokes and not proposal.term.effect.physical:
+        return f"{above} {criteria.WITHIN_P:g}, and it is a shape along strokes without a mechanism"
+    if proposal.weak and gain.share < criteria.LEAST_FALL:
+        lowers = f"it lowers the held-out error by less than {criteria.LEAST_FALL:.0%}"
+        return f"{above} {criteria.WEAK_P:g}, and {lowers}"
+    return None
 
 
 def turns_negative(fitted: Fitted) -> bool:
-    """Whether the last effect of a fit multiplies a quantity by a negative number at some row.
-
-    The amplitude of a shape on a coefficient that hardly any row determines may be anything, at no cost.
-    """
+    """Whether the last effect of a fit multiplies a quantity by a negative number at some row."""
     term, values = fitted.model.terms[-1], fitted.model.values[-1]
     return term.operation == "multiply" and bool((shape_of(term, values, fitted.rows) <= -1).any())
 
 
 def vague_between_speeds(before: Fitted, proposal: Proposal) -> bool:
-    """Whether the largest standard error of the force between tested speeds doubles and exceeds the residual.
-
-    A free shape beside the Stribeck curve may fit the tested speeds and leave the force between them open.
-    """
+    """Whether the largest standard error between tested speeds doubles and exceeds the residual."""
     points, fits = between_speeds(before.rows), (before, proposal.fitted)
     if points.speed.size == 0:
         return False
@@ -346,11 +324,6 @@ def _changes_the_curve(proposal: Proposal) -> bool:
         return term.acts_on not in WHOLE and not set(ALONG).isdisjoint(term.channels)
     by_speed = len(term.channels) > 1 and "speed_mm_s" in term.channels
     return by_speed or term.acts_on not in WHOLE
-
-
-def _shape_along_strokes(term: Term, rows: Rows) -> bool:
-    """Whether it is a form without a mechanism of a channel that follows the strokes."""
-    return not term.effect.physical and any(follows_strokes(name, rows) for name in term.channels)
 
 
 def added_force(proposal: Proposal) -> np.ndarray:

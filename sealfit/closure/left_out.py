@@ -18,31 +18,23 @@ from sealfit.ingest.strokes import SPEEDS_APART
 
 # A file is tried if its residual in the fit to all files has a p-value below this, times the number of files.
 SCREEN_P = 0.05
-# Files that are tried, those with the largest residuals.
-MOST_SUSPECTS = 3
+MOST_SUSPECTS = 3  # Files that are tried, those with the largest residuals.
 # Files of a campaign up to which all of them are tried: the fit to so few follows the one that went wrong.
 FEW_FILES = 20
 # Largest p-value of an outlier, times the number of files. With 0.01, 5 of 73 worlds drawn at random lost a
 # sound file: their scatter was not normal.
 OUTLIER_P = 1e-3
-# P-value, times the number of files, above which a file agrees with the rest.
-AGREES_P = 0.5
+AGREES_P = 0.5  # P-value, times the number of files, above which a file agrees with the rest.
 # Largest p-value beside the files of the same speed. Where these scatter more than others, or differ from the
 # model like the file, it is no outlier.
 SAME_SPEED_P = 0.01
-# Fewest files of the same speed from which their scatter is estimated.
-LEAST_OF_SPEED = 3
-# Least share of the force by which an outlier is off.
-OUTLIER_SHARE = 0.05
+LEAST_OF_SPEED = 3  # Fewest files of the same speed from which their scatter is estimated.
+OUTLIER_SHARE = 0.05  # Least share of the force by which an outlier is off.
 # Largest share of the files that may be outliers. If there are more, they are not exceptions.
 MOST_OUTLIERS = 0.1
 # Least degrees of freedom of the files. With fewer, all files together do not predict another one.
 LEAST_DF = 4
-# Rows of each stroke in the fits. The mean of a file needs no more.
-ROWS = 8
-
-# ---------------------------------------------------------------- outlying files
-# Files whose mean force is far off what all other files predict.
+ROWS = 8  # Rows of each stroke in the fits. The mean of a file needs no more.
 
 
 class OutlierFile(NamedTuple):
@@ -58,11 +50,10 @@ class OutlierFile(NamedTuple):
 def outlier_files(rows: Rows) -> list[OutlierFile]:
     """Return the files whose mean force is far off what all other files predict, the farthest first.
 
-    Model and scatter are fitted without the file, so that it does not hide itself. It is an outlier if the
-    gain that would explain it is significant beside the scatter of the others. These are then judged without
-    it. In linear regression the test is that of the deletion residual (Cook & Weisberg 1982, *Residuals and
-    Influence in Regression*, section 2.2.2). If another file may be the wrong one instead, none is left out,
-    and the search ends.
+    Model and scatter are fitted without the file. It is an outlier if the gain that would explain it is
+    significant beside the scatter of the others, which are then judged without it. In linear regression the
+    test is that of the deletion residual (Cook & Weisberg 1982, *Residuals and Influence in Regression*,
+    section 2.2.2). If another file may be the wrong one instead, none is left out, and the search ends.
     """
     rows = rows.sparse(ROWS)
     fitted, found = fit_declared(rows), []
@@ -79,10 +70,7 @@ def outlier_files(rows: Rows) -> list[OutlierFile]:
 
 
 def _wrong_instead(one: OutlierFile, tried: Sequence[tuple[OutlierFile, Fitted]]) -> tuple[str, ...]:
-    """Return the files without which `one` agrees with the rest, or the rest does not predict it.
-
-    Each may be the wrong one instead.
-    """
+    """Return the files without which `one` agrees with the rest: each may be the wrong one instead."""
     found = []
     for other, kept in tried:
         if other.file == one.file:
@@ -102,8 +90,7 @@ def _df(fitted: Fitted) -> int:
 def _suspects(fitted: Fitted) -> list[int]:
     """Return the numbers of the files with the largest mean residuals, where these may be outliers.
 
-    Of few files these are all. A residual over a standard deviation that was estimated without it has
-    Student's distribution; here that of all files is known, which contains it.
+    A residual over a standard deviation estimated without it has Student's distribution.
     """
     groups, df = fitted.rows.groups, _df(fitted)
     if df < LEAST_DF:
@@ -139,9 +126,8 @@ def _without(fitted: Fitted, number: int) -> tuple[OutlierFile, Fitted]:
 def _like_others_of_its_speed(fitted: Fitted, number: int) -> bool:
     """Whether a file's relative residual is within those of the other files of its speed (t test)."""
     groups = fitted.rows.groups
-    relative = groups.sums(fitted.friction * fitted.residual, "file") / groups.sums(
-        fitted.friction**2, "file"
-    )
+    size = groups.sums(fitted.friction**2, "file")
+    relative = groups.sums(fitted.friction * fitted.residual, "file") / size
     speed = groups.means(np.abs(fitted.rows.speed), "file")
     ratio = speed / speed[number]
     same = np.maximum(ratio, 1 / ratio) < SPEEDS_APART
@@ -155,7 +141,6 @@ def _like_others_of_its_speed(fitted: Fitted, number: int) -> bool:
 
 
 # ---------------------------------------------------------------- held-out rows
-# Whole groups, calendar blocks or whole settings, and whether the other rows cover them.
 
 
 def heldout_level(rows: Rows) -> str:
@@ -169,8 +154,7 @@ def heldout_level(rows: Rows) -> str:
 def foldable(rows: Rows, level: str) -> str:
     """Return a level, or the next finer one at which conditions keep some groups while others are held out.
 
-    A condition with one file and no aging law cannot be predicted without that file. Its strokes are held out
-    then, and the error is that of predicting the same files.
+    A condition with one file and no aging law cannot be predicted without that file.
     """
     for finer in reversed(LEVELS[: LEVELS.index(level) + 1]):
         start = rows.groups.starts[finer]
@@ -182,16 +166,11 @@ def foldable(rows: Rows, level: str) -> str:
 
 
 def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,), in whole groups.
-
-    The groups are spread so that each condition keeps most of its own. Day 0 and the last day always keep a
-    group, so that the aging law does not have to extrapolate.
-    """
+    """Yield masks of the rows held out, shape (n,), in whole groups spread over the conditions."""
     start = rows.groups.starts[level]
     count = min(count, start.size)
     condition = rows.condition[start]
-    rng = np.random.default_rng(seed)
-    shuffled = rng.permutation(start.size)
+    shuffled = np.random.default_rng(seed).permutation(start.size)
     order = shuffled[np.argsort(condition[shuffled], kind="stable")]
     number = np.empty(start.size, dtype=int)
     number[order] = np.arange(start.size) % count
@@ -201,9 +180,8 @@ def folds(rows: Rows, level: str, count: int, seed: int) -> Iterator[np.ndarray]
 def blocks(rows: Rows, level: str, count: int, channel: str) -> list[np.ndarray]:
     """Return masks of the rows held out, shape (n,): blocks of groups that are consecutive in the calendar.
 
-    Neighbours in time are correlated, and so are conditions tested one after the other. With single groups
-    held out, any smooth curve through the calendar would be confirmed. If a block contains a whole condition
-    that cannot be predicted without it, blocks are shortened, and a fold has several of them that are apart.
+    With single groups held out, any smooth curve through the calendar would be confirmed. If a block contains
+    a whole condition that cannot be predicted without it, a fold has several shorter ones that are apart.
     """
     start = rows.groups.starts[level]
     count = min(count, start.size)
@@ -236,11 +214,7 @@ def _without_lost_edges(out: np.ndarray, condition: np.ndarray, rows: Rows) -> n
 
 
 def _edge(rows: Rows, condition: int) -> bool:
-    """Whether a condition cannot be predicted without its rows.
-
-    It has parameters of its own without an aging law, and the law does not extrapolate: day 0 and the last
-    day are edges, too.
-    """
+    """Whether a condition cannot be predicted without its rows: no aging law, day 0 or the last day."""
     law = rows.cache.once(("aging law",), lambda: has_law(rows.conditions, rows.has_aging))
     if not law[condition]:
         return True
@@ -263,10 +237,9 @@ def covered(rows: Rows, out: np.ndarray, channels: Iterable[str] = ()) -> np.nda
         lawful = rows.has_aging and tested.size > 1
         days = rows.days[seen | (~out & (rows.days == 0))]  # every series starts from unaged rubber
         new = here & out & ~np.isin(rows.condition, tested)
-        if not lawful:
-            inside &= ~new
-        else:
-            inside &= ~(new & ((rows.days < days.min()) | (rows.days > days.max())))
+        if lawful:
+            new &= (rows.days < days.min()) | (rows.days > days.max())
+        inside &= ~new
         if seen.any():
             inside &= ~(here & out & _outside(speed, speed[seen]))
     for name in channels:
@@ -286,10 +259,7 @@ def _outside(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def whole_settings(rows: Rows, values: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield masks of the rows held out, shape (n,): all rows at each inner setting of a channel in turn.
-
-    A free shape may fit every setting it has seen and still not predict those between them.
-    """
+    """Yield masks of the rows held out, shape (n,): all rows at each inner setting of a channel in turn."""
     for setting in np.unique(values)[1:-1]:
         out = _without_lost_edges(values == setting, rows.condition, rows)
         if out.any():
