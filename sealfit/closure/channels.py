@@ -7,7 +7,7 @@ grouping and never an effect.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,17 +49,18 @@ class Channel:
 
 def channels_of(rows: Rows, config: Config) -> list[Channel]:
     """Return the channels that the loop searches by a campaign's config: see `find_channels`."""
-    on_rig = config.position_origin == "rig"
     ignored = {*config.loop.ignore_channels, *force_inputs(config)}
-    return find_channels(rows, ignored, conditions=config.condition, rig_position=on_rig)
+    if config.position_origin != "rig":  # displacement is not the same place in every file
+        ignored.add("displacement_mm")
+    return find_channels(rows, ignored, conditions=config.condition)
 
 
 def searched(channels: Iterable[Channel], rows: Rows) -> list[Channel]:
     """Return the channels that are searched: all, or those that do not increase along strokes.
 
     Where strokes end before the friction is steady, a residual along them is an error of the bristle model,
-    by which the rest of the rise is taken out. That error opposes the motion. A force that time adds, such as
-    a drift of the sensor, does not, so it is searched where strokes go both ways.
+    and opposes the motion. A force that time adds, such as a drift of the sensor, does not, so it is searched
+    where strokes go both ways.
     """
     if not too_short(rows):
         return list(channels)
@@ -78,37 +79,28 @@ def too_short(rows: Rows) -> bool:
 
 
 def find_channels(
-    rows: Rows, ignore: Iterable[str] = (), *, conditions: Iterable[str] = (), rig_position: bool = True
+    rows: Rows, ignore: Collection[str] = (), *, conditions: Collection[str] = ()
 ) -> list[Channel]:
     """Return every channel of the rows that varies and is not a grouping or a text with hundreds of values.
 
     Columns of the condition, `conditions`, are kept even if they are groupings: an offset between directions
-    may differ between conditions. With `rig_position`, displacement means the same place in every file.
+    may differ between conditions.
     """
-    conditions = set(conditions)
-    skip = set(ignore) | (set() if rig_position else {"displacement_mm"})
     found = []
-    for name in rows.channels:
-        if name in skip:
-            continue
+    for name in (name for name in rows.channels if name not in ignore):
         values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
         if values.dtype.kind == "f":
-            if not (np.isfinite(values).all() and varies(values)):
-                continue
-            if _one_setting(name, values):
+            if not (np.isfinite(values).all() and varies(values)) or _one_setting(name, values):
                 continue
             values = settings(level_values(values, rows))
         elif not 2 <= np.unique(values).size <= criteria.MOST_LEVELS:
             continue
-        if name == "stroke" and "direction" not in skip and _out_and_back(values, rows):
+        if name == "stroke" and "direction" not in ignore and _out_and_back(values, rows):
             continue
-        unit = unit_of(values, rows)
-        channel = Channel(name, values, unit)
-        if not channel.numeric and _is_grouping(channel, rows):
-            if name not in conditions:
-                continue
-            channel = replace(channel, grouping=True)
-        found.append(channel)
+        channel = Channel(name, values, unit_of(values, rows))
+        channel = replace(channel, grouping=not channel.numeric and _is_grouping(channel, rows))
+        if not channel.grouping or name in conditions:
+            found.append(channel)
     return found
 
 
@@ -139,16 +131,15 @@ def incomplete_channels(rows: Rows) -> list[dict]:
 def unit_of(values: np.ndarray, rows: Rows) -> str:
     """Return the coarsest level in whose groups `values` are nearly constant; "sample" if there is none."""
     numeric = values.dtype.kind == "f"
-    least = criteria.CONSTANT_SHARE * float(np.var(values)) if numeric else 0.0
+    if numeric:
+        rounding = ROUNDING * float(np.abs(values).max())
+        most = max(criteria.CONSTANT_SHARE * float(np.var(values)), rounding**2)
     for level in reversed(LEVELS):
         start, code = rows.groups.starts[level], rows.codes(level)
-        if not numeric:
-            constant = (values == values[start][code]).all()
+        if numeric:
+            constant = np.mean((values - rows.groups.means(values, level)[code]) ** 2) <= most
         else:
-            rounding = ROUNDING * float(np.abs(values).max())
-            constant = np.mean((values - rows.groups.means(values, level)[code]) ** 2) <= max(
-                least, rounding**2
-            )
+            constant = (values == values[start][code]).all()
         if constant:
             return level
     return "sample"
@@ -163,11 +154,9 @@ def level_values(values: np.ndarray, rows: Rows) -> np.ndarray:
 def run_means(channel: Channel, rows: Rows) -> Channel | None:
     """Return a channel as its means over runs if it differs little within them; None otherwise.
 
-    Repeats are more precise than runs are alike, so the columns of a channel that varies within runs are
-    tested mostly within them. A step between two runs is not seen there.
+    A channel that varies within runs is tested mostly within them, where a step between runs is not seen.
     """
-    finer = FINER["sample"] < FINER[channel.unit] < FINER["run"]
-    if not (channel.numeric and finer):
+    if not channel.numeric or channel.unit not in ("stroke", "file"):
         return None
     means = rows.groups.means(channel.values, "run")[rows.codes("run")]
     if np.mean((channel.values - means) ** 2) > criteria.MOST_WITHIN_RUNS * np.var(channel.values):
@@ -178,7 +167,7 @@ def run_means(channel: Channel, rows: Rows) -> Channel | None:
 def follows_strokes(name: str, rows: Rows) -> bool:
     """Whether a channel is the same along all strokes to a part, as the profiles of specimens may be.
 
-    Time, distance and position are. A column of the traces is if a common parabola of distance and position
+    Time, distance and position are, and a column of the traces if a common parabola of distance and position
     explains `COMMON_PROFILE` of its variance within strokes.
     """
     values = rows.values(name)
@@ -230,11 +219,10 @@ def settings(values: np.ndarray) -> np.ndarray:
 def scatter_level(channels: Iterable[Channel], rows: Rows) -> str:
     """Return the level of the units between which a contrast of some channels is tested.
 
-    It is the coarsest level at which the slope along the channels may scatter without any effect. The
-    dependence of friction on the place in a stroke, on speed, load and direction differs between specimens,
-    so these are tested between specimens; what else varies between runs is tested between runs. A product has
-    the units of its coarser channel, because each of them may have a slope of its own along the finer one.
-    With few units the next finer level is used.
+    It is the coarsest level at which the slope may scatter without any effect: specimens for the place in a
+    stroke, speed, load and direction, and runs for what else varies between runs. A product has the units of
+    its coarser channel, each of which may have a slope of its own along the finer one. With few units the
+    next finer level is used.
     """
     channels = list(channels)
     unit = max((c.unit for c in channels), key=FINER.get)
@@ -273,9 +261,8 @@ def _is_grouping(channel: Channel, rows: Rows) -> bool:
 def free_columns(channel: Channel, most: int = criteria.FREE_DF) -> np.ndarray:
     """Return the columns of a free shape, first a straight line: shape (n, k), each centred and scaled.
 
-    A cubic B-spline with knots at quantiles (of the logarithm if a positive channel spans a factor of 20, but
-    not of the calendar, whose zero is arbitrary), a quadratic for few units; for categories, one column per
-    level except the first.
+    A cubic B-spline with knots at quantiles of the scaled channel (the zero of the calendar is arbitrary), a
+    quadratic for few units; for categories, one column per level except the first.
     """
     if not channel.numeric:
         levels = np.unique(channel.values)
@@ -283,15 +270,12 @@ def free_columns(channel: Channel, most: int = criteria.FREE_DF) -> np.ndarray:
     x = scaled(channel.values, even=channel.name in CALENDAR)
     distinct = np.unique(x)
     df = min(most, distinct.size - 1)
-    columns = [x]
-    if df >= 2:
-        if distinct.size <= most + 1 or df == 2:  # a cubic spline has three columns at least
-            columns += [x**k for k in range(2, df + 1)]
-        else:
-            inner = np.quantile(distinct, np.linspace(0, 1, df)[1:-1])
-            knots = np.r_[[distinct[0]] * 4, inner, [distinct[-1]] * 4]
-            spline = BSpline.design_matrix(x, knots, 3).toarray()
-            columns += list(spline[:, 1:-1].T)
+    if distinct.size <= most + 1 or df == 2:  # a cubic spline has three columns at least
+        columns = [x**k for k in range(1, max(df, 1) + 1)]
+    else:
+        inner = np.quantile(distinct, np.linspace(0, 1, df)[1:-1])
+        knots = np.r_[[distinct[0]] * 4, inner, [distinct[-1]] * 4]
+        columns = [x, BSpline.design_matrix(x, knots, 3).toarray()[:, 1:-1]]
     stacked = np.column_stack(columns)
     stacked = stacked - stacked.mean(axis=0)
     size = np.sqrt((stacked**2).mean(axis=0))

@@ -17,12 +17,9 @@ from sealfit.fit.joint import Fitted
 # The signs of whole units are flipped at random many times. The largest T over all candidates gives the
 # p-value adjusted for the search (Westfall & Young 1993; sign flips of score contributions: Hemerik, Goeman &
 # Finos 2020, doi:10.1111/rssb.12369). P-values by the jackknife are adjusted for the number of candidates
-# (Bonferroni); each of the two tests has half of the error rate. Tests on few specimens are adjusted by
-# random draws (`small_sample`), contrasts in few units by their number (`slopes`).
-#
-# Draws continue until the smallest p-value is known well enough for the decision not to depend on them
-# (sequential Monte Carlo p-values: Besag & Clifford 1991, Biometrika 78(2), 301-304,
-# doi:10.1093/biomet/78.2.301).
+# (Bonferroni). Tests on few specimens are adjusted by random draws, contrasts in few units by their number.
+# Draws continue until the smallest p-value is known well enough (sequential Monte Carlo p-values: Besag &
+# Clifford 1991, Biometrika 78(2), 301-304, doi:10.1093/biomet/78.2.301).
 
 FLIPS = 1999  # Number of random sign flips, or draws, that are made at a time.
 # Their largest number: a p-value of 0.00125, four times which is 0.005, has an error of 13 %.
@@ -43,31 +40,23 @@ def adjust_all(
     for k in many:
         if results[k].scores.shape[0] >= JACKKNIFE_UNITS:  # two tests, each with half of the error rate
             p_values[k] = 2 * min(p_values[k], len(many) * np.exp(results[k].log_p_jackknife))
-    small = np.min(
-        [adjust_small_sample(units, results, rng) for units in tests.cluster_tests.values()], axis=0
-    )
-    p_values = np.minimum(p_values, np.minimum(small, adjust_slopes(results)))
+    for units in tests.cluster_tests.values():
+        p_values = np.minimum(p_values, adjust_small_sample(units, results, rng))
+    p_values = np.minimum(p_values, adjust_slopes(results))
     p_values[[r.small_sample is not None and bool(r.slopes) for r in results]] *= 2  # two tests here as well
-    found = [
-        replace(c, p_value=min(1.0, SEARCHES * float(p))) for c, p in zip(candidates, p_values, strict=True)
-    ]
+    adjusted = np.minimum(1.0, SEARCHES * p_values).tolist()
+    found = [replace(c, p_value=p) for c, p in zip(candidates, adjusted, strict=True)]
     return sorted(found, key=lambda c: -c.evidence)
 
 
 def adjust(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
-    """Return each p-value adjusted over all results by the maximum over sign flips, shape (m,).
-
-    Results with the same number of units are flipped with the same signs, so that their correlation is used.
-    """
+    """Return each p-value adjusted over all results by the maximum over common sign flips, shape (m,)."""
     units = max(j.units for j in results)
     return _adjusted([j.log_p for j in results], lambda: _least(results, rng, flips), units)
 
 
 def _adjusted(own: Sequence[float], draw: Callable[[], np.ndarray], units: int) -> np.ndarray:
-    """Return adjusted p-values from log p and draws of the smallest log p under the null hypothesis.
-
-    They are drawn until `ENOUGH` are below the observed one, or no more fit.
-    """
+    """Return adjusted p-values from log p and draws of the smallest log p under the null hypothesis."""
     least = draw()
     most = min(MOST_FLIPS, MOST_SIGNS // units)
     while np.count_nonzero(least <= min(own)) < ENOUGH and least.size < most:
@@ -120,24 +109,18 @@ def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
 def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.ndarray:
     """Return sums of scores, shape (units, m), under random signs -> (flips, m); a few flips at a time."""
     part = max(1, MOST_SIGNS // scores.shape[0])
-    return np.concatenate(
-        [
-            rng.choice([-1.0, 1.0], size=(min(part, flips - first), scores.shape[0])) @ scores
-            for first in range(0, flips, part)
-        ]
-    )
+    sizes = [(min(part, flips - first), scores.shape[0]) for first in range(0, flips, part)]
+    return np.concatenate([rng.choice([-1.0, 1.0], size=size) @ scores for size in sizes])
 
 
 def adjust_small_sample(
     units: ClusterTests, results: Sequence[ScoreTestResult], rng: np.random.Generator, draws: int = FLIPS
 ) -> np.ndarray:
     """Return the p-values of the small-sample tests of a level, adjusted over all, (m,); 1 if not tested."""
-    p_values = np.ones(len(results))
-    tried = [
-        k for k, j in enumerate(results) if j.small_sample is not None and j.small_sample.level == units.level
-    ]
+    p_values, every = np.ones(len(results)), [j.small_sample for j in results]
+    tried = [k for k, test in enumerate(every) if test is not None and test.level == units.level]
     if tried:
-        tests = [results[k].small_sample for k in tried]
+        tests = [every[k] for k in tried]
         logs = np.array([test.log_p for test in tests])
         count = max(results[k].units for k in tried)
         drawn = _adjusted(logs, lambda: _least_small_sample(units, tests, rng, draws), count)

@@ -31,19 +31,16 @@ from sealfit.fit.joint.tangent import OwnColumns, Tangent
 #
 # .. math:: T = S^T V^{-1} S, \quad S = \sum_u s_u, \quad V = \sum_u s_u s_u^T .
 #
-# The r_u in V are enlarged for what the fit has removed from each unit (CR2, Bell & McCaffrey 2002), because
-# residuals are smaller than errors and V would be too small with few units. V does not change when the sign
-# of a unit is flipped, so random flips give the null distribution of T.
+# The r_u in V are enlarged for what the fit has removed from each unit (CR2, Bell & McCaffrey 2002). V does
+# not change when the sign of a unit is flipped, so random flips give the null distribution of T.
 #
-# Sign flips are valid for any scatter of the units, but a strong effect is part of V itself: T never exceeds
-# the number of units over the kurtosis of c, and a few runs in extreme places may mask the others. From
-# thirty units on the estimate is therefore also tested against its jackknife over whole units (CV3;
-# MacKinnon, Nielsen & Webb 2023, doi:10.1016/j.jeconom.2022.04.001). A few runs may have nearly all of the
-# leverage and agree by chance, so what the columns explain must be significant too: by chi-squared, or by F
-# against the scatter of runs (files) if they are one number per run (file). With fewer than thirty specimens,
+# A strong effect is part of V itself: T never exceeds the number of units over the kurtosis of c. From thirty
+# units on the estimate is therefore also tested against its jackknife over whole units (CV3; MacKinnon,
+# Nielsen & Webb 2023, doi:10.1016/j.jeconom.2022.04.001). A few runs may have nearly all of the leverage and
+# agree by chance, so what the columns explain must be significant too: by chi-squared, or by F against the
+# scatter of runs (files) if they are one number per run (file). With fewer than thirty specimens or runs,
 # what is constant in them is tested against their own scatter (`small_sample`), and what varies within them
-# against the scatter of their slopes (`slopes`). With fewer than thirty runs, what is constant in runs or in
-# files is tested against their scatter too (`small_sample`).
+# against the scatter of their slopes (`slopes`).
 
 # A unit alone determines a direction if the eigenvalue of what is left without the unit is smaller.
 OWN = 1e-6
@@ -147,9 +144,8 @@ class ScoreTests:
         """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
 
         The first variant is projected. If the scatter of specimens is not known, the second is also projected
-        off the specimens' own columns. With about as many specimens as conditions their scatter is confounded
-        with the conditions, and a channel that varies between runs, such as the time since the start, would
-        explain it.
+        off the specimens' own columns: a channel that varies between runs, such as the time since the start,
+        would explain that scatter.
         """
         left = project(self.fitted, columns)
         if self._specimens is None or FINER[unit] >= FINER["specimen"]:
@@ -159,10 +155,7 @@ class ScoreTests:
 
     @cached_property
     def _specimens(self) -> tuple[OwnColumns, Tangent] | None:
-        """The specimens' own columns (their friction), and the tangent space projected off them.
-
-        None if their scatter is known or each specimen is one run.
-        """
+        """The specimens' own columns and the tangent space off them; None if their scatter is known."""
         rows = self.fitted.rows
         starts = rows.groups.starts
         if self.fitted.scatter.estimates("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
@@ -179,17 +172,13 @@ class ScoreTests:
     ) -> ScoreTestResult | None:
         """Return the weakest test of all `variants` of some columns; None if one of them cannot be tested.
 
-        `between` is the level of the units whose slopes along the columns may scatter, `level` that of the
-        units of evidence.
+        `between` is the level of units whose slopes may scatter, `level` that of the units of evidence.
         """
         starts = self.fitted.rows.groups.starts
         few_units = starts[between].size < criteria.JACKKNIFE_UNITS
-        found = []
-        for left in variants:
-            test_result = self._score_test(left, level if few_units else between, target)
-            if test_result is None:
-                return None
-            found.append(test_result)
+        found = [self._score_test(left, level if few_units else between, target) for left in variants]
+        if None in found:
+            return None
         weakest = max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
         weakest = weakest._replace(units=starts[level].size)
         if not few_units:
@@ -217,11 +206,7 @@ class ScoreTests:
     def _test_of_constants(
         self, variants: Sequence[np.ndarray], target: tuple[str, str], coarsest: str
     ) -> SmallSampleTest | None:
-        """Return the weakest F test of all variants of columns that are constant in each run, or each file.
-
-        Between specimens, of columns that are constant in each specimen. None if they are not. It is exact;
-        the variance of a slope from half a dozen runs has two or three degrees of freedom.
-        """
+        """Return the weakest exact F test of columns constant in each run, file or specimen, or None."""
         for level in ("specimen",) if coarsest == "specimen" else ("run", "file"):
             tests = [self.cluster_tests[level].test(left, target) for left in variants]
             if all(test is not None and test.share > criteria.CONSTANT_IN_RUNS for test in tests):
@@ -257,18 +242,16 @@ class ScoreTests:
     def _jackknife(self, left: np.ndarray, level: str) -> float:
         """Return the log p-value of orthonormal columns' coefficients by their jackknife over whole units.
 
-        All parameters, also those of the model, are re-estimated without each unit u in the tangent space,
-        from the normal equations less those of u: [[1 - B'B, -B'L], [-L'B, 1 - L'L]] with B, L its rows of
-        basis and columns.
+        Without each unit u the normal equations of the tangent space and the columns are
+        [[1 - B'B, -B'L], [-L'B, 1 - L'L]] with B, L its rows of basis and columns.
         """
         fitted, start = self.fitted, self.fitted.rows.groups.starts[level]
         units, k = start.size, left.shape[1]
         parts = np.split(left, start[1:])
         inverse, product = self._without(level)
         own = np.add.reduceat(left * fitted.white_residual[:, None], start)
-        mixed = np.stack(
-            [b.T @ c for b, c in zip(np.split(fitted.basis.values, start[1:]), parts, strict=True)]
-        )
+        bases = np.split(fitted.basis.values, start[1:])
+        mixed = np.stack([b.T @ c for b, c in zip(bases, parts, strict=True)])
         through = mixed.transpose(0, 2, 1) @ inverse
         square = np.eye(k) - np.stack([c.T @ c for c in parts]) - through @ mixed
         total = left.T @ fitted.white_residual

@@ -18,7 +18,7 @@ from sealfit.fit.joint.variance_components import orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
 # ---------------------------------------------------------------- contrasts
-# Contrasts in few units: the mean slope is tested against the scatter of the units' own slopes.
+# The mean slope is tested against the scatter of the units' own slopes.
 #
 # A contrast is one column L of the force, whitened, projected off the tangent space of the model, and of
 # length 1. Unit u (a specimen, or a run or file where there are few specimens) gives the score
@@ -28,21 +28,16 @@ from sealfit.fit.joint.whitening import Whitening
 #
 # .. math:: V = \sum_u \frac{(s_u - h_u \hat\beta)^2}{1 - h_u}, \quad h_u = L_u^T L_u ,
 #
-# (CR2; Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181) with Satterthwaite's degrees of freedom.
-# With a dozen units V is uncertain. All contrasts of one kind give a prior for it: moderated t (Smyth 2004,
-# doi:10.2202/1544-6115.1027). Contrasts are correlated, so the degrees of freedom of the prior are limited by
-# the number of independent directions of their scores. An effect is part of the scatter of all other
-# contrasts, so V alone is used as well: the p-value is twice the smaller of the two. P-values are adjusted
-# for the number of contrasts (Bonferroni).
+# (CR2; Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181) with Satterthwaite's degrees of freedom. All
+# contrasts of one kind give a prior for V: moderated t (Smyth 2004, doi:10.2202/1544-6115.1027). Its degrees
+# of freedom are limited by the number of independent directions of the scores. An effect is part of the
+# scatter of all other contrasts, so V alone is used as well: the p-value is twice the smaller of the two.
 
-MOST_DF = 1e4
-"""Largest degrees of freedom of a prior. With more, the variance counts as known."""
-
+MOST_DF = 1e4  # Largest degrees of freedom of a prior. With more, the variance counts as known.
+# Number of variances a contrast is tested against: moderated, and its own. Each has half the error rate.
 N_VARIANCES = 2
-"""Number of variances a contrast is tested against: moderated, and its own. Each has half the error rate."""
-
+# Smallest variance of a contrast, so that one of noise-free data, 0 of 0, has the p-value 1.
 LEAST_VARIANCE = 1e-300
-"""Smallest variance of a contrast, so that one of noise-free data, 0 of 0, has the p-value 1."""
 
 
 class ContrastTest(NamedTuple):
@@ -96,9 +91,8 @@ def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
 def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     """Return whether up to four specimens have equal slopes along each whitened column, shape (n, m) -> (m,).
 
-    From `LEAST_UNITS_OF_SLOPES` specimens on they are the units of the test. Along strokes each specimen has
-    a slope of its own. There must be enough specimens there, and slopes that differ by more than noise must
-    meet a stricter level; or all slopes must be larger than the scatter of specimens can be.
+    Along strokes there must be enough specimens, and slopes that differ by more than noise must meet a
+    stricter level; or all slopes must be larger than the scatter of specimens can be.
     """
     found = enough_specimens(fitted, left)
     if not few_specimens(fitted):
@@ -128,10 +122,7 @@ def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, 
 
 
 def least_share(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return the smallest effect of whitened columns, shape (n, m), in any specimen, shape (m,).
-
-    It is the RMS as a share of the force; 0 if specimens differ in sign.
-    """
+    """Return the smallest effect of whitened columns, (n, m), in any specimen, a share of the force (m,)."""
     sums = fitted.rows.groups.sums
     leverage, slopes = _slopes_of_specimens(fitted, left)
     size_N = np.sqrt(sums((left / fitted.whitening.unit[:, None]) ** 2, "specimen"))
@@ -236,22 +227,17 @@ def _independent_directions(deviations: np.ndarray) -> float:
 
 
 # ---------------------------------------------------------------- small sample test
-# One number per specimen, or per run, is tested against the scatter between these units.
-#
 # An effect on a quantity that is constant within specimens shifts each specimen along one direction, the
 # slope of that quantity. With g_u that direction in specimen u (whitened, of length 1), :math:`\rho_u = g_u^T
 # r_u` is one number per specimen. What the model has removed from these numbers is known. Without it they are
 # independent, with one variance if all specimens scatter equally, and a channel's columns are tested against
 # their residual by F. The variance of a few numbers is uncertain. If runs and files explain it, it gets eight
 # prior degrees of freedom (moderated F: Smyth 2004, doi:10.2202/1544-6115.1027); if specimens scatter
-# themselves, it has no prior.
+# themselves, it has no prior. The same test is used for what is constant in runs, with few runs.
 #
-# The same test is used for what is constant in runs, with few runs.
-#
-# A dozen specimens have too few sign flips for a search of hundreds of candidates, and a strong effect is
-# part of its own denominator there. The F test assumes normal scatter instead. Its p-values are adjusted by
-# the smallest over all candidates in draws of normal numbers with the same covariance (a rotation test:
-# Langsrud 2005, doi:10.1007/s11222-005-4789-5).
+# A dozen specimens have too few sign flips for a search of hundreds of candidates. The F test assumes normal
+# scatter instead. Its p-values are adjusted by the smallest over all candidates in draws of normal numbers
+# with the same covariance (a rotation test: Langsrud 2005, doi:10.1007/s11222-005-4789-5).
 
 MANY = 100  # Number of units from which their covariance is not computed as a matrix.
 
@@ -271,9 +257,9 @@ class SmallSampleTest(NamedTuple):
     @property
     def enough_df(self) -> bool:
         """Whether there are enough residual degrees of freedom between units."""
-        return self.error_df >= (
-            criteria.LEAST_ERROR_DF if self.level == "specimen" else criteria.LEAST_ERROR_DF_OF_RUNS
-        )
+        between_specimens = self.level == "specimen"
+        least = criteria.LEAST_ERROR_DF if between_specimens else criteria.LEAST_ERROR_DF_OF_RUNS
+        return self.error_df >= least
 
 
 class Numbers(NamedTuple):
@@ -317,10 +303,7 @@ def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
 
 
 class ClusterTests:
-    """Tests on one number per unit of a fit.
-
-    The groups of the level share only the model.
-    """
+    """Tests on one number per unit of a fit; the groups of the level share only the model."""
 
     def __init__(self, fitted: Fitted, level: str = "specimen") -> None:
         self.fitted, self.level = fitted, level
@@ -399,8 +382,7 @@ class ClusterTests:
 def mean_ratio(squares: np.ndarray, finer: np.ndarray) -> float:
     """Return the mean of squares / finer, shape (units,) each, over units where `finer` is not rounding.
 
-    It is 1 if there are none. Rounding is below 1e-30 of the largest. A derivative far from its Stribeck
-    velocity may underflow in a unit, and the ratio then overflows.
+    It is 1 if there are none. A derivative far from its Stribeck velocity may underflow in a unit.
     """
     known = finer > 1e-30 * finer.max(initial=0.0)
     return float(np.mean(squares[known] / finer[known])) if known.any() else 1.0
