@@ -1,10 +1,10 @@
 """Sensitivity of a campaign: the smallest effect of each variable that it would have found.
 
-The effect is a factor on mu, linear in the variable at one of the levels at which it varies, or an offset
-force for the direction. It is added to the residual, and the scatter is re-estimated, because part of the
-effect is taken for scatter. The smallest effect exceeds the critical value of the whole search with a power
-of 80 % (noncentral F). It must also have the least size that is reported and, with weak evidence, lower the
-held-out error. The stated size is larger by `TO_BE_ADDED`.
+The effect is a factor on mu, linear in the variable at one of its levels, or an offset force for the
+direction. It is added to the residual, and the scatter is re-estimated, because part of the effect is taken
+for scatter. The smallest effect exceeds the critical value of the whole search with a power of 80 %
+(noncentral F), has the least size that is reported and, with weak evidence, lowers the held-out error. The
+stated size is larger by `TO_BE_ADDED`.
 """
 
 from __future__ import annotations
@@ -36,18 +36,14 @@ from sealfit.fit.joint.rows import ALONG, LEVELS
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
-# Size of an effect, as a share of the force, that changes no estimate.
-TINY = 1e-6
+TINY = 1e-6  # Size of an effect, as a share of the force, that changes no estimate.
 # Ratio of the stated size to that which is significant with a power of 80 %. Some significant effects are
 # refused, or another variable is taken for them. Of 53 effects of the significant size in designs drawn at
 # random 64 % were added, of 42 effects 1.2 times as large 79 %, 1.35 times 83 %.
 TO_BE_ADDED = 1.2
-# Most sizes that are tried to reach `TARGET_POWER`.
-STEPS = 6
-# Relative error of the size at which the iteration ends.
-CLOSE = 0.03
-# Effect to which `files_needed` refers, in percent of the friction force.
-WANTED_PCT = 1.0
+STEPS = 6  # Most sizes that are tried to reach `TARGET_POWER`.
+CLOSE = 0.03  # Relative error of the size at which the iteration ends.
+WANTED_PCT = 1.0  # Effect to which `files_needed` refers, in percent of the friction force.
 SPECIMEN, SPECIMENS = "specimen_id", "specimen"
 FRICTION = ("mu", "multiply")
 
@@ -60,11 +56,10 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
     """Return an entry per variable and level, at the family-wise level `alpha` of the search.
 
     Its keys are variable, level, acts_on, smallest_N, smallest_pct and files_needed. A variable that varies
-    at several levels has an entry for each, for an effect at that level only. `smallest_N` is the RMS over
-    all rows of the smallest effect that is found with a power of 80 %, `smallest_pct` the same in percent of
-    the RMS force; None if the variable cannot be tested in this campaign. `files_needed` is the number of
-    files, made like these, that would show an effect of 1 % of the force. A variable that can show nothing
-    beside its effect in the model, such as the direction beside a zero offset, has no entry.
+    at several levels has an entry for each. `smallest_N` is the RMS over all rows of the smallest effect that
+    is found with a power of 80 %, `smallest_pct` the same in percent of the RMS force; None if the variable
+    cannot be tested. `files_needed` is the number of files, made like these, that would show an effect of 1 %
+    of the force. A variable that can show nothing beside its effect in the model has no entry.
     """
     fitted = selection.after
     rows, force = fitted.rows, float(np.sqrt(fitted.rows.weight @ fitted.force**2))
@@ -95,16 +90,9 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 if channel.unit == "sample" and specimens > 1:
                     units = min(units, specimens)
                 needed = int(np.ceil(files * least / units)) if units < least else None
-            entries.append(
-                {
-                    "variable": name,
-                    "level": LEVEL_NAMES[level],
-                    "acts_on": target[0],
-                    "smallest_N": smallest,
-                    "smallest_pct": None if smallest is None else 100 * smallest / force,
-                    "files_needed": needed,
-                }
-            )
+            entry = {"variable": name, "level": LEVEL_NAMES[level], "acts_on": target[0]}
+            percent = None if smallest is None else 100 * smallest / force
+            entries.append({**entry, "smallest_N": smallest, "smallest_pct": percent, "files_needed": needed})
     # No variable describes how specimens differ.
     if len(rows.conditions) < specimens < least:
         needed = int(np.ceil(files * least / specimens))
@@ -120,15 +108,13 @@ def _channels_in_model(selection: Selection) -> set[str]:
 def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
     """Return the factor on an effect at a level, shape (n,), with which it lowers the error by `LEAST_FALL`.
 
-    Only the part that the declared model does not explain lowers the error. Effect and error are taken about
-    the means of the groups within which the effect varies.
+    Effect and error are taken about the means of the groups within which the effect varies.
     """
     rows = fitted.rows
     around = dict(zip(LEVEL_NAMES, (*LEVELS, None), strict=True))[level]
-    own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit
-    size, left = (
-        float(np.sqrt(rows.weight @ about_means(x, rows, around) ** 2)) for x in (own, fitted.residual)
-    )
+    own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit  # not explained by the model
+    squares = [rows.weight @ about_means(x, rows, around) ** 2 for x in (own, fitted.residual)]
+    size, left = np.sqrt(squares).tolist()
     if not size > 0:
         return np.inf
     return criteria.SIZE_MARGIN * left * float(np.sqrt(1 / (1 - criteria.LEAST_FALL) ** 2 - 1)) / size
@@ -163,8 +149,7 @@ class _Search:
     """The tests of the last search, applied to an effect that is added to the residual.
 
     The effect raises the estimated scatter, and its differences between units raise the variance that it is
-    tested against. Variances are treated as in the search: those of contrasts in few units are moderated, and
-    those of the scores of many units are 1 or more.
+    tested against.
     """
 
     def __init__(self, selection: Selection, alpha: float) -> None:
@@ -178,11 +163,9 @@ class _Search:
         self.contrasts = N_VARIANCES * sum(own[0].slope.size for own in slopes)
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
-        lines = [c for c in self.candidates if c.test_result.slopes and c.key[1:] == FRICTION and not c.pair]
-        self.lines = np.column_stack(
-            [c.columns[:, 0] for c in lines] or [np.ones(selection.after.force.size)]
-        )
-        self.lines = self.lines * selection.after.slope(*FRICTION)[:, None]
+        lines = [c for c in self.candidates if c.test_result.slopes and c.target == FRICTION and not c.pair]
+        columns = [c.columns[:, 0] for c in lines] or [np.ones(selection.after.force.size)]
+        self.lines = np.column_stack(columns) * selection.after.slope(*FRICTION)[:, None]
         self.many = len(many)
         self.critical_many = critical_many(many, self.level / 2, np.random.default_rng(0)) if many else 0.0
         self.critical_small_sample = {}
@@ -208,11 +191,10 @@ class _Search:
         if test is None and candidate.test_result.units < criteria.JACKKNIFE_UNITS:
             return np.inf
         df = candidate.test_result.units if test is None else test.error_df
-        found, strong = (
-            -stdtrit(df, p / 2 / criteria.SEARCHES / len(self.candidates))
-            for p in (self.level * criteria.SEARCHES, criteria.WEAK_P)
-        )
-        return times * float((strong + ndtri(criteria.TARGET_POWER)) / (found + ndtri(criteria.TARGET_POWER)))
+        levels = np.array([self.level * criteria.SEARCHES, criteria.WEAK_P])
+        quantiles = stdtrit(df, levels / 2 / criteria.SEARCHES / len(self.candidates))
+        found, strong = ndtri(criteria.TARGET_POWER) - quantiles
+        return times * float(strong / found)
 
     def smallest(self, candidate: Candidate, effect: np.ndarray) -> float:
         """Return the factor on an effect, shape (n,), that gives it `TARGET_POWER`; infinite if none does."""
@@ -255,7 +237,7 @@ class _Search:
         if known is not None and known.level in self.critical_small_sample:
             tail = np.exp(self.critical_small_sample[known.level])
             units = [ClusterTests(one, known.level) for one in (noise, effect)]
-            by_test = min(_by_numbers(*units, left, known.target, tail) for left in variants)
+            by_test = min(_by_numbers(units, left, known.target, tail) for left in variants)
         if test_result.slopes:
             tail = self.level / self.contrasts / (1 if known is None else N_VARIANCES)
             pairs = zip(variants, test_result.slopes, strict=True)
@@ -275,22 +257,14 @@ class _Search:
         prior_df = df - known.df
         prior = (df * variance - known.df * known.variance) / np.maximum(prior_df, 1e-9)
         others = contrast_test(effect, project(effect, self.lines), known.level)
-        for along in (False, True) if others is not None else ():
-            others_variance = others.variance[others.along == along]  # the effect enlarges it
-            prior[known.along == along] *= (
-                np.exp(np.mean(np.log1p(others_variance))) if others_variance.size else 1.0
-            )
+        for along in set(others.along.tolist()) if others is not None else ():  # the effect enlarges them
+            prior[known.along == along] *= np.exp(np.mean(np.log1p(others.variance[others.along == along])))
         own = variance * test.variance / known.variance
         share = test.df / (prior_df + test.df)
         both = (1 - share) * prior + share * own
-        margins = [
-            _margin(added.slope, quiet, differs, 1, d, tail)
-            for quiet, differs, d in (
-                (own, added.variance, test.df),
-                (both, share * added.variance, prior_df + test.df),
-            )
-        ]
-        return float(np.nanmax(margins))
+        by_own = _margin(added.slope, own, added.variance, 1, test.df, tail)
+        by_both = _margin(added.slope, both, share * added.variance, 1, prior_df + test.df, tail)
+        return float(np.nanmax([by_own, by_both]))
 
     def _by_many(
         self, noise: Fitted, effect: Fitted, left: np.ndarray, level: str, candidate: Candidate
@@ -303,9 +277,8 @@ class _Search:
         scores = candidate.test_result.scores
         units, k = scores.shape
         sums = noise.rows.groups.sums
-        own, added = (
-            float((sums(seen / length * f.unit_residual(level), level) ** 2).sum()) for f in (noise, effect)
-        )
+        each = [sums(seen / length * f.unit_residual(level), level) for f in (noise, effect)]
+        own, added = (float((part**2).sum()) for part in each)
         own *= max(1.0, k / float((scores**2).sum()))  # not smaller than the noise is on average
         beyond = ndtri(criteria.TARGET_POWER) * np.sqrt(own)
         share = 1 - betaincinv((units - k) / 2, k / 2, np.exp(self.critical_many))
@@ -317,28 +290,24 @@ class _Search:
         explained = length / (np.sqrt(chdtri(k, tail)) + beyond)
         for one in ("file", "run") if level in ("file", "run") else ():
             units = ClusterTests(noise, one), ClusterTests(effect, one)
-            by_units = _by_numbers(*units, left, candidate.target, tail, least=criteria.CONSTANT_IN_RUNS)
+            by_units = _by_numbers(units, left, candidate.target, tail, least=criteria.CONSTANT_IN_RUNS)
             explained = max(explained, by_units)
         return max(margin, min(spread, explained))
 
 
 def _by_numbers(
-    noise: ClusterTests,
-    effect: ClusterTests,
-    left: np.ndarray,
-    target: tuple[str, str],
-    tail: float,
-    least: float = 0.0,
+    both: Sequence[ClusterTests], left: np.ndarray, target: tuple[str, str], tail: float, least: float = 0.0
 ) -> float:
-    """Return the margin by the F test of one number per unit, at a p-value; 0 if the columns are not that."""
-    test, added = (units.test(left, target) for units in (noise, effect))
+    """Return the margin by the F test of one number per unit, at a p-value; 0 if the columns are not that.
+
+    The tests are those of the noise and of the effect.
+    """
+    test, added = (units.test(left, target) for units in both)
     if test is None or test.share <= least:
         return 0.0
     k, df = test.basis.shape[1], test.known + test.error_df
-    quiet, differs = (
-        max(float(np.sum(units.numbers(target).values ** 2)) - own.chi2, 0.0) / df
-        for units, own in ((noise, test), (effect, added))
-    )
+    squares = [float(np.sum(units.numbers(target).values ** 2)) for units in both]
+    quiet, differs = (max(s - own.chi2, 0.0) / df for s, own in zip(squares, (test, added), strict=True))
     return float(_margin(np.sqrt(added.chi2), quiet + test.known / df, differs, k, df, tail))
 
 
@@ -368,8 +337,7 @@ def undetectable_variables(
 
     An effect is not detectable if it cannot reach the required p-value, and the variable varies along
     strokes, is the direction, or varies between fewer than five specimens; or if the units between which it
-    varies scatter strongly, and an effect that explains all of that scatter would not have been found. A
-    variable of an effect that was added is not among them.
+    varies scatter strongly, and an effect that explains all of that scatter would not have been found.
     """
     starts = selection.after.rows.groups.starts
     in_model = _channels_in_model(selection)

@@ -123,5 +123,5 @@ def test_a_test_that_leaves_nothing_but_rounding_has_a_margin():
     units = SimpleNamespace(
         test=lambda left, target: test, numbers=lambda target: SimpleNamespace(values=np.array([1.0]))
     )
-    margin = _by_numbers(units, units, np.ones((4, 1)), ("mu", "multiply"), 1e-8)
+    margin = _by_numbers((units, units), np.ones((4, 1)), ("mu", "multiply"), 1e-8)
     assert 0.0 <= margin < np.inf
