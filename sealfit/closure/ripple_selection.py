@@ -60,21 +60,17 @@ class Ripples:
             return own
         if not self.added:
             return fitted
-        held = tuple(
-            replace(t, fixed={**t.fixed, "held": {name: (value, value) for name, value in v.items()}})
-            for t, v in zip(own.model.terms, own.model.values, strict=True)
-        )
-        return fit(replace(own.model, terms=held), fitted.rows, own.scatter, turns=2)
+        held = []
+        for term, values in zip(own.model.terms, own.model.values, strict=True):
+            at_values = {name: (value, value) for name, value in values.items()}
+            held.append(replace(term, fixed={**term.fixed, "held": at_values}))
+        return fit(replace(own.model, terms=tuple(held)), fitted.rows, own.scatter, turns=2)
 
     def _find(self, model: Model | None = None) -> Peak | None:
-        known = (
-            [(t.channels[0], v["lambda_"]) for t, v in zip(model.terms, model.values, strict=True)]
-            if model
-            else []
-        )
-        common_phase = self.context.config.position_origin == "rig"
-        peak = find_ripple(self.samples, common_phase=common_phase, known=known)
-        return peak if peak is not None and peak.p_value <= self.context.config.loop.family_error else None
+        pairs = zip(model.terms, model.values, strict=True) if model else ()
+        known, config = [(term.channels[0], own["lambda_"]) for term, own in pairs], self.context.config
+        peak = find_ripple(self.samples, common_phase=config.position_origin == "rig", known=known)
+        return peak if peak is not None and peak.p_value <= config.loop.family_error else None
 
 
 def without_ripples(samples: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
@@ -116,12 +112,10 @@ def steady_samples(
 ) -> pd.DataFrame:
     """Return the steady samples of the strokes in `rows`, for the ripple search.
 
-    The turns of a rotation are joined, since a wave of one period per stroke is hard to distinguish from a
-    slow change: the displacement goes on past the turn, and they have the `stroke_id` of the first.
-
-    `traces` is that table, its samples ordered by stroke, or where it is stored, to be read part by part.
-    `rows` are made from `numbered` bins. `turn` is the displacement of one turn, where strokes are turns
-    (`[strokes] turn`). The columns are stroke_id, stroke, direction, unit (number of the file) and `SAMPLED`.
+    `traces` is that table, its samples ordered by stroke, or where it is stored. `rows` are made from
+    `numbered` bins. The columns are stroke_id, stroke, direction, unit (number of the file) and `SAMPLED`.
+    Strokes that are turns, `turn` long, are joined, since a wave of one period per stroke is hard to
+    distinguish from a slow change.
     """
     first = rows.groups.starts["stroke"]
     strokes = rows.table.iloc[first]
@@ -136,9 +130,8 @@ def steady_samples(
         place = np.repeat(own, np.diff(edges))
         known = place >= 0
         parts.append((place[known].astype(np.int32), *(steady[name].to_numpy()[known] for name in SAMPLED)))
-    place, *values = (
-        map(np.concatenate, zip(*parts, strict=True)) if parts else [np.zeros(0, int)] * (1 + len(SAMPLED))
-    )
+    parts = parts or [(np.zeros(0, int),) * (1 + len(SAMPLED))]
+    place, *values = map(np.concatenate, zip(*parts, strict=True))
     about = {name: own.astype(np.int32)[place] for name, own in about.items()}
     samples = pd.DataFrame({**about, **dict(zip(SAMPLED, values, strict=True))})
     return samples if turn is None or samples.empty else turns_joined(samples, turn)

@@ -11,13 +11,7 @@ import pandas as pd
 from numpy.polynomial.legendre import legvander
 from scipy.special import betaincc, fdtrc, gammaincc
 
-from sealfit.closure.criteria import (
-    ABOVE_BACKGROUND,
-    LEAST_FILES_OF_RIPPLE,
-    LEAST_GROUPS_HELD_OUT,
-    LOBE,
-    SHARED_PHASE,
-)
+from sealfit.closure import criteria
 from sealfit.closure.spectrum import (
     AxisStrokes,
     Spectrum,
@@ -30,10 +24,6 @@ from sealfit.closure.spectrum import (
 from sealfit.fit.joint.model import passes
 from sealfit.fit.joint.rows import Rows
 
-# ---------------------------------------------------------------- ripple
-# Ripples are periodic forces along displacement or time. They are searched in the samples of the steady
-# windows.
-#
 # Bins are too coarse for short waves, so the samples of every stroke are transformed: :math:`Z_u(f)` is the
 # complex amplitude of unit u (a file) at frequency f. A ripple of the rig has the same phase in all files, so
 # :math:`R = |\sum_u Z_u|^2 / \sum_u |Z_u|^2` is large; with random phases R is exponential with mean 1. If
@@ -56,19 +46,14 @@ class Peak:
 
 AXES = ("displacement_mm", "time_s")  # in time: mains, servo
 
-# Periods per median stroke that are tried for waves of few periods.
-LONG_WAVES = np.linspace(1.5, 4.5, 16)
-# Sums with random phases with which that of the files is compared.
-RANDOM_PHASES = 9_999
+LONG_WAVES = np.linspace(1.5, 4.5, 16)  # Periods per median stroke that are tried for waves of few periods.
+RANDOM_PHASES = 9_999  # Sums with random phases with which that of the files is compared.
 # Least ratio of the sum of all files to that of the directions each by itself if they share the phase: a
 # backlash shifts one against the other, and the phases of either direction agree.
 SAME_BOTH_WAYS = 0.98
-# Phases of all files that are drawn at once: 67 MB.
-MOST_PHASES = 1 << 22
-# Periods per stroke about a wave in the model within which what is left of it is found again.
-MAIN_LOBE = 2
-# Degree of the Legendre series of a curve of the position; it resolves six periods.
-CURVE_DEGREE = 14
+MOST_PHASES = 1 << 22  # Phases of all files that are drawn at once: 67 MB.
+MAIN_LOBE = 2  # Periods per stroke about a wave in the model within which what is left of it is found again.
+CURVE_DEGREE = 14  # Degree of the Legendre series of a curve of the position; it resolves six periods.
 # Degrees of the Legendre series of a smooth curve along the travel, without the parabola.
 TRAVEL_DEGREES = np.arange(3, 7)
 # Least share of what a curve of the position explains that a wave must explain. A bump of the position, a
@@ -83,11 +68,10 @@ def find_ripple(
 
     The samples are steady and ordered by stroke: stroke_id, direction, unit, the axes, `residual_N`. With
     `common_phase`, displacement means the same place in every file (`position_origin = "rig"`). `known` are
-    axis and wavelength of the components in the model. Near them the residual contains their scatter between
-    files.
+    axis and wavelength of the components in the model.
     """
     peaks, locked = [], []
-    if common_phase and samples["unit"].nunique() < LEAST_GROUPS_HELD_OUT:
+    if common_phase and samples["unit"].nunique() < criteria.LEAST_GROUPS_HELD_OUT:
         samples = samples.assign(unit=samples["stroke_id"])  # strokes are held out, too
     for axis in AXES:
         lengths = [length for own, length in known if own == axis]
@@ -105,17 +89,13 @@ def find_ripple(
         return None
     # A wave in time is also seen along displacement, at each speed, and vice versa. If both are significant,
     # the axis along which it is the same wave in all files has more energy.
-    significant = [peak for peak in peaks if peak.p_value < SHARED_PHASE]
-    best = (
-        max(significant, key=lambda p: p.energy)
-        if significant
-        else min(peaks, key=lambda p: (p.p_value, -p.statistic))
-    )
+    significant = [peak for peak in peaks if peak.p_value < criteria.SHARED_PHASE]
+    best = min(peaks, key=lambda p: (p.p_value, -p.statistic))
+    best = max(significant, key=lambda p: p.energy, default=best)
     # A common phase is stronger evidence than power.
-    shared = [
-        p for p in (*peaks, *locked) if p.common_phase and p.axis == best.axis and p.p_value < SHARED_PHASE
-    ]
-    best = next((p for p in shared if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
+    shared = [p for p in (*peaks, *locked) if p.common_phase and p.p_value < criteria.SHARED_PHASE]
+    same_axis = [p for p in shared if p.axis == best.axis]
+    best = next((p for p in same_axis if abs(p.wavelength / best.wavelength - 1) < 0.05), best)
     if common_phase and not best.common_phase:
         best = _with_shared_phase(best, samples)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
@@ -124,9 +104,8 @@ def find_ripple(
 def _with_shared_phase(peak: Peak, samples: pd.DataFrame) -> Peak:
     """Return a peak of the mean power, with one phase in all files if their phases agree.
 
-    The sum of the files' complex amplitudes is compared with sums in which the phases are random. The power
-    gives the wavelength, so no other is tried, and files without the wave have little weight: a ripple may be
-    that of one direction or of some conditions.
+    The sum of the files' complex amplitudes is compared with sums in which the phases are random. Files
+    without the wave have little weight: a ripple may be that of one direction or of some conditions.
     """
     waves = waves_of(samples, np.array([peak.wavelength]), peak.axis)
     own = waves.amplitudes[:, 0] @ np.array([1, 1j])
@@ -141,7 +120,7 @@ def _with_shared_phase(peak: Peak, samples: pd.DataFrame) -> Peak:
     whole = np.abs(sums.sum(axis=0))
     best = int(whole.argmax())
     each_way = sum(abs(own[waves.direction == way].sum()) for way in np.unique(waves.direction))
-    if p_values.size * p_values[best] > SHARED_PHASE or whole[best] < SAME_BOTH_WAYS * each_way:
+    if p_values.size * p_values[best] > criteria.SHARED_PHASE or whole[best] < SAME_BOTH_WAYS * each_way:
         return peak
     return replace(peak, common_phase=True, sign_symmetric=best == 0)
 
@@ -152,7 +131,7 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
     for mode in range(modes):
         total = np.abs(spectrum.total[mode]) ** 2
         statistic = total / np.maximum(spectrum.square[mode], 1e-300)
-        sharp = total / background(np.where(spectrum.taken, np.nan, total)) > ABOVE_BACKGROUND
+        sharp = total / background(np.where(spectrum.taken, np.nan, total)) > criteria.ABOVE_BACKGROUND
         found = sharp & tops(total) & ~spectrum.taken
         units = int(spectrum.units[mode])
         if units < 4 or not found.any():
@@ -170,14 +149,13 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
 def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
     """Return the best wave of few periods per stroke, per mode, unless a smooth curve is as likely.
 
-    Near its low end a spectrum contains the smooth shapes of strokes. Here the mean over files of the
-    amplitudes of sine and cosine is tested against their scatter (Hotelling's T squared). Nearly all of what
-    any curve of the position that all files share explains must be the wave, and a curve along the travel,
-    as of warming, must explain less.
+    The mean over files of the amplitudes of sine and cosine is tested against their scatter (Hotelling's T
+    squared). Nearly all of what any curve of the position that all files share explains must be the wave, and
+    a curve along the travel, as of warming, must explain less.
     """
     strokes = AxisStrokes.of(samples, "displacement_mm")
     units, unit = np.unique(strokes.unit, return_inverse=True)
-    if units.size < LEAST_GROUPS_HELD_OUT:
+    if units.size < criteria.LEAST_GROUPS_HELD_OUT:
         return []
     span, low, high = np.median(strokes.span), strokes.low.min(), (strokes.low + strokes.span).max()
     waves = np.array([m for m in LONG_WAVES if all(abs(m - span / length) > MAIN_LOBE for length in known)])
@@ -248,7 +226,7 @@ def _incoherent(spectrum: Spectrum) -> list[Peak]:
     p = float(np.exp(own[k])) * spectrum.frequency.size
     wavelength = _refined(spectrum.power, spectrum.frequency, k)
     energy = spectrum.amplitude**2 * spectrum.count * (1 - 1 / np.maximum(ratio, 1.0))
-    significant = peaks & (own < np.log(SHARED_PHASE / spectrum.frequency.size))
+    significant = peaks & (own < np.log(criteria.SHARED_PHASE / spectrum.frequency.size))
     significant[k] = True
     most = float(energy[significant].max())
     return [Peak(spectrum.axis, wavelength, True, False, float(ratio[k]), p, most)]
@@ -256,8 +234,8 @@ def _incoherent(spectrum: Spectrum) -> list[Peak]:
 
 def _refined(power: np.ndarray, frequency: np.ndarray, k: int) -> float:
     """Return the wavelength at the highest point of a peak."""
-    first = max(k - LOBE, 0)
-    return 1 / _summit(frequency, power, first + int(np.argmax(power[first : k + LOBE + 1])))
+    first = max(k - criteria.LOBE, 0)
+    return 1 / _summit(frequency, power, first + int(np.argmax(power[first : k + criteria.LOBE + 1])))
 
 
 def _summit(places: np.ndarray, power: np.ndarray, k: int) -> float:
@@ -271,13 +249,8 @@ def _summit(places: np.ndarray, power: np.ndarray, k: int) -> float:
 
 
 # ---------------------------------------------------------------- stroke phases
-# The wave of each pass at one wavelength, from the raw samples: the exact wavelength, and the phases of the
-# passes.
-#
 # A pass is a file in one direction. A parabola, a sine and a cosine of the place are fitted to a stroke's
-# residual by least squares weighted with a Hann window, which gives the ends of the stroke little weight. The
-# strokes of a pass share the sine and the cosine. The resolution is not limited by bins or frequencies, and a
-# wave of a few periods is separated from the trend.
+# residual by least squares weighted with a Hann window. The strokes of a pass share the sine and the cosine.
 
 AROUND = np.linspace(-0.5, 0.5, 101)  # Periods per stroke on each side of a peak that are refined.
 
@@ -310,29 +283,17 @@ def waves_of(samples: pd.DataFrame, lengths: np.ndarray, axis: str) -> Waves:
     total, middle = np.zeros((2, count))
     for k in range(count):
         place, value = strokes.along(k)
-        square[k], product[k], total[k] = _normal_equations(place, value, lengths)
-        middle[k] = place.mean()
+        turn = 2 * np.pi * place[:, None] / lengths
+        columns = _flattened(place, np.column_stack([np.sin(turn), np.cos(turn), value]))
+        waves, y = columns[:, :-1].reshape(place.size, 2, lengths.size), columns[:, -1]
+        square[k], product[k] = np.einsum("nim,njm->mij", waves, waves), np.einsum("nim,n->mi", waves, y)
+        total[k], middle[k] = y @ y, place.mean()
     order = np.lexsort((strokes.direction, strokes.unit))
     unit, direction = strokes.unit[order], strokes.direction[order]
     first = np.flatnonzero(np.r_[True, (np.diff(unit) != 0) | (np.diff(direction) != 0)][: order.size])
-    square, product, total, middle = (
-        np.add.reduceat(part[order], first, axis=0) if first.size else part
-        for part in (square, product, total, middle)
-    )
-    return Waves(
-        unit[first], direction[first], square, product, total, middle / np.diff(np.r_[first, order.size])
-    )
-
-
-def _normal_equations(
-    place: np.ndarray, value: np.ndarray, lengths: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return `square`, `product` and `total` of a stroke of n samples, shape (n,), sorted by place."""
-    turn = 2 * np.pi * place[:, None] / lengths
-    columns = _flattened(place, np.column_stack([np.sin(turn), np.cos(turn), value]))
-    waves, y = columns[:, :-1].reshape(place.size, 2, lengths.size), columns[:, -1]
-    square = np.einsum("nim,njm->mij", waves, waves)
-    return square, np.einsum("nim,n->mi", waves, y), float(y @ y)
+    parts = (part[order] for part in (square, product, total, middle))
+    sums = [np.add.reduceat(part, first, axis=0) if first.size else part for part in parts]
+    return Waves(unit[first], direction[first], *sums[:3], sums[3] / np.diff(np.r_[first, order.size]))
 
 
 def _flattened(place: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -372,23 +333,21 @@ def _top(lengths: np.ndarray, power: np.ndarray) -> float:
 def agreement(samples: pd.DataFrame, first: np.ndarray, wavelength: float, axis: str) -> np.ndarray:
     """Return per file the scalar product of the amplitudes of its two halves, shape (files,).
 
-    Without a wave the phases of the halves are independent, and both signs are equally likely. With too few
-    files for a sign test the products are per pass (a file in one direction). `first`, shape (n,), is true
-    for the samples of the first half.
+    Without a wave both signs are equally likely. With too few files for a sign test the products are per
+    pass. `first`, shape (n,), is true for the samples of the first half.
     """
     one, other = (waves_of(samples[mask], np.array([wavelength]), axis) for mask in (first, ~first))
     whole = [np.rec.fromarrays([part.unit, part.direction]) for part in (one, other)]
     _, mine, its = np.intersect1d(*whole, assume_unique=True, return_indices=True)
     cross = (one.amplitudes[mine, 0] * other.amplitudes[its, 0]).sum(axis=1)
     files, file = np.unique(one.unit[mine], return_inverse=True)
-    return np.bincount(file, cross) if files.size >= LEAST_FILES_OF_RIPPLE else cross
+    return np.bincount(file, cross) if files.size >= criteria.LEAST_FILES_OF_RIPPLE else cross
 
 
 def pass_shifts(samples: pd.DataFrame, rows: Rows, wavelength: float, axis: str) -> dict[str, float]:
     """Return per pass the shift of its origin from that of the wave, in the unit of the axis.
 
-    Of the possible origins the one nearest to the middle of the pass is taken. A change of the wavelength
-    then does not change the phase there.
+    Of the possible origins the one nearest to the middle of the pass is taken.
     """
     strokes = rows.table.iloc[rows.groups.starts["stroke"]]
     names = dict(zip(strokes["stroke_id"], passes(strokes), strict=True))

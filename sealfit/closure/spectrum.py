@@ -13,9 +13,6 @@ from scipy.special import digamma, polygamma
 
 from sealfit.closure.criteria import LEAST_SAMPLES_OF_STROKE, LOBE, NEIGHBOURS, REACHED
 
-# ---------------------------------------------------------------- stroke signals
-# Strokes along an axis, each of which is interpolated on an even grid.
-
 
 @dataclass(frozen=True)
 class AxisStrokes:
@@ -51,15 +48,10 @@ class AxisStrokes:
         return self.place[own][order], self.residual[own][order]
 
 
-# ---------------------------------------------------------------- background
-# The background of a spectrum at each frequency, from its neighbours.
-
-
 def effective_count(ratio: np.ndarray) -> np.ndarray:
     """Return the effective number of independent powers in the mean at each frequency, shape (f,).
 
-    The logarithm of a mean of c powers has the variance trigamma(c). It is estimated from the quartiles of
-    the neighbours, which are robust to a few peaks.
+    The logarithm of a mean of c powers has the variance trigamma(c), here from the neighbours' quartiles.
     """
     low, high = _quantiles(_neighbours(np.log(np.maximum(ratio, 1e-300))), (0.25, 0.75))
     spread = ((high - low) / 1.349) ** 2
@@ -95,8 +87,7 @@ def _neighbours(value: np.ndarray) -> np.ndarray:
 def tops(power: np.ndarray) -> np.ndarray:
     """Return where a spectrum has its maximum within a main lobe on each side, without both ends, shape (f,).
 
-    The low end contains the smooth shapes of a stroke (warming, drift), which are no ripple. Only the most
-    finely sampled strokes reach the high end, and their noise is not typical.
+    The low end contains the smooth shapes of a stroke; few strokes reach the high end.
     """
     padded = np.pad(power, LOBE, constant_values=np.inf)
     highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * LOBE + 1).max(axis=1)
@@ -107,7 +98,7 @@ def smooth_background(power: np.ndarray, frequency: np.ndarray, count: np.ndarra
     """Return the background of means of `count` powers: a line in log-log coordinates through the neighbours.
 
     The spectrum of correlated noise falls steeply, so a median of neighbours would give a false peak at the
-    low end. Outlying neighbours are clipped, and the main lobe of the peak is excluded.
+    low end. Outlying neighbours are clipped.
     """
     value = np.log(np.maximum(power, 1e-300))
     place = np.log(frequency)
@@ -132,10 +123,6 @@ def background(power: np.ndarray) -> np.ndarray:
     return np.maximum(_quantiles(_neighbours(power), (0.5,))[0], 1e-300)
 
 
-# ---------------------------------------------------------------- spectrum
-# The spectrum of strokes along an axis, summed over units. Amplitudes of single units are not kept, so that
-# memory does not grow with the campaign.
-
 LEAST_STROKES = 3  # Fewest strokes of a spectrum.
 LEAST_FREQUENCIES = 4  # Fewest frequencies of a spectrum.
 
@@ -144,7 +131,8 @@ LEAST_FREQUENCIES = 4  # Fewest frequencies of a spectrum.
 class Spectrum:
     """Sums over passes (units in one direction) at f frequencies, and over units in one or two modes.
 
-    The first mode is the same force in both directions, the second has the sign of the direction.
+    The first mode is the same force in both directions, the second has the sign of the direction. Amplitudes
+    of single units are not kept, so that memory does not grow with the campaign.
     """
 
     axis: str
@@ -215,18 +203,15 @@ class _Grid:
             return None
         step = strokes.span / (strokes.size - 1)
         longest = float(2 * strokes.span.max())
-        distinct, number = np.unique(
-            np.clip(np.ceil(longest / step), 8, 2**15).astype(int), return_inverse=True
-        )
-        points = np.array([next_fast_len(int(n), real=True) for n in distinct])[number]
+        least = np.clip(np.ceil(longest / step), 8, 2**15).astype(int)
+        points = np.array([next_fast_len(int(n), real=True) for n in least])
         most = min(2**15, int(np.ceil(longest / np.quantile(step, 0.1))))
         frequency = np.arange(most // 2 + 1) / longest
         reach = np.minimum(points // 2 + 1, np.searchsorted(frequency, 0.5 / step, side="right"))
         # strokes, at each frequency
         reaching = np.bincount(reach, minlength=frequency.size + 1)[::-1].cumsum()[::-1][1:]
-        use = (frequency >= 2 / np.median(strokes.span)) & (
-            reaching[: frequency.size] >= REACHED * reach.size
-        )
+        widely = reaching[: frequency.size] >= REACHED * reach.size
+        use = widely & (frequency >= 2 / np.median(strokes.span))
         if use.sum() < LEAST_FREQUENCIES:
             return None
         first, last = np.flatnonzero(use)[[0, -1]]  # contiguous, as fewer strokes reach further
@@ -235,10 +220,7 @@ class _Grid:
 
 
 def _passes(grid: _Grid, strokes: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean complex amplitudes of a unit's strokes in each direction, and where any reaches them.
-
-    Both have the shape (directions, f), up to the highest frequency that one of the strokes reaches.
-    """
+    """Return the mean complex amplitudes of a unit's strokes, (directions, f), and where any reaches them."""
     wave = np.zeros((sides.size, int(grid.reach[strokes].max())), dtype=complex)
     count = np.zeros(wave.shape)
     for k in strokes:

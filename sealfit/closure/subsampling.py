@@ -24,18 +24,12 @@ from sealfit.fit.joint.rows import POWER, Rows, make_rows, merge, thin
 
 # A campaign with no more strokes is searched in full. Of a larger one this many are drawn, by whole runs.
 STROKES = 4_000
-# Least number of runs drawn: runs are the evidence for most variables.
-RUNS = 1_000
-# Least number of runs drawn for each parameter of the declared model.
-LEAST_RUNS = 20
-# Factor on the number of strokes drawn next if the full campaign shows more than those searched.
-FURTHER = 4
-# Approximate number of rows in a search. More rows are merged along their strokes.
-ROWS = 4_000
-# Number of merged rows kept per stroke, if `MOST_ROWS` allows it.
-PER_STROKE = 8
-# Largest number of rows in a search.
-MOST_ROWS = 8_000
+RUNS = 1_000  # Least number of runs drawn: runs are the evidence for most variables.
+LEAST_RUNS = 20  # Least number of runs drawn for each parameter of the declared model.
+FURTHER = 4  # Factor on the number of strokes drawn next if the full campaign shows more than those searched.
+ROWS = 4_000  # Approximate number of rows in a search. More rows are merged along their strokes.
+PER_STROKE = 8  # Number of merged rows kept per stroke, if `MOST_ROWS` allows it.
+MOST_ROWS = 8_000  # Largest number of rows in a search.
 # If `MOST_ROWS` allows fewer rows per stroke, some files keep `PER_STROKE` and the others one row per stroke.
 LEAST_PER_STROKE = 4
 
@@ -58,9 +52,7 @@ class Subsample:
 
 
 def subsamples(rows: Rows, seed: int) -> Iterator[Subsample]:
-    """Yield larger and larger subsets of a campaign's runs, drawn evenly over its conditions.
-
-    The last has all runs. The cost of the first search depends on the model, not on the number of files.
+    """Yield larger and larger subsets of a campaign's runs, drawn evenly over its conditions, then all runs.
 
     The rows are made of bins as returned by `numbered`.
     """
@@ -112,12 +104,10 @@ def _fill(drawn: np.ndarray, number: np.ndarray, least: int, rng: np.random.Gene
 
 
 def merged_bins(bins: pd.DataFrame, seed: int) -> pd.DataFrame:
-    """Return the bins for the search: neighbours within a stroke are merged if there are many.
+    """Return bins of `numbered` for the search: neighbours within a stroke are merged if there are many.
 
     With very many strokes, some files drawn evenly over the campaign keep several rows per stroke, in
     `MOST_ROWS` rows together. The others keep their mean only.
-
-    The bins are those that `numbered` returns.
     """
     strokes = bins["stroke_id"].nunique()
     if LEAST_PER_STROKE * strokes <= MOST_ROWS:
@@ -150,10 +140,8 @@ def reselect_on_all(
     """Re-select the form and target of each effect on all strokes; return the result and the fitted model.
 
     An effect is compared with its first rivals, and the best of them with itself on the targets of its
-    rivals, each time on all strokes. Rivals on targets that are excluded by this are removed. Ripples were
-    tested on the samples and are kept.
-
-    `every` has all rows, merged along the strokes, and `samples` the raw samples of the part.
+    rivals. Rivals on targets that are excluded by this are removed. Ripples were tested on the samples and
+    are kept. `every` has all rows, merged along the strokes, and `samples` the raw samples of the part.
     """
     added, after = list(selection.added), selection.after
     whole = fit(after.model, every, after.scatter, turns=1)
