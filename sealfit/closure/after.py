@@ -34,12 +34,8 @@ from sealfit.progress import timed
 from sealfit.tables import AFTER, AGING_CURVES, SCHEMAS
 
 # ---------------------------------------------------------------- reference
-# The reference state of the after-model, in which its effects are zero, and the effects' share of the
-# measured forces.
-#
 # The coefficients of the after-model are those at the reference: the contact cold, the offset removed, a
-# column at its reference value. An effect of condition columns only (such as days) is part of the condition
-# and is not removed.
+# column at its reference value. An effect of condition columns only (such as days) is not removed.
 
 KEPT = "not removed: part of the aging condition"
 SMALL = 1e-4  # Share of the effects' variance in principal directions that are dropped.
@@ -97,31 +93,26 @@ def without_effects(steady: pd.DataFrame, after: Fitted, config: Config) -> pd.D
     columns |= {f"{SHIFT}{k + 1}_N": principal[:, k] * np.sign(rows.speed) for k in range(principal.shape[1])}
     keys = [rows.table["file"], rows.table["stroke"]]
     weight = rows.table["n"].astype(float)
-    means = (
-        pd.DataFrame(columns).mul(weight, axis=0).groupby(keys).sum().div(weight.groupby(keys).sum(), axis=0)
-    )
+    sums = pd.DataFrame(columns).mul(weight, axis=0).groupby(keys).sum()
+    means = sums.div(weight.groupby(keys).sum(), axis=0)
     found = means.reindex(pd.MultiIndex.from_frame(steady[["file", "stroke"]])).reset_index(drop=True)
-    known = found["effects_N"].notna()
+    used = steady["used"].to_numpy(dtype=bool) & found["effects_N"].notna()
     table = steady.reset_index(drop=True).join(found.fillna(0.0))
-    return table.assign(
-        force_N=table["force_N"] - table["effects_N"], used=table["used"].astype(bool) & known
-    )
+    return table.assign(force_N=table["force_N"] - table["effects_N"], used=used)
 
 
 def _principal(columns: np.ndarray, covariance: np.ndarray, rows: Rows) -> np.ndarray:
     """Return L with L L' = J C J' for derivatives J, shape (n, p), and a covariance C, shape (p, p).
 
-    L has few columns: directions whose mean over the strokes is small are dropped, because they do not change
-    a fit to the strokes.
+    Directions whose mean over the strokes is small are dropped: they do not change a fit to the strokes.
     """
     if not columns.size:
         return columns
     size, axes = np.linalg.eigh(covariance)
     spread = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))
     stroke = rows.codes("stroke")
-    means = (
-        np.column_stack([np.bincount(stroke, column) for column in spread.T]) / np.bincount(stroke)[:, None]
-    )
+    sums = np.column_stack([np.bincount(stroke, column) for column in spread.T])
+    means = sums / np.bincount(stroke)[:, None]
     _, singular, turned = np.linalg.svd(means, full_matrices=False)
     share = np.cumsum(singular[::-1] ** 2)[::-1]
     kept = share > SMALL * share[0]
@@ -138,8 +129,6 @@ def _at_start(model: Model, reference: Model, rows: Rows) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- after law
-# The aging law of every series in the after-model: Eq. 15 from the joint fit, with effects at their
-# reference.
 
 SLOW, FAST = 1e-6, 12.0  # Multiples of v_s at which the force is mu_s N, and mu_c N without the viscous term.
 WIDEST = 700.0  # Largest logarithm.
@@ -151,10 +140,9 @@ def after_laws(
     """Return tables `aging_fit` and `aging_covariance`, and `aging_curves`; empty without aging.
 
     The laws are compared with the values of single conditions in `steady_fit`, the fits without the effects.
-    mu_0, a and b and their standard errors are those of the joint fit. Their intervals use Student's t with
-    the number of specimens less the parameters of one coefficient; that of b is symmetric in its logarithm.
-    Effects that are part of the condition (such as days) multiply or change the law; the curves include them.
-    Three speeds determine no mu_s and mu_c: the laws are then those of single conditions, as before the loop.
+    mu_0, a and b are those of the joint fit. Effects that are part of the condition (such as days) change the
+    law; the curves include them. Three speeds determine no mu_s and mu_c: the laws are then those of single
+    conditions, as before the loop.
     """
     if "interpolated" in after.model.declared.stribeck.values():
         laws = fit_series(steady_fit, config)
@@ -171,8 +159,7 @@ def after_laws(
 def law_df(after: Fitted) -> float:
     """Return the degrees of freedom of the laws' intervals: specimens less the parameters of one coefficient.
 
-    With few specimens their variance is often estimated as zero, and the runs would give too many degrees of
-    freedom.
+    With few specimens their variance is often estimated as zero; the runs would give too many.
     """
     left = after.rows.groups.starts["specimen"].size - after.model.declared.mu_parameter_count
     return min(degrees_of_freedom(after), float(max(left, 1)))
@@ -218,11 +205,9 @@ class _LawAfter:
         found = Estimate(after.model.theta[at], after.covariance[np.ix_(at, at)], shift)
         changed = {"force", "mu", f"mu_{self.end}", "mu_0", "a", "b"}
         kept = [t for t in after.model.terms if is_kept(t, config) and t.acts_on in changed]
-        words = "; ".join(
-            f"The effect {t.effect.id} of {' and '.join(t.channels)} acts on top of it." for t in kept
-        )
-        interval = self._interval(found)
-        rows = list(law_rows(self.curve_of, found, interval, self.df))
+        effects = [f"The effect {t.effect.id} of {' and '.join(t.channels)} acts on top of it." for t in kept]
+        words = "; ".join(effects)
+        rows = list(law_rows(self.curve_of, found, self._interval(found), self.df))
         for row in rows:
             row["reason"] = " ".join(part for part in (row["reason"], words) if part)
         rows += self._statistics(steady_fit)
@@ -233,12 +218,11 @@ class _LawAfter:
         t, error = t_quantile(self.df), np.sqrt(np.diag(found.covariance))
         low, high = (found.x[2] + s * t * error[2] for s in (-1, 1))
         first, last = search_limits(self.curve_of.days)
-        b = (
-            float(np.exp(low)) if low > first else 0.0,
-            float(np.exp(min(high, WIDEST))) if high < last else np.inf,
-        )
+        least = float(np.exp(low)) if low > first else 0.0
+        most = float(np.exp(min(high, WIDEST))) if high < last else np.inf
         c, half = -found.x[1] * found.x[2], t * found.error_of_c()
-        return CurveInterval((found.x[1] - t * error[1], found.x[1] + t * error[1]), b, (c - half, c + half))
+        a = found.x[1] - t * error[1], found.x[1] + t * error[1]
+        return CurveInterval(a, (least, most), (c - half, c + half))
 
     def _statistics(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
         """Yield the errors of the law at single conditions, and the statistics behind its intervals."""
@@ -261,11 +245,8 @@ class _LawAfter:
             ("n_days", curve.days.size + curve.unaged, ""),
             ("last_day", curve.days[-1], "d"),
         ):
-            parameter = f"{curve.quantity}:{name}"
-            row = table_row(
-                quantity="statistics", parameter=parameter, value=value, unit=unit, identified=True
-            )
-            yield {**row, "series": curve.series}
+            named = {"quantity": "statistics", "parameter": f"{curve.quantity}:{name}"}
+            yield {**table_row(**named, value=value, unit=unit, identified=True), "series": curve.series}
 
     def curve(self) -> pd.DataFrame:
         """Return the law along aging time with its 95 % band, including effects of the condition."""
@@ -291,10 +272,9 @@ class _LawAfter:
             theta[index["sigma_2"]] = 0.0
         load = float(rows.load.mean())
         first = rows.table[rows.condition == condition].iloc[[0]]
+        speed = v_s * (SLOW if self.end == "s" else FAST)
         table = pd.concat([first] * days.size, ignore_index=True)
-        table = table.assign(
-            aging_days=days, speed_mm_s=v_s * (SLOW if self.end == "s" else FAST), load_N=load
-        )
+        table = table.assign(aging_days=days, speed_mm_s=speed, load_N=load)
         at = rows.points(table.drop(columns=[POWER], errors="ignore"), np.full(days.size, condition))
         force, tangent = evaluate(replace(model, theta=theta), replace(at, days=days))
         places = [np.arange(after.model.size)[after.model.term_slice(k)] for k in kept]
@@ -306,7 +286,6 @@ class _LawAfter:
 
 
 # ---------------------------------------------------------------- after fits
-# The fits repeated with the effects of the after-model removed at their reference.
 
 
 def after_fits(
@@ -322,8 +301,8 @@ def after_fits(
 
     `after` is the after-model, fitted to all bins; `steady` and `traces` are these tables, or where `traces`
     is stored. The laws of single series are those of the joint fit. Single conditions are fitted to the
-    strokes' forces without the effects, and the effects' covariance is propagated through these fits. The
-    laws for all series, the pre-sliding fits and the break-away forces follow from them.
+    strokes' forces without the effects; the laws for all series, the pre-sliding fits and the break-away
+    forces follow from them.
     """
     if not after.model.terms and not left_out:
         return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}

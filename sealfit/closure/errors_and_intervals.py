@@ -23,8 +23,7 @@ from sealfit.fit.joint.tangent import OwnColumns, Tangent
 from sealfit.fit.joint.whitening import KINDS, LEVELS_OF_FORCE
 from sealfit.tables import LEVELS as TABLE_OF_LEVELS
 
-# Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3.
-SHAPES = 3
+SHAPES = 3  # Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3.
 RANK = 1e-9  # Relative singular value below which a direction of a tangent is zero.
 
 # Value and both ends of its 95 % interval.
@@ -33,14 +32,8 @@ Interval = tuple[float, float, float]
 PHASES = {"phi": ("A", 2 * np.pi, np.pi), "phi_2": ("B", 2 * np.pi, np.pi), "t_max": ("A", DAY_H, DAY_H)}
 
 
-# ---------------------------------------------------------------- errors
-
-
 def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
-    """Return rmse_N, rmse_runs_N, max_abs_N and mean_abs_pct of a residual, shape (n,).
-
-    Every file has the same weight.
-    """
+    """Return rmse_N, rmse_runs_N, max_abs_N and mean_abs_pct of a residual, (n,); files have equal weight."""
     weight = rows.weight
     run = pd.factorize(rows.table["run_id"])[0]
     per_run = np.bincount(run, weight)
@@ -48,13 +41,12 @@ def errors(rows: Rows, residual: np.ndarray) -> dict[str, float]:
     size = np.abs(np.bincount(run, weight * rows.force) / per_run)
     relative = np.abs(residual) / np.where(size > 0, size, np.nan)[run]
     known = np.isfinite(relative)
+    percent = 100 * (weight[known] @ relative[known]) / weight[known].sum() if known.any() else None
     return {
         "rmse_N": float(np.sqrt(weight @ residual**2)),
         "rmse_runs_N": float(np.sqrt(np.mean(means**2))),
         "max_abs_N": float(np.abs(residual).max()),
-        "mean_abs_pct": float(100 * (weight[known] @ relative[known]) / weight[known].sum())
-        if known.any()
-        else None,
+        "mean_abs_pct": None if percent is None else float(percent),
     }
 
 
@@ -73,19 +65,16 @@ def without_repeat_pattern(rows: Rows, residual: np.ndarray) -> np.ndarray:
 def noise_floor(fitted: Fitted) -> float | None:
     """Return the RMS deviation of bins from their run's mean over repeats; None without repeats.
 
-    It is the RMSE that the true mean would have on these bins. The mean shape over the repeats of a run and
-    the mean pattern from one repeat to the next are not part of it. It does not contain the scatter of
-    set-ups, which cannot be distinguished from lack of fit without replicated runs.
+    It is the RMSE that the true mean would have on these bins. The mean pattern from one repeat to the next
+    is not part of it, nor is the scatter of set-ups: without replicated runs it looks like lack of fit.
     """
     clean = without_repeat_pattern(fitted.rows, fitted.residual)
     place = fitted.rows.table.groupby(["run_id", "stroke", "bin"], sort=False).ngroup().to_numpy()
     count = np.bincount(place)
     mean = np.bincount(place, clean) / count
     repeated = count[place] > 1
-    df = float((count[count > 1] - 1).sum())
-    if df <= 0:
-        return None
-    return float(np.sqrt(float(((clean - mean[place])[repeated] ** 2).sum() / df)))
+    df = float((count - 1).sum())
+    return float(np.sqrt(((clean - mean[place])[repeated] ** 2).sum() / df)) if df > 0 else None
 
 
 def lack_of_fit(fitted: Fitted) -> float | None:
@@ -101,8 +90,7 @@ def lack_of_fit(fitted: Fitted) -> float | None:
 def _p_of_shapes(fitted: Fitted) -> list[float]:
     """Return the p-values of shapes along strokes that the repeats of a run have in common.
 
-    Each is one number per file, the mean over its strokes of the coefficient of a Legendre polynomial: noise
-    may be correlated within strokes, and strokes of a file may have a shape in common.
+    Each is one number per file: noise may be correlated within strokes, and strokes of a file may be alike.
     """
     rows = fitted.rows
     stroke, start = rows.codes("stroke"), rows.groups.starts["stroke"]
@@ -114,10 +102,8 @@ def _p_of_shapes(fitted: Fitted) -> list[float]:
     found = []
     for degree in range(1, SHAPES + 1):
         shape = Legendre.basis(degree)(place)
-        strokes = pd.DataFrame(
-            {"run": run, "file": file, "z": np.bincount(stroke, shape * fitted.residual) / count}
-        )
-        strokes["z"] /= scale
+        z = np.bincount(stroke, shape * fitted.residual) / count / scale
+        strokes = pd.DataFrame({"run": run, "file": file, "z": z})
         cells = strokes[chosen].groupby(["run", "file"])["z"].mean().groupby("run")
         mean, files = cells.mean().to_numpy(), cells.size().to_numpy()
         df = float((files - 1).sum())
@@ -128,10 +114,7 @@ def _p_of_shapes(fitted: Fitted) -> list[float]:
 
 
 def _p_of_run_means(fitted: Fitted) -> float | None:
-    """Return the p-value of run means against the scatter of files in runs (F test); None without repeats.
-
-    The scatter of specimens is not lack of fit and is removed with the model.
-    """
+    """Return the p-value of run means against the scatter of files in runs (F test); None without repeats."""
     rows = fitted.rows
     clean = without_repeat_pattern(rows, fitted.residual)
     keys = rows.table[["run_id"]].assign(file=rows.codes("file"), residual=clean, friction=fitted.friction)
@@ -162,10 +145,9 @@ def _p_of_run_means(fitted: Fitted) -> float | None:
 def _residual_of_model(
     fitted: Fitted, size: np.ndarray, chosen: np.ndarray, factor: np.ndarray
 ) -> tuple[np.ndarray, int]:
-    """Return the residual of one number per run left by model and specimens, and their rank.
+    """Return the residual of one number per run, `size`, left by model and specimens, and their rank.
 
-    The numbers are `size`, shape (runs,), `chosen` is a file of each run, and `factor` that on its tangent,
-    which is the mean over the file's rows.
+    `chosen` is a file of each run, and `factor` that on its tangent, the mean over the file's rows.
     """
     rows = fitted.rows
     number = rows.table.groupby(["run_id", rows.codes("file")], sort=False).ngroup().to_numpy()
@@ -205,8 +187,8 @@ def level_table(
 ) -> pd.DataFrame:
     """Return the residual's variance by level and, within the levels, by channel (table `levels`).
 
-    The level of a candidate is the finest at which one of its `channels` varies, as that of an effect. The
-    rows of the candidates are those of the fit that was `searched`, a part of all or means of them.
+    The level of a candidate is the finest at which one of its `channels` varies. The rows of the candidates
+    are those of the fit that was `searched`, a part of all or means of them.
     """
     rows = fitted.rows
     noise = float(rows.weight @ fitted.scatter.noise_sd(fitted.friction) ** 2)
@@ -241,19 +223,12 @@ def _scatter_by_level(fitted: Fitted) -> Iterator[tuple[str, float, float]]:
 def scatter_list(fitted: Fitted) -> list[dict]:
     """Return closure.json's `scatter`: per level the SD in force units, relative to the force, and its df."""
     mean_square = float(fitted.rows.weight @ fitted.force**2)
-    return [
-        {
-            "level": level,
-            "sd_rel": float(np.sqrt(variance / mean_square)),
-            "sd_N": float(np.sqrt(variance)),
-            "df": df,
-        }
-        for level, variance, df in _scatter_by_level(fitted)
-        if variance > 0
-    ]
-
-
-# ---------------------------------------------------------------- intervals
+    found = []
+    for level, variance, df in _scatter_by_level(fitted):
+        if variance > 0:
+            sizes = {"sd_rel": float(np.sqrt(variance / mean_square)), "sd_N": float(np.sqrt(variance))}
+            found.append({"level": level, **sizes, "df": df})
+    return found
 
 
 class Sandwich(NamedTuple):
@@ -267,9 +242,9 @@ class Sandwich(NamedTuple):
 def degrees_of_freedom(fitted: Fitted) -> float:
     """Return the degrees of freedom of the coarsest level that scatters.
 
-    This is the number of its units less the degrees of freedom that the model takes from their mean forces.
-    Effects within strokes take none. For specimens the levels and aging laws are counted. It is 0 if the
-    model takes those of nearly all runs: their scatter is not estimable then.
+    This is the number of its units less what the model takes from their mean forces; for specimens the levels
+    and aging laws are counted. It is 0 if the model takes those of nearly all runs: their scatter is not
+    estimable then.
     """
     starts = fitted.rows.groups.starts
     if starts["run"].size - _taken(fitted, "run") < LEAST_SPARE_RUNS:
@@ -304,10 +279,7 @@ def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
 
 
 def sandwiches(fitted: Fitted) -> list[Sandwich]:
-    """Return the sandwich covariances of specimens, runs and files, down to the first level with many groups.
-
-    Units may differ in parameters that have no variance component, such as v_s of runs.
-    """
+    """Return the sandwich covariances of specimens, runs and files, to the first level with many groups."""
     found, rows, white = [], fitted.rows, fitted.white_jacobian
     for level in reversed(LEVELS[1:]):
         starts = rows.groups.starts[level]
@@ -329,9 +301,9 @@ def sandwiches(fitted: Fitted) -> list[Sandwich]:
 def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Interval]:
     """Return {parameter: (value, lo95, hi95)} of one effect.
 
-    The larger of two standard errors is used: by the variance components, and by the sandwich of the units of
-    the effect's level. An effect that scatters between units would otherwise get too short an interval. The
-    place of a jump is only known to lie between two neighbouring values of the channel.
+    The larger of two standard errors is used, by the variance components and by the sandwich of the units of
+    the effect's level, as the effect may scatter between units. The place of a jump is only known to lie
+    between two neighbouring values of the channel.
     """
     term = fitted.model.terms[number]
     held = dict(term.fixed.get("held", {}))
@@ -386,8 +358,8 @@ def mean_half_width(
     """Return half the 95 % interval of the model's force, shape (n,): the largest of several.
 
     One uses the covariance by the variance components, shape (p, p), with `df` degrees of freedom. The others
-    are sandwiches of whole groups, each with Satterthwaite's degrees of freedom at this point. They are not
-    used where one group alone determines the force. The tangent at the points has shape (n, p).
+    are sandwiches, each with Satterthwaite's degrees of freedom at this point, except where one group alone
+    determines the force. The tangent at the points has shape (n, p).
     """
     half = t_quantile(df) * mean_se(tangent, covariance)
     for covariance_of_groups, information in others:
@@ -396,8 +368,7 @@ def mean_half_width(
             parts = [tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information]
             share = np.maximum(parts, 0.0)
             share /= np.maximum(share.sum(axis=0), 1e-300)
-            reach = np.where(
-                share.max(axis=0) > LARGEST_LEVERAGE, 0.0, stdtrit(satterthwaite_df(share), 0.975)
-            )
+            reach = stdtrit(satterthwaite_df(share), 0.975)
+            reach[share.max(axis=0) > LARGEST_LEVERAGE] = 0.0
         half = np.maximum(half, reach * mean_se(tangent, covariance_of_groups))
     return half

@@ -26,12 +26,10 @@ from sealfit.ingest.columns import condition_columns
 from sealfit.tables import CALENDAR
 
 # ---------------------------------------------------------------- aliases
-# Effects that are not distinguishable from the model with these runs.
-#
 # A sensor offset in a campaign with one direction is the same as friction; a drift over time, with one
-# specimen tested after the other, is the same as aging. The residual does not contain them, so the design is
-# searched for them: of an alias, less than 1 % is left after projection off the tangent space of the model,
-# for all its parameters and targets.
+# specimen tested after the other, is the same as aging. The residual does not contain such aliases. Of each,
+# less than 1 % is left after projection off the tangent space of the model, for all its parameters and
+# targets.
 
 SIZE = 0.01  # Assumed size of an alias, as a share of the RMS force.
 NEGLIGIBLE = 1e-6  # A shape of amplitude 1 with a smaller RMS has no effect here.
@@ -48,10 +46,7 @@ class Alias:
 
 
 def find_aliases(fitted: Fitted, effects: Mapping[str, Effect], taken: tuple[str, ...]) -> list[Alias]:
-    """Return the physical effects that are not distinguishable from the model with these runs.
-
-    `taken` are the channels that define a condition: the model already has parameters per series.
-    """
+    """Return the physical effects of channels not `taken` that are the same as the model with these runs."""
     known = set(fitted.rows.channels) - set(taken)
     own = [e for e in effects.values() if e.physical and CHANNEL not in e.reads and set(e.reads) <= known]
     found = []
@@ -81,9 +76,8 @@ def _at_grid(
     searched = grid_of(effect, rows.unsigned(effect.reads[0]))
     for point in itertools.product(*searched.values()):
         at = {**effect.start(), **dict(zip(searched, point, strict=True))}
-        for name, shape in zip(
-            effect.linear, mean_derivatives(term, at, rows, only_linear=True), strict=True
-        ):
+        shapes = mean_derivatives(term, at, rows, only_linear=True)
+        for name, shape in zip(effect.linear, shapes, strict=True):
             column = slope * shape
             if np.isfinite(shape).all() and (column**2).mean() > NEGLIGIBLE**2 * (slope**2).mean():
                 white = fitted.whitening(column[:, None])[:, 0]
@@ -105,8 +99,6 @@ def _alias(fitted: Fitted, term: Term, values: Mapping[str, float], column: np.n
 
 
 # ---------------------------------------------------------------- next runs
-# Runs to make next: where rival models differ most, at tested and untested combinations of channels.
-
 BEYOND = 0.5  # Share of a channel's range by which a run may exceed it.
 SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
 DISTINCT = 0.1  # Least difference between two models that a run is to show, as a share of the RMSE.
@@ -114,6 +106,10 @@ TIE = 1e-9  # Relative difference below which two runs differ by rounding only.
 LONGER_STROKES = (
     "would show effects along the strokes, which end before the friction is steady: slide eleven times the "
     "length of the rise to 63 %"
+)
+SLOWER_SPEED = (
+    "would help to determine the Stribeck curve, which needs four speeds in one direction, two of them below "
+    "about 2 v_s: a slower speed at every condition"
 )
 SECOND_SPECIMEN = (
     "would show the scatter of specimens, which these do not determine, and no interval has it: "
@@ -126,15 +122,9 @@ ROWS = 4  # Rows per stroke at which forces are compared.
 def next_runs(
     selection: Selection, config: Config, effects: Mapping[str, Effect], outliers: Sequence[OutlierFile] = ()
 ) -> list[dict]:
-    """Return the runs that would distinguish effects from rivals, and those that would show aliases.
+    """Return the runs to repeat, those that would distinguish effects from rivals or would show aliases.
 
-    The runs of files that were left out come first: they are to be repeated. Then there is a run for each
-    effect, which would distinguish it from its nearest rival, and a run for each alias, which would show it.
-
-    Returns
-    -------
-    list of dict
-        `why`, a text, and `conditions`: the condition and the channels of one run.
+    Each is a dict of `why`, a text, and `conditions`, the condition and the channels of one run.
     """
     wanted = [_run_to_repeat(one, config) for one in outliers]
     for item in selection.added:
@@ -185,10 +175,8 @@ def _run_to_repeat(one: OutlierFile, config: Config) -> dict:
     if one.instead:
         others = " or ".join(one.instead)
         done = f"was kept, as {others} may be the wrong file instead: look at them, and repeat their runs"
-    return {
-        "why": f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and {done}",
-        "conditions": _settings(one.conditions, names),
-    }
+    why = f"file {one.file} is {abs(one.deviation):.0%} {side} what all others predict and {done}"
+    return {"why": why, "conditions": _settings(one.conditions, names)}
 
 
 def _slower_speed(fitted: Fitted, config: Config) -> list[dict]:
@@ -200,9 +188,7 @@ def _slower_speed(fitted: Fitted, config: Config) -> list[dict]:
     series = series_of_curve(rows.conditions, rows.has_aging)[rows.condition]
     row = rows.table.iloc[int(np.argmax(series == few[0]))].copy()
     row["speed_mm_s"] = float(np.abs(rows.speed[series == few[0]]).min()) / 2
-    why = "would help to determine the Stribeck curve, which needs four speeds in one direction, two of them "
-    why += "below about 2 v_s: a slower speed at every condition"
-    return [{"why": why, "conditions": _settings(row, (*condition_columns(config), "speed_mm_s"))}]
+    return [{"why": SLOWER_SPEED, "conditions": _settings(row, (*condition_columns(config), "speed_mm_s"))}]
 
 
 def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effect]) -> Iterator[dict]:
@@ -217,10 +203,8 @@ def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effe
         found = largest_difference(*models, fitted.rows, channels, config, untested=True)
         if found is not None and found[1] > SHOWN * first.size_N:
             names = " or ".join(describe(a.term, fitted.rows) for a in aliases)
-            yield {
-                "why": f"would show {names}, which is not distinguishable from the model with these runs",
-                "conditions": found[0],
-            }
+            why = f"would show {names}, which is not distinguishable from the model with these runs"
+            yield {"why": why, "conditions": found[0]}
 
 
 def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
@@ -230,11 +214,10 @@ def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
     count = fitted.rows.groups.starts["specimen"].size
     few = "one specimen is" if count == 1 else f"{count} specimens are"
     label = describe(item.proposal.term, fitted.rows)
-    return {
-        "why": f"{few} too few to distinguish {label} from the scatter of specimens: "
-        "test a second specimen of the same conditions, here first",
-        "conditions": _settings(fitted.rows.table.iloc[k], (*condition_columns(config), "speed_mm_s")),
-    }
+    why = f"{few} too few to distinguish {label} from the scatter of specimens: "
+    why += "test a second specimen of the same conditions, here first"
+    conditions = _settings(fitted.rows.table.iloc[k], (*condition_columns(config), "speed_mm_s"))
+    return {"why": why, "conditions": conditions}
 
 
 def largest_difference(
@@ -249,8 +232,7 @@ def largest_difference(
     """Return the run at which two models differ most, and the difference (force unit); None if there is none.
 
     Every tested run is tried with each combination of low, median and high values of the channels of their
-    effects, so that channels which were confounded in the campaign (a condition and the calendar) are
-    separated. With `untested`, a combination whose largest difference is at a tested run is passed over.
+    effects. With `untested`, a combination whose largest difference is at a tested run is passed over.
     """
     every, rows = rows, rows.sparse(ROWS)
     channels = tuple(dict.fromkeys(channels))
@@ -300,10 +282,7 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
 
 
 def _followed(rows: Rows, channels: Sequence[str]) -> dict[str, str]:
-    """Return the channels whose order is that of an earlier one, and which that is.
-
-    Days are no such channel: what was confounded with them in the campaign is to be separated.
-    """
+    """Return the channels, but for days, whose order is that of an earlier one, and which that is."""
     found: dict[str, str] = {}
     numeric = [n for n in channels if n not in ("direction", AGING) and rows.unsigned(n).dtype.kind == "f"]
     ranks = {name: pd.Series(rows.unsigned(name)).rank() for name in numeric}

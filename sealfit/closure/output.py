@@ -35,12 +35,15 @@ from sealfit.store.paths import needed
 from sealfit.tables import CHANNELS, CURVES, SHAPE_POINTS, SHAPES
 
 # ---------------------------------------------------------------- model record
-# The fitted model as plain data for `predict`, written to OUT/model.json.
 
 
 def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
-    """Return both fitted models with covariance, scatter and tested ranges as JSON values."""
-    rows = after.rows
+    """Return OUT/model.json: both fitted models with covariance, scatter and tested ranges."""
+    rows, declared, scatter = after.rows, after.model.declared, after.scatter
+    series = rows.conditions["series"].to_numpy(dtype=object)[rows.condition]
+    speeds = {
+        name: tested_speeds(rows, np.flatnonzero(series == name)).tolist() for name in pd.unique(series)
+    }
     # The folder of user effects is an argument of a prediction.
     own_config = config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
     return {
@@ -50,10 +53,10 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         "has_load": rows.has_load,
         "has_aging": rows.has_aging,
         "declared": {
-            "parameters": [[p.quantity, p.owner] for p in after.model.declared.parameters],
-            "index": {q: after.model.declared.index[q].tolist() for q in QUANTITIES},
-            "stribeck": dict(after.model.declared.stribeck),
-            "law": {k: bool(v) for k, v in after.model.declared.law.items()},
+            "parameters": [[p.quantity, p.owner] for p in declared.parameters],
+            "index": {q: declared.index[q].tolist() for q in QUANTITIES},
+            "stribeck": dict(declared.stribeck),
+            "law": {k: bool(v) for k, v in declared.law.items()},
         },
         "before": _model(before.model),
         "after": _model(after.model),
@@ -67,18 +70,17 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         ],
         "df": degrees_of_freedom(after),
         "scatter": {
-            "s0": float(after.scatter.s0),
-            "g": float(after.scatter.g),
-            "alike": float(after.scatter.design_effect),
-            "shape": float(after.scatter.shape),
+            "s0": float(scatter.s0),
+            "g": float(scatter.g),
+            "alike": float(scatter.design_effect),
+            "shape": float(scatter.shape),
             "of_specimens": after.knows_specimens,
             "components": [
-                {"level": c.level, "kind": c.kind, "variance": float(c.variance)}
-                for c in after.scatter.components
+                {"level": c.level, "kind": c.kind, "variance": float(c.variance)} for c in scatter.components
             ],
         },
         "ranges": _ranges(rows),
-        "speeds_mm_s": _speeds(rows),
+        "speeds_mm_s": speeds,
     }
 
 
@@ -114,32 +116,16 @@ def _ranges(rows: Rows) -> dict:
     return ranges
 
 
-def _speeds(rows: Rows) -> dict[str, list[float]]:
-    """Return the tested speeds of each series, without signs."""
-    series = rows.conditions["series"].to_numpy(dtype=object)[rows.condition]
-    return {name: tested_speeds(rows, np.flatnonzero(series == name)).tolist() for name in pd.unique(series)}
-
-
 def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[Model, Model, pd.DataFrame]:
     """Return the models before and after and the table of conditions from a record as of `to_record`.
 
-    None of the record is executed. `own` are the user's own effects, by id.
-
-    Raises
-    ------
-    RequestError
-        If the model has an effect that is neither in the catalogue nor in `own`.
-    ParameterError
-        If the values of an effect are not those that it has.
+    None of the record is executed. `own` are the user's own effects, by id. RequestError if the model has an
+    effect that is not known; ParameterError if the values of an effect are not those that it has.
     """
     raw = record["declared"]
-    declared = Declared(
-        tuple(JointParameter(*p) for p in raw["parameters"]),
-        {q: np.array(v, dtype=int) for q, v in raw["index"].items()},
-        raw["stribeck"],
-        raw["law"],
-        {},  # it is not fitted again
-    )
+    parameters = tuple(JointParameter(*p) for p in raw["parameters"])
+    index = {q: np.array(v, dtype=int) for q, v in raw["index"].items()}
+    declared = Declared(parameters, index, raw["stribeck"], raw["law"], {})  # it is not fitted again
     effects = {**EFFECTS, **(own or {})}
     ids = {term["id"] for stage in ("before", "after") for term in record[stage]["terms"]}
     if unknown := sorted(ids - effects.keys() - FREE.keys()):
@@ -151,22 +137,15 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
             fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in raw_term["fixed"].items()}
             effect = free_effect(raw_term["id"], fixed) if raw_term["id"] in FREE else effects[raw_term["id"]]
             own = (raw_term["acts_on"], raw_term["operation"], fixed, raw_term.get("smoothness"))
-            term = Term(effect, tuple(raw_term["channels"]), *own)
-            model = model.with_term(_fitting(term, raw_term["values"]), raw_term["values"])
+            channels, values = tuple(raw_term["channels"]), raw_term["values"]
+            if len(channels) != len(effect.reads) or values.keys() != {p.name for p in effect.parameters}:
+                raise ParameterError(f"effect {effect.id}: its channels or parameters are others.")
+            model = model.with_term(Term(effect, channels, *own), values)
         models.append(model)
     return models[0], models[1], pd.DataFrame(record["conditions"])
 
 
-def _fitting(term: Term, values: Mapping[str, float]) -> Term:
-    """Return the term; ParameterError unless its channels and parameters are those of its effect."""
-    effect = term.effect
-    if len(term.channels) != len(effect.reads) or values.keys() != {p.name for p in effect.parameters}:
-        raise ParameterError(f"effect {effect.id}: its channels or parameters are others.")
-    return term
-
-
 # ---------------------------------------------------------------- plot tables
-# Tables for the plots of the loop: residual by channel, effect shapes, force against speed.
 
 GROUPS = 12  # Groups of a numeric channel in the residual plot.
 POINTS = 60  # Points of a plotted curve.
@@ -198,10 +177,11 @@ def channel_table(selection: Selection, before: Fitted, after: Fitted) -> pd.Dat
             for stage, fitted in (("before", before), ("after", after)):
                 weight, residual = rows.weight[inside], (fitted.residual * sign)[inside]
                 record[f"{stage}_N"] = mean = weight @ residual / weight.sum()
-                record[f"{stage}_half_N"] = _half_width(
-                    weight * (residual - mean) / weight.sum(), units[inside]
-                )
-                record[f"{stage}_run"] = _farthest(runs[inside], weight, residual)
+                parts = weight * (residual - mean) / weight.sum()
+                record[f"{stage}_half_N"] = _half_width(parts, units[inside])
+                sums = pd.DataFrame({"weight": weight, "residual": weight * residual}).groupby(runs[inside])
+                farthest = (sums["residual"].sum() / sums["weight"].sum()).abs().idxmax()
+                record[f"{stage}_run"] = farthest
             records.append(record)
     return pd.DataFrame(records, columns=CHANNELS.names())
 
@@ -235,12 +215,6 @@ def _grouped(values: np.ndarray, *, numeric: bool, groups: int = GROUPS) -> tupl
     return code, list(middle), [None] * middle.size
 
 
-def _farthest(run: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> str:
-    """Return the run with the largest mean residual."""
-    sums = pd.DataFrame({"weight": weight, "residual": weight * residual}).groupby(run).sum()
-    return (sums["residual"] / sums["weight"]).abs().idxmax()
-
-
 def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
     """Return each effect's shape along its channel with a 95 % band, and the corresponding free shape.
 
@@ -254,9 +228,8 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
         covariance = robust_covariance(after, "file") if "held" in term.fixed else after.covariance
         inputs, x, labels = _along(term, values, after.rows, first)
         value = np.asarray(term.effect.shape(inputs, **values), dtype=float)
-        tangent = np.column_stack(
-            [np.broadcast_to(d, value.shape) for d in term_derivatives(term, values, inputs)]
-        )
+        derivatives = term_derivatives(term, values, inputs)
+        tangent = np.column_stack([np.broadcast_to(d, value.shape) for d in derivatives])
         se = mean_se(Tangent.dense(tangent), covariance[place, place])
         free = _free_shape(after, number, x)
         unit = parameter_unit("{y}", term, config.units)
@@ -278,8 +251,7 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
 
     The residual is divided by the force's derivative with respect to the shape, by weighted least squares in
     groups of the first channel's values (Larsen and McCleary 1972, Technometrics 14(3), 781-790). Standard
-    errors are from whole files, or from the strokes of a single one. Of a periodic effect all periods are
-    shifted onto those that are drawn.
+    errors are from whole files, or from the strokes of a single one. All periods are shifted onto the drawn.
     """
     rows, parts = after.rows, []
     units = rows.codes("file" if rows.groups.starts["file"].size > 1 else "stroke")
@@ -301,10 +273,11 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
         change = np.bincount(code, weighted * residual) / size
         left = np.zeros((size.size, unit.max() + 1))
         np.add.at(left, (code, unit), weighted * (residual - slope * change[code]))
-        shape = (
-            np.interp(x, own["x"], own["value"]) if numeric else own.set_index("label").loc[labels, "value"]
-        )
-        part = 1 + np.asarray(shape) if term.operation == "multiply" else 1.0  # which the slope has in it
+        if numeric:
+            shape = np.interp(x, own["x"], own["value"])
+        else:
+            shape = own.set_index("label").loc[labels, "value"].to_numpy()
+        part = 1 + shape if term.operation == "multiply" else 1.0  # which the slope has in it
         se = np.abs(part) * np.sqrt((left**2).sum(axis=1)) / size
         found = {"effect": number, "channel": first, "x": x, "label": labels}
         found |= {"value": shape + part * change, "se": se, "unit": own["unit"].iloc[0]}
@@ -315,7 +288,10 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
 def _along(
     term: Term, parameters: Mapping[str, float], rows: Rows, first: str
 ) -> tuple[dict, np.ndarray, list | None]:
-    """Return inputs along one of a term's channels, others at their means, and its values or categories."""
+    """Return inputs along one of a term's channels, and its values or categories.
+
+    Other channels are at their mean, at their 90 % quantile if the effect grows with them, or a category.
+    """
     values = rows.unsigned(first)
     if values.dtype.kind != "f":
         labels = [str(c) for c in np.unique(values)]
@@ -329,18 +305,16 @@ def _along(
         x = spaced(low, high, 4 * POINTS if high < values.max() else POINTS)
     inputs = {}
     for name, channel in zip(term.effect.reads, term.channels, strict=True):
-        far = name == SECOND and term.effect.id != SURFACE
-        inputs[name] = x if channel == first else np.full(x.size, _usual(rows.values(channel), far=far))
+        others = rows.values(channel)
+        if channel == first:
+            inputs[name] = x
+        elif others.dtype.kind != "f":
+            inputs[name] = np.full(x.size, str(np.unique(others)[0]))
+        else:
+            far = name == SECOND and term.effect.id != SURFACE
+            inputs[name] = np.full(x.size, np.quantile(others, 0.9) if far else np.abs(others).mean())
     fixed = {key: value for key, value in term.fixed.items() if key != "shift"}
     return {**inputs, **fixed}, x, None
-
-
-def _usual(values: np.ndarray, *, far: bool) -> float | str:
-    """Return a second channel's value in a plot: its mean, the 90 % quantile if `far`, or a category."""
-    if values.dtype.kind != "f":
-        return str(np.unique(values)[0])
-    size = np.abs(values)
-    return float(np.quantile(values, 0.9)) if far else float(size.mean())
 
 
 def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
@@ -348,20 +322,14 @@ def _free_shape(after: Fitted, number: int, x: np.ndarray) -> np.ndarray | None:
 
     It is None beside another free shape of the same channel and quantity too: only their sum is identifiable.
     """
-    term = after.model.terms[number]
+    term, rows, name = after.model.terms[number], after.rows, after.model.terms[number].channels[0]
     free_shapes = [(t.channels, t.target) for t in after.model.terms if t.effect.id == SMOOTH]
-    if (
-        len(term.channels) != 1
-        or term.effect.periodic
-        or term.effect.id in (SMOOTH, LEVELS)
-        or np.isnan(x).any()
-    ):
+    shown = term.effect.periodic or term.effect.id in (SMOOTH, LEVELS) or np.isnan(x).any()
+    beside = (term.channels, term.target) in free_shapes
+    if shown or beside or len(term.channels) != 1 or name == "direction":
         return None
-    if term.channels[0] == "direction" or (term.channels, term.target) in free_shapes:
-        return None
-    rows = after.rows
-    values = np.abs(rows.speed) if term.channels[0] == "speed_mm_s" else rows.values(term.channels[0])
-    free = free_term(Channel(term.channels[0], values, unit_of(values, rows)), *term.target)
+    values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
+    free = free_term(Channel(name, values, unit_of(values, rows)), *term.target)
     model = after.model.without_term(number).with_term(free, {p.name: 0.0 for p in free.effect.parameters})
     fitted = fit(model, rows, after.scatter, turns=0)
     shape = free.effect.shape({free.effect.reads[0]: x, **free.fixed}, **fitted.model.values[-1])

@@ -80,9 +80,8 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
             others.append(Sandwich(np.array(own["covariance"]), information))
         half = mean_half_width(tangent, np.array(model["covariance"]), model["df"], others)
         half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, at, mean))
-        spread = reach * np.sqrt(
-            (half / reach) ** 2 + _one_measurement(model["scatter"], loads_of(after, at))
-        )
+        one = _one_measurement(model["scatter"], loads_of(after, at))
+        spread = reach * np.sqrt((half / reach) ** 2 + one)
         forces = (evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half)
         answer[good] = np.column_stack([*forces, mean - spread, mean + spread])
     return points.reset_index(drop=True).assign(
@@ -111,12 +110,9 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
             table[name] = tested[0]
             continue
         unit = config.units.of(name)
-        raise RequestError(
-            "is missing, and the model needs it.",
-            column=name,
-            fix=f"Add the column{f' in {unit}' if unit else ''}"
-            + (f"; tested from {tested[0]:g} to {tested[1]:g}." if _is_range(tested) else "."),
-        )
+        fix = f"Add the column{f' in {unit}' if unit else ''}"
+        fix += f"; tested from {tested[0]:g} to {tested[1]:g}." if _is_range(tested) else "."
+        raise RequestError("is missing, and the model needs it.", column=name, fix=fix)
     if "speed_mm_s" not in table:
         table["speed_mm_s"] = ranges["speed_mm_s"][0]
     return table
@@ -155,9 +151,9 @@ def _conditions(
 ) -> tuple[Model, Model, pd.DataFrame, np.ndarray]:
     """Return the models with the points' conditions added, and each point's condition; -1 if it has none."""
     keys = add_keys(table, config)
-    days = (
-        pd.to_numeric(table["aging_days"], errors="coerce") if config.aging else pd.Series(0.0, table.index)
-    )
+    days = np.zeros(len(table))
+    if config.aging:
+        days = pd.to_numeric(table["aging_days"], errors="coerce").to_numpy(dtype=float)
     known = {name: k for k, name in enumerate(conditions["condition"])}
     declared = after.declared
     added, like = [], []  # conditions that were not tested, and for each one that was, with the same law
@@ -170,7 +166,7 @@ def _conditions(
         if name not in known:
             same = np.flatnonzero((conditions["series"] == series) & (conditions["rubber"] == rubber))
             lawful = same[declared.index["a_c"][same] >= 0]
-            if not lawful.size or not 0 <= days.iloc[k] < OVERLOAD:
+            if not lawful.size or not 0 <= days[k] < OVERLOAD:
                 fix = f"give a tested condition, such as {conditions['condition'].iloc[0]}"
                 law = ""
                 if config.aging:
@@ -180,7 +176,7 @@ def _conditions(
                 continue
             known[name] = len(known)
             keys_of = {"condition": name, "series": series, "rubber": rubber}
-            added.append({**keys_of, "aging_days": float(days.iloc[k])})
+            added.append({**keys_of, "aging_days": float(days[k])})
             like.append(lawful[0])
         code[k] = known[name]
     full = pd.concat([conditions, pd.DataFrame(added)], ignore_index=True) if added else conditions
@@ -236,9 +232,8 @@ def _outside(
         tested = np.array(model["speeds_mm_s"][series[code[k]]])
         if tested.size < SPEEDS_BETWEEN and not (np.abs(speed[k] / tested - 1) < NEAR_TESTED_SPEED).any():
             outside[k] = True
-            notes[k].append(
-                f"too few speeds for the friction between them; tested: {', '.join(f'{v:g}' for v in tested)}"
-            )
+            speeds = ", ".join(f"{v:g}" for v in tested)
+            notes[k].append(f"too few speeds for the friction between them; tested: {speeds}")
     read = ["speed_mm_s", *(["load_N"] if model["has_load"] else [])]
     read += [name for term in after.terms for name in term.channels]
     for name in dict.fromkeys(read):

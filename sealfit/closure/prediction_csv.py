@@ -23,10 +23,7 @@ ANSWERS = (
 def read_points(path: Path) -> pd.DataFrame:
     """Return the rows of a CSV of points (comma, UTF-8, one line of names) as text.
 
-    Raises
-    ------
-    RequestError
-        If the file does not exist or is not such a CSV; with the line.
+    RequestError, with the line, if the file does not exist or is not such a CSV.
     """
     try:
         raw = existing_file(path, "table of points").read_text("utf-8-sig")
@@ -75,10 +72,7 @@ def _refuse_names(names: list[str], **place: object) -> None:
 def points_of(frame: pd.DataFrame) -> pd.DataFrame:
     """Return points as `predict` takes them: numbers in numeric columns, as a CSV of them would give.
 
-    Raises
-    ------
-    RequestError
-        If it has no rows, a column twice, or a column of the answer.
+    RequestError if it has no rows, a column twice, or a column of the answer.
 
     Examples
     --------
@@ -114,22 +108,15 @@ def _no_formula(cell: str) -> str:
     try:
         float(cell)
     except ValueError:
-        return f"'{cell}" if cell.lstrip()[:1] in FORMULA and cell.strip() else cell
+        return f"'{cell}" if cell.lstrip().startswith(FORMULA) else cell
     return cell
 
 
 def write_answers(points: pd.DataFrame, answers: pd.DataFrame, output: Path, *, given: Path) -> dict:
     """Write the rows of file `given` and their predictions to `output`, completely or not at all.
 
-    Return the counts. The cells of the points are written unchanged, except those that a spreadsheet would
-    take as a formula.
-
-    Raises
-    ------
-    RequestError
-        If `output` is the table of points itself, or no name for a CSV.
-    OutError
-        If it cannot be written.
+    Return the counts. Cells that a spreadsheet would take as a formula get an apostrophe. RequestError if
+    `output` is the table of points itself, or no name for a CSV; OutError if it cannot be written.
     """
     if output.exists() and output.resolve() == given.resolve():
         raise RequestError(f"--output {output} is the table of points.", fix="Give another name.")
@@ -139,10 +126,8 @@ def write_answers(points: pd.DataFrame, answers: pd.DataFrame, output: Path, *, 
         what = "a folder" if output.is_dir() else "no file"
         raise RequestError(f"--output {output} is {what}.", fix="Give a file name.")
     if output.exists() and output.suffix.lower() != ".csv":  # such as a config, or a file of OUT
-        raise RequestError(
-            f"--output {output} is there, and its name is not that of a CSV.",
-            fix="Give a name that ends in .csv.",
-        )
+        what = f"--output {output} is there, and its name is not that of a CSV."
+        raise RequestError(what, fix="Give a name that ends in .csv.")
     # `answers` has the same rows in the same order.
     table = pd.concat([points.map(_no_formula), answers[list(ANSWERS)].reset_index(drop=True)], axis=1)
     table.columns = [_no_formula(name) for name in table.columns]

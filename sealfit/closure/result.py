@@ -83,26 +83,17 @@ class BeforeAfter:
         return self._ratios(None)[1] < criteria.HALVED
 
     def _ratios(self, around: str | None) -> tuple[float, float]:
-        """Return the ratio of errors after and before, in sample and held out (1 if nothing was held out).
-
-        Errors about the means of runs or finer groups do not need the force to be determined.
-        """
-        rows, weight = self.before.rows, self.before.rows.weight
-        inside = [weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
+        """Return the ratio of errors after and before, in sample and held out (1 if nothing was held out)."""
+        rows, held = self.before.rows, (self.held_before, self.held_after)
+        inside = [rows.weight @ about_means(f.residual, rows, around) ** 2 for f in (self.before, self.after)]
         known = np.isfinite(self.held_before) & np.isfinite(self.held_after) & self.covered
-        if around in (None, "specimen"):
+        if around in (None, "specimen"):  # else the level of the force need not be determined
             known &= self.determined
-        held = [1.0, 1.0]
+        outside = [1.0, 1.0]
         if known.any():
             test = rows.subset(known)
-            left = [
-                about_means(test.force - h[known], test, around) for h in (self.held_before, self.held_after)
-            ]
-            held = [test.weight @ own**2 for own in left]
-        in_sample, held_out = (
-            float(np.sqrt(after / max(before, 1e-300))) for before, after in (inside, held)
-        )
-        return in_sample, held_out
+            outside = [test.weight @ about_means(test.force - h[known], test, around) ** 2 for h in held]
+        return tuple(float(np.sqrt(after / max(before, 1e-300))) for before, after in (inside, outside))
 
 
 def closure_document(
@@ -115,18 +106,15 @@ def closure_document(
 ) -> dict:
     """Return closure.json."""
     after, units = models.after, config.units
-    numbers = {
-        name: {
+    numbers = {}
+    held_out = (("before", models.before, models.held_before), ("after", after, models.held_after))
+    for name, fitted, held in held_out:
+        numbers[name] = {
             **errors(fitted.rows, fitted.residual),
             "heldout_rmse_N": models.heldout_rmse_N(held),
             "heldout_extrapolated_rmse_N": models.heldout_rmse_N(held, extrapolated=True),
             "lack_of_fit_p": lack_of_fit(fitted),
         }
-        for name, fitted, held in (
-            ("before", models.before, models.held_before),
-            ("after", after, models.held_after),
-        )
-    }
     floor, scatter = noise_floor(after), scatter_list(after)
     quality = fit_quality(numbers["after"], floor)
     seen = sensitivity(selection, config.loop.family_error)
@@ -136,15 +124,13 @@ def closure_document(
     significant = bool(selection.worse) or (selection.left is not None and not only_unclaimable)
     # What remains beside effects that were found may be less than repeats scatter by.
     small = bool(selection.added) and not selection.worse and (quality["ratio"] or np.inf) <= 1.0
+    undecided = only_unclaimable or any(not item.negligible for item in selection.refused)
+    unseen = undetectable and quality["state"] != "within_scatter"
     if significant and not small:
         verdict = "unexplained"
     elif selection.added:
         verdict = "closed"
-    elif only_unclaimable:
-        verdict = "cannot_tell"
     else:
-        undecided = any(not item.negligible for item in selection.refused)
-        unseen = undetectable and quality["state"] != "within_scatter"
         verdict = "cannot_tell" if undecided or unseen else "nothing_missing"
     return {
         "schema": 1,
@@ -196,11 +182,9 @@ def _identity(term: Term, rows: Rows) -> dict:
 def effect_entries(after: Fitted, selection: Selection, config: Config) -> list[dict]:
     """Return closure.json's `effects`: one per term of the after-model, then the inconclusive candidate."""
     entries = [_entry(after, number, item, config) for number, item in enumerate(selection.added)]
-    if selection.inconclusive is not None:
-        alone = selection.inconclusive.proposal.fitted
-        entries.append(
-            {**_entry(alone, len(alone.model.terms) - 1, selection.inconclusive, config), "candidate": True}
-        )
+    if (item := selection.inconclusive) is not None:
+        alone = item.proposal.fitted
+        entries.append({**_entry(alone, len(alone.model.terms) - 1, item, config), "candidate": True})
     return entries
 
 
@@ -211,18 +195,14 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
     intervals = effect_intervals(after, number, proposal.unit)
     if own_phase:
         intervals["phi"] = (None, None, None)
-    smooth = ""
+    form = form_of(term)
     if term.smoothness is not None:
-        smooth = f"; smooth, {effective_df(after, number):.1f} effective degrees of freedom"
-    parameters = [
-        {
-            "name": p.symbol,
-            "value": intervals[p.name][0],
-            "ci95": list(intervals[p.name][1:]),
-            "unit": parameter_unit(p.unit, term, config.units),
-        }
-        for p in term.effect.parameters
-    ]
+        form += f"; smooth, {effective_df(after, number):.1f} effective degrees of freedom"
+    parameters = []
+    for p in term.effect.parameters:
+        value, *ci95 = intervals[p.name]
+        unit = parameter_unit(p.unit, term, config.units)
+        parameters.append({"name": p.symbol, "value": value, "ci95": ci95, "unit": unit})
     return {
         "id": term.effect.id,
         "label": describe(term, after.rows) + (", separate phase per stroke" if own_phase else ""),
@@ -231,7 +211,7 @@ def _entry(after: Fitted, number: int, item: AcceptedEffect, config: Config) -> 
         "acts_on": term.acts_on,
         "operation": term.operation,
         "reference": reference_of(term, after.model.values[number], config),
-        "form": form_of(term) + smooth,
+        "form": form,
         "named": proposal.named,
         "candidate": False,
         "parameters": parameters,
@@ -307,9 +287,8 @@ def effect_table(entries: Sequence[dict], added: Sequence[AcceptedEffect]) -> pd
 def left_entry(selection: Selection, rmse_N: float, floor_N: float | None) -> dict:
     """Return closure.json's `left`: the error above the noise floor and the residual's strongest structure.
 
-    This is what is still significant, or an effect that was removed because it lowered no error. If there is
-    neither but effects were added, it is the channel that explains most of the residual, which is not
-    significant.
+    This is what is still significant, or an effect that was removed because it lowered no error, or the
+    channel that explains most of the residual of added effects, which is not significant.
     """
     above = float(np.sqrt(max(rmse_N**2 - floor_N**2, 0.0))) if floor_N is not None else None
     level, channel, p_value = _left(selection)
@@ -323,11 +302,8 @@ def _left(selection: Selection) -> tuple[str | None, str | None, float | None]:
         item, rows = selection.worse[-1].proposal, selection.after.rows
         return effect_level(item.term, rows), " ".join(channels_of(item.term, rows)), item.p_value
     if left is None and selection.added:
-        last = [
-            c
-            for c in selection.left_over
-            if c.test_result.log_p <= np.log(criteria.NOT_ADJUSTED) and c.p_value < criteria.CHANCE_P
-        ]
+        last = [c for c in selection.left_over if c.test_result.log_p <= np.log(criteria.NOT_ADJUSTED)]
+        last = [c for c in last if c.p_value < criteria.CHANCE_P]
         left = _unsteady_offset(selection) or _largest(selection.after, last)
     if isinstance(left, Peak):
         return "trace", left.axis, left.p_value
@@ -341,10 +317,9 @@ def _left(selection: Selection) -> tuple[str | None, str | None, float | None]:
 
 
 def _unsteady_offset(selection: Selection) -> Candidate | None:
-    """Return the category that explains most of an unsteady offset between directions, or None.
+    """Return the category that explains most of an offset between directions that differs by run, or None.
 
-    An unsteady offset differs between runs. An offset per condition is fitted first, because it would mask
-    the influence of a set-up. The p-value is adjusted over the categories.
+    An offset per condition is fitted first, because it would mask the influence of a set-up.
     """
     fitted = selection.after
     rows = fitted.rows
