@@ -1,8 +1,7 @@
 """Channels that may explain a residual, and the level at which each varies.
 
-A channel varies at the coarsest level within whose groups it is nearly constant. Measured numbers scatter, so
-exact equality is not required. A category with each of its levels in one group only (a serial number) is a
-grouping and never an effect.
+A channel varies at the coarsest level within whose groups it is nearly constant. A category with each of its
+levels in one group only (a serial number) is a grouping and never an effect.
 """
 
 from __future__ import annotations
@@ -83,8 +82,7 @@ def find_channels(
 ) -> list[Channel]:
     """Return every channel of the rows that varies and is not a grouping or a text with hundreds of values.
 
-    Columns of the condition, `conditions`, are kept even if they are groupings: an offset between directions
-    may differ between conditions.
+    Groupings are kept among `conditions`: an offset between directions may differ between these.
     """
     found = []
     for name in (name for name in rows.channels if name not in ignore):
@@ -184,8 +182,7 @@ def follows_strokes(name: str, rows: Rows) -> bool:
 def without_trends(channel: Channel, rows: Rows) -> Channel | None:
     """Return a column of the traces that does not follow the strokes, less a parabola along each of them.
 
-    Specimens differ in their profiles along strokes, which would hide what the column does. None for other
-    channels.
+    Specimens differ in their profiles, which would hide what the column does. None for other channels.
     """
     if not channel.numeric or channel.unit != "sample" or follows_strokes(channel.name, rows):
         return None

@@ -36,9 +36,7 @@ class Proposal:
     p_value: float
     column: np.ndarray  # (n,) what it adds to the force, whitened and projected
     source: tuple  # key of its candidate
-    linear_size: float | None = (
-        None  # of a penalised shape: effective degrees of freedom before it is refitted
-    )
+    linear_size: float | None = None  # effective degrees of freedom of a penalised shape, not refitted
     fitted: Fitted | None = None
 
     @cached_property

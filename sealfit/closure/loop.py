@@ -95,10 +95,8 @@ def close_loop(
         if not part.whole and (more := missed_by_subsample(on_all_strokes, selection, config)):
             say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
             continue
-        say(
-            f"held out by {heldout.level}"
-            + (": the search repeated without each fold" if heldout.repeats else "")
-        )
+        repeated = ": the search repeated without each fold" if heldout.repeats else ""
+        say(f"held out by {heldout.level}{repeated}")
         with timed("held out", rows=len(heldout.masks), of="folds"):
             held_before, held_after, determined, found = heldout.forces(selection, say)
             within = heldout.covered(after.model)

@@ -95,7 +95,9 @@ def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
     least = np.zeros(flips)
     for units, by_df in by_units.items():
         scores = np.column_stack([own for scores in by_df.values() for own in scores])
-        totals = _flipped(scores, flips, rng)
+        part = max(1, MOST_SIGNS // units)  # a few flips at a time
+        counts = [min(part, flips - first) for first in range(0, flips, part)]
+        totals = np.concatenate([rng.choice([-1.0, 1.0], size=(n, units)) @ scores for n in counts])
         first = 0
         for df, scores in by_df.items():
             most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
@@ -104,13 +106,6 @@ def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
                 first += df
             least = np.minimum(least, log_p_of_score(most, df, units))
     return least
-
-
-def _flipped(scores: np.ndarray, flips: int, rng: np.random.Generator) -> np.ndarray:
-    """Return sums of scores, shape (units, m), under random signs -> (flips, m); a few flips at a time."""
-    part = max(1, MOST_SIGNS // scores.shape[0])
-    sizes = [(min(part, flips - first), scores.shape[0]) for first in range(0, flips, part)]
-    return np.concatenate([rng.choice([-1.0, 1.0], size=size) @ scores for size in sizes])
 
 
 def adjust_small_sample(

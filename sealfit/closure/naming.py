@@ -1,8 +1,7 @@
 """From a channel that explains the residual to an effect: physical effects, closed forms, free shapes.
 
-Every form is fitted to the residual in the tangent space, exactly in its amplitudes and on a grid in its
-nonlinear parameters. The best few are refitted jointly with the model, and the BIC decides. Of equal forms a
-physical effect is preferred to a closed form, and a closed form to a free shape.
+Every form is fitted to the residual in the tangent space. The best few are refitted jointly with the model,
+and the BIC decides. Of equal forms a physical effect is preferred, then a closed form to a free shape.
 """
 
 from __future__ import annotations

@@ -290,7 +290,7 @@ def _along(
 ) -> tuple[dict, np.ndarray, list | None]:
     """Return inputs along one of a term's channels, and its values or categories.
 
-    Other channels are at their mean, at their 90 % quantile if the effect grows with them, or a category.
+    Others are at the mean, a second channel at its 90 % quantile, but for a surface; or a category.
     """
     values = rows.unsigned(first)
     if values.dtype.kind != "f":

@@ -1,9 +1,8 @@
 """Force at new points, before and after, with 95 % intervals of the mean and of one new measurement.
 
-The mean is that of the population, with all random effects (specimen, set-up, repeat) at zero. Its interval
-has the uncertainty of the parameters, which includes the scatter of specimens, runs and files. The interval
-of a measurement adds one draw of each level and the noise of a bin. The sensor's accuracy is not included
-(GUM, type B).
+The mean is that of the population, with all random effects (specimen, set-up, repeat) at zero; its interval
+includes their scatter. The interval of a measurement adds one draw of each level and the noise of a bin. The
+sensor's accuracy is not included (GUM, type B).
 """
 
 from __future__ import annotations
@@ -94,7 +93,10 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
 def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -> pd.DataFrame:
     """Return the points with every column that the model reads: given, derived, or the only tested value."""
     ranges = model["ranges"]
-    table = _with_derived(_with_unaged(points, config).assign(file=""), model)
+    own = points[[name for name in condition_columns(config) if name in points]]
+    cells = own.astype(object).where(own.notna(), None)
+    unaged = with_day_0({name: cells[name].tolist() for name in cells}, config)  # a word may say it
+    table = _with_derived(points.assign(**unaged, file=""), model)
     needed = [*config.condition, *config.rubber]
     if any(form != "constant" for form in after.declared.stribeck.values()) or "speed_mm_s" in points:
         needed.append("speed_mm_s")
@@ -116,13 +118,6 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
     if "speed_mm_s" not in table:
         table["speed_mm_s"] = ranges["speed_mm_s"][0]
     return table
-
-
-def _with_unaged(points: pd.DataFrame, config: Config) -> pd.DataFrame:
-    """Return the points with the days of unaged rubber as 0, where a word says so, as in a runs table."""
-    own = points[[name for name in condition_columns(config) if name in points]]
-    cells = own.astype(object).where(own.notna(), None)
-    return points.assign(**with_day_0({name: cells[name].tolist() for name in cells}, config))
 
 
 def _with_derived(table: pd.DataFrame, model: dict) -> pd.DataFrame:

@@ -1,8 +1,7 @@
 """Renaming of effects that were named while others were still missing.
 
-A missing effect is part of the scatter, so an effect named then is not well distinguished from its rivals: a
-factor from an added force, a line from a logarithm. If a second effect of one channel is found, the first was
-not its whole shape: one effect that fits as well replaces the two.
+A missing effect is part of the scatter, so an effect named then is not well distinguished from its rivals. If
+a second effect of one channel is found, one effect that fits as well replaces the two.
 """
 
 from __future__ import annotations
@@ -106,7 +105,10 @@ class Renaming:
         found: list[Proposal] = []
         if None not in names:
             p_value = min(earlier.proposal.p_value, new.proposal.p_value)
-            found += self._proposals_on(fitted, number, without, self._channels_near(*names), p_value)
+            near = list(dict.fromkeys(names))
+            if all(self.channels[name].unit == "sample" for name in names):  # all channels along strokes
+                near += [name for name in ALONG if name in self.channels and name not in near]
+            found += self._proposals_on(fitted, number, without, near, p_value)
             found += self._products(without, names, p_value)
         better = [p for p in found if _lead(p, two) > p.bic_penalty - penalties - EQUAL_BIC]
         if None not in names and names[0] == names[1] and not any(e.physical for e in effects):
@@ -120,13 +122,6 @@ class Renaming:
             better += [p for p in surfaces if _lead(p, two) > 0 and gain(p).rmse_N > least]
         better = sorted(better, key=lambda p: p.bic)
         return self._confirmed(without, better, new.round) if better else None
-
-    def _channels_near(self, *names: str) -> list[str]:
-        """Return the channels of two effects; if both vary along strokes, all channels that do."""
-        found = list(dict.fromkeys(names))
-        if all(self.channels[name].unit == "sample" for name in names):
-            found += [name for name in ALONG if name in self.channels and name not in found]
-        return found
 
     def _products(self, without: Fitted, names: tuple[str, str], p_value: float) -> Sequence[Proposal]:
         """Return forms of two channels together; none if both are the same channel."""

@@ -166,8 +166,7 @@ def search_pairs(
 ) -> list[Candidate]:
     """Return candidates of pairs, with p-values adjusted over single channels and pairs, strongest first.
 
-    Of the campaign's own columns those that explain least alone (`singles` are sorted) are left out beyond
-    `MOST_PAIRED`.
+    Of the campaign's own columns `MOST_PAIRED` are paired, which explain most alone: `singles` are sorted.
     """
     own = set(open_columns(tests.fitted.rows.table))
     ranked = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in own))
@@ -185,8 +184,7 @@ def equivalent_pairs(
 ) -> list[Candidate]:
     """Return the pairs that are equivalent to a single channel acting on a, b, v_s or sigma_2.
 
-    a describes how mu changes with days, v_s how it changes with speed. The pair explains the same structure,
-    so it is fitted as well as the single channel, whatever its own p-value. The fits decide.
+    a describes how mu changes with days, v_s how it changes with speed. The fits decide.
     """
     best: dict[frozenset, list[Candidate]] = {}
     for single in significant:
@@ -240,9 +238,8 @@ def candidate_of(term: Term, pair: Sequence[Channel], rows: Rows, p_value: float
 def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
     """Return the interaction terms of two channels, blocks of shape (n, k) that are tested one by one.
 
-    The first are products, also of logarithms for channels with a wide range: main effects explain most of a
-    product, and the rest depends on its exact shape. The last is a block of nonlinear terms. Two categories
-    have none.
+    The first are products, also of logarithms for channels with a wide range; the last is a block of
+    nonlinear terms. Two categories have none.
     """
     if not (one.numeric or other.numeric):
         return []

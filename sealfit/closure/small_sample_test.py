@@ -185,25 +185,20 @@ def log_p_of_t(t: np.ndarray, df: np.ndarray) -> np.ndarray:
 def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> tuple[float, float]:
     """Return the prior variance of contrasts of one kind, and its degrees of freedom.
 
-    They follow from the moments of their log variances (Smyth 2004, 6.2).
+    They follow from the moments of their log variances without sampling error (Smyth 2004, 6.2).
     """
     chosen = [(t, t.along == along) for t in tests if t.level == level]
     variance = np.concatenate([t.variance[own] for t, own in chosen])
     df = np.concatenate([t.df[own] for t, own in chosen])
     deviations = np.concatenate([t.deviations[:, own] for t, own in chosen], axis=1)
-    mean, spread = _log_moments(variance, df)
+    half = df / 2
+    logs = np.log(np.maximum(variance, 1e-12)) - psi(half) + np.log(half)
+    mean = float(np.mean(logs))
+    spread = float(np.var(logs, ddof=1) - np.mean(polygamma(1, half))) if logs.size > 1 else 0.0
     known = _degrees_of_freedom(spread)
     half = known / 2
     typical = float(np.exp(mean + (psi(half) - np.log(half) if known < MOST_DF else 0.0)))
     return typical, min(known, (_independent_directions(deviations) - 1) * float(np.median(df)))
-
-
-def _log_moments(variance: np.ndarray, df: np.ndarray) -> tuple[float, float]:
-    """Return mean and variance of the logarithms of the true variances, without sampling error."""
-    half = df / 2
-    logs = np.log(np.maximum(variance, 1e-12)) - psi(half) + np.log(half)
-    spread = float(np.var(logs, ddof=1) - np.mean(polygamma(1, half))) if logs.size > 1 else 0.0
-    return float(np.mean(logs)), spread
 
 
 def _degrees_of_freedom(spread: float) -> float:
