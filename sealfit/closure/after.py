@@ -52,9 +52,8 @@ def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str
         return KEPT
     labels = {name: config.units.label(name) for name in term.channels}
     known = {"x": labels[term.channels[0]], "z": labels[term.channels[-1]], **labels}
-    known |= {
-        name: f"{value:.4g}" for name, value in (*term.fixed.items(), *values.items()) if np.isscalar(value)
-    }
+    numbers = {**term.fixed, **values}
+    known |= {name: f"{value:.4g}" for name, value in numbers.items() if np.isscalar(value)}
     words = term.effect.reference or f"where {term.effect.form} = 0"
     return re.sub(r"\{(\w+)\}", lambda found: str(known.get(found[1], found[1])), words)
 
@@ -300,9 +299,8 @@ def after_fits(
     """Return the tables `*_after` by name; they have no rows if no effect was added and no file left out.
 
     `after` is the after-model, fitted to all bins; `steady` and `traces` are these tables, or where `traces`
-    is stored. The laws of single series are those of the joint fit. Single conditions are fitted to the
-    strokes' forces without the effects; the laws for all series, the pre-sliding fits and the break-away
-    forces follow from them.
+    is stored. The laws of single series are those of the joint fit; the other fits are to the strokes' forces
+    without the effects.
     """
     if not after.model.terms and not left_out:
         return {schema.name: pd.DataFrame(columns=schema.names()) for schema in AFTER}

@@ -25,7 +25,6 @@ from sealfit.effects import EFFECTS
 from sealfit.effects.contract import SECOND, Effect
 from sealfit.effects.free import FREE, LEVELS, SMOOTH, SURFACE, WIDE, free_effect
 from sealfit.errors import ParameterError
-from sealfit.fit.aging.law_table import t_of_95
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
 from sealfit.fit.joint.model import Model, Term, evaluate, term_derivatives
@@ -199,7 +198,7 @@ def _half_width(parts: np.ndarray, units: np.ndarray) -> float:
     sums = np.bincount(np.unique(units, return_inverse=True)[1], parts)
     if sums.size < 2:
         return np.nan
-    return float(t_of_95(sums.size - 1) * np.sqrt(sums @ sums * sums.size / (sums.size - 1)))
+    return float(t_quantile(sums.size - 1) * np.sqrt(sums @ sums * sums.size / (sums.size - 1)))
 
 
 def _grouped(values: np.ndarray, *, numeric: bool, groups: int = GROUPS) -> tuple[np.ndarray, list, list]:

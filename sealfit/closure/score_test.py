@@ -101,9 +101,8 @@ class Candidate:
     @property
     def claimable(self) -> bool:
         """Whether it may be claimed: there are enough units, and two to four specimens are consistent."""
-        return self.consistent and (
-            self.test_result.small_sample is None or self.test_result.small_sample.enough_df
-        )
+        test = self.test_result.small_sample
+        return self.consistent and (test is None or test.enough_df)
 
     @property
     def chi2(self) -> float:
@@ -144,8 +143,7 @@ class ScoreTests:
         """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
 
         The first variant is projected. If the scatter of specimens is not known, the second is also projected
-        off the specimens' own columns: a channel that varies between runs, such as the time since the start,
-        would explain that scatter.
+        off the specimens' own columns: a channel that varies between runs would explain that scatter.
         """
         left = project(self.fitted, columns)
         if self._specimens is None or FINER[unit] >= FINER["specimen"]:

@@ -203,12 +203,8 @@ def equivalent_pairs(
 
 
 def _usable(channels: Sequence[Channel]) -> list[Channel]:
-    return [
-        c
-        for c in channels
-        if not (c.grouping or c.added_only or c.name in NOT_IN_PAIRS)
-        and (c.numeric or np.unique(c.values).size <= criteria.MOST_CATEGORIES)
-    ]
+    own = [c for c in channels if not (c.grouping or c.added_only or c.name in NOT_IN_PAIRS)]
+    return [c for c in own if c.numeric or np.unique(c.values).size <= criteria.MOST_CATEGORIES]
 
 
 def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Candidate]:
@@ -252,11 +248,12 @@ def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
         u = _centred(evenly(number.values))
         levels = np.unique(category.values)
         blocks = [(category.values[:, None] == levels[None, 1:]) * u[:, None]]
-    sizes = [np.sqrt((columns**2).mean(axis=0)) for columns in blocks]
-    blocks = [
-        columns[:, size > 1e-9] / size[size > 1e-9] for columns, size in zip(blocks, sizes, strict=True)
-    ]
-    return [columns for columns in blocks if columns.shape[1]]
+    found = []
+    for columns in blocks:
+        size = np.sqrt((columns**2).mean(axis=0))
+        if (size > 1e-9).any():
+            found.append(columns[:, size > 1e-9] / size[size > 1e-9])
+    return found
 
 
 def _scales(channel: Channel) -> list[np.ndarray]:

@@ -321,8 +321,7 @@ def _related_candidates(significant: list[Candidate], candidates: list[Candidate
     """Return further candidates that may explain the same structure as the significant ones.
 
     These are the same channel on other quantities; time, distance and position for each other; and conditions
-    that explain half of what the calendar does: they are tested one after the other, so the calendar is
-    correlated with them, and a dozen specimens may give too little evidence.
+    that explain half of what the calendar does, which is correlated with them.
     """
     found = []
     keys = {c.key for c in significant}

@@ -148,8 +148,7 @@ def _parts(
 class _Search:
     """The tests of the last search, applied to an effect that is added to the residual.
 
-    The effect raises the estimated scatter, and its differences between units raise the variance that it is
-    tested against.
+    The effect raises the estimated scatter and the variance that it is tested against.
     """
 
     def __init__(self, selection: Selection, alpha: float) -> None:

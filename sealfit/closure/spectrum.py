@@ -151,9 +151,8 @@ def spectrum_of(samples: pd.DataFrame, axis: str, known: Sequence[float] = ()) -
     """Return the spectrum along an axis; None with too few strokes or frequencies.
 
     A parabola is subtracted from each stroke, which is then tapered (Hann) and transformed on a grid that
-    divides twice the longest stroke. All strokes have the same frequencies then. The longest wavelength is
-    half the median stroke. The samples are those of `sealfit.closure.ripples.find_ripple`, and `known` the
-    wavelengths of the components in the model along this axis.
+    divides twice the longest stroke, for common frequencies. The longest wavelength is half the median
+    stroke. The samples are those of `find_ripple`, and `known` the wavelengths in the model along this axis.
     """
     grid = _Grid.of(AxisStrokes.of(samples, axis))
     if grid is None:
