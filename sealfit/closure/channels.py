@@ -272,7 +272,7 @@ def free_columns(channel: Channel, most: int = criteria.FREE_DF) -> np.ndarray:
     else:
         inner = np.quantile(distinct, np.linspace(0, 1, df)[1:-1])
         knots = np.r_[[distinct[0]] * 4, inner, [distinct[-1]] * 4]
-        columns = [x, BSpline.design_matrix(x, knots, 3).toarray()[:, 1:-1]]
+        columns = [x, *BSpline.design_matrix(x, knots, 3).toarray()[:, 1:-1].T]
     stacked = np.column_stack(columns)
     stacked = stacked - stacked.mean(axis=0)
     size = np.sqrt((stacked**2).mean(axis=0))
