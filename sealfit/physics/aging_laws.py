@@ -29,11 +29,9 @@ def aging_law(days, *, mu_0, a, b):
 
     Parameters
     ----------
-    days : float or ndarray, shape (n,)
-        Aging time t in days, at least 0.
-    mu_0, a, b : float or ndarray
-        Value of the unaged rubber; loss per factor e of time, same unit; time at which the loss sets in, in
-        days.
+    days, mu_0, a, b : float or ndarray, shape (n,)
+        Aging time t in days, at least 0; value of the unaged rubber; loss per factor e of time, same unit;
+        time at which the loss sets in, in days.
 
     Raises
     ------
@@ -56,10 +54,7 @@ def aging_law(days, *, mu_0, a, b):
 def aging_constant(a, b):
     """Return the constant of Eq. 15 for the identifiable law, c = -a ln b, in the unit of `a`.
 
-    Raises
-    ------
-    ParameterError
-        If any `b` (in days) is not positive.
+    ParameterError if any `b` (in days) is not positive.
 
     Examples
     --------

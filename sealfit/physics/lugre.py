@@ -28,13 +28,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
 # ---------------------------------------------------------------- pressure
-# Load per unit width in the contact, F_n / L s(x) at x = zeta / L from 0 to 1 (Eqs. 8 to 11). Each function
-# returns s, the load relative to its mean, shape (n,).
-
-
-def sine(x):
-    r"""Return s of the sine distribution, :math:`\pi / 2 \sin \pi x`."""
-    return np.pi / 2 * np.sin(np.pi * x)
+# Load per unit width in the contact, F_n / L s(x) at x = zeta / L from 0 to 1 (Eqs. 8 to 11).
 
 
 def exponential(x, decay=1.0):
@@ -42,18 +36,16 @@ def exponential(x, decay=1.0):
 
     `decay` is lambda, dimensionless. At 0 the distribution is uniform; below 0 it increases.
     """
-    if decay == 0:
-        return np.ones_like(x)
-    return decay * np.exp(-decay * x) / -np.expm1(-decay)
+    return decay * np.exp(-decay * x) / -np.expm1(-decay) if decay else np.ones_like(x)
 
 
-def parabolic(x):
-    """Return s of the parabolic distribution, 6 x (1 - x)."""
-    return 6 * x * (1 - x)
-
-
-# The distributions by name.
-PRESSURES = {"uniform": np.ones_like, "sine": sine, "exponential": exponential, "parabolic": parabolic}
+# The distributions by name: functions of x that return s, the load relative to its mean, shape (n,).
+PRESSURES = {
+    "uniform": np.ones_like,
+    "sine": lambda x: np.pi / 2 * np.sin(np.pi * x),
+    "exponential": exponential,
+    "parabolic": lambda x: 6 * x * (1 - x),
+}
 
 
 @dataclass(frozen=True)
@@ -70,10 +62,7 @@ class Contact:
     def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
         """Return each element's share of the load and mu relative to the reference, shape (elements,) each.
 
-        Raises
-        ------
-        ParameterError
-            If the load, the width or the reference is not positive.
+        ParameterError if the load, the width or the reference is not positive.
 
         Examples
         --------
@@ -96,19 +85,10 @@ class Contact:
 
 
 def stribeck_decay(speed_mm_s, v_s):
-    r"""Return the decay of the static rise mu_s - mu_c with speed, from 1 at rest to 0 at high speed.
+    r"""Return the decay :math:`e^{-(v / v_s)^2}` of the static rise mu_s - mu_c with speed.
 
-    .. math:: E = e^{-(v / v_s)^2}
-
-    Parameters
-    ----------
-    speed_mm_s, v_s : float or ndarray
-        Sliding speed v in mm/s, of either sign; Stribeck velocity in mm/s, broadcast against it.
-
-    Raises
-    ------
-    ParameterError
-        If any `v_s` is not positive.
+    Speed v and Stribeck velocity v_s are in mm/s and are broadcast. ParameterError if any `v_s` is not
+    positive.
 
     Examples
     --------
@@ -117,9 +97,8 @@ def stribeck_decay(speed_mm_s, v_s):
     """
     v_s = np.asarray(v_s, float)
     if not np.all(v_s > 0):
-        raise ParameterError(
-            f"v_s = {np.min(v_s):g}: the Stribeck velocity must be positive.", fix="Give v_s > 0."
-        )
+        reason = f"v_s = {np.min(v_s):g}: the Stribeck velocity must be positive."
+        raise ParameterError(reason, fix="Give v_s > 0.")
     return np.exp(-((np.asarray(speed_mm_s, float) / v_s) ** 2))
 
 
@@ -131,8 +110,7 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
     Parameters
     ----------
     speed_mm_s, load_N : float or ndarray, shape (n,)
-        Sliding speed v in mm/s, signed; normal load N in N. A load of 1 turns the coefficients into forces
-        F_s, F_c.
+        Sliding speed v in mm/s, signed; normal load N in N. With a load of 1 the coefficients are forces.
     mu_s, mu_c, v_s, sigma_2 : float or ndarray, shape (n,)
         Static and Coulomb coefficients; Stribeck velocity in mm/s; viscous coefficient in N s/mm.
 
@@ -144,20 +122,26 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
     Notes
     -----
     The force has the sign of the speed. F(0) = 0 is not the break-away force; sigma_0 and sigma_1 have no
-    effect in steady sliding. Canudas de Wit et al. 1995, IEEE Trans. Automatic Control 40(3), 419-425,
-    doi:10.1109/9.376053; Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102, Eq. 14.
+    effect in steady sliding. Wu et al. 2020, Eq. 14.
 
     Examples
     --------
     >>> round(float(stribeck_force(5.0, 100.0, mu_s=0.6, mu_c=0.4, v_s=5.0, sigma_2=0.0)), 4)
     47.3576
     """
-    speed, load = np.asarray(speed_mm_s, float), np.asarray(load_N, float)
-    if np.any(load < 0):
-        raise ParameterError(f"load_N = {np.min(load):g}: a normal load cannot be negative.")
-    mu_s, mu_c = np.asarray(mu_s, float), np.asarray(mu_c, float)
-    mu = mu_c + (mu_s - mu_c) * stribeck_decay(speed, v_s)
-    return load * mu * np.sign(speed) + np.asarray(sigma_2, float) * speed
+    speed, load = np.asarray(speed_mm_s, float), _not_negative(load_N)
+    return load * _coefficient(speed, mu_s, mu_c, v_s) * np.sign(speed) + np.asarray(sigma_2, float) * speed
+
+
+def _not_negative(load_N):
+    if np.any(np.asarray(load_N) < 0):
+        raise ParameterError(f"load_N = {np.min(load_N):g}: a normal load cannot be negative.")
+    return np.asarray(load_N, float)
+
+
+def _coefficient(speed_mm_s, mu_s, mu_c, v_s):
+    mu_c = np.asarray(mu_c, float)
+    return mu_c + (np.asarray(mu_s, float) - mu_c) * stribeck_decay(speed_mm_s, v_s)
 
 
 # ---------------------------------------------------------------- history of the speed
@@ -177,12 +161,8 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
 
     .. math:: g(v) = \frac{N}{\sigma_0} [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}]
 
-    Parameters as `stribeck_force`; sigma_0, the stiffness of the bristles, is in N/mm.
-
-    Raises
-    ------
-    ParameterError
-        If `v_s` or `sigma_0` is not positive, or a load is negative.
+    Parameters as `stribeck_force`; sigma_0, the stiffness of the bristles, is in N/mm. ParameterError if
+    `v_s` or `sigma_0` is not positive, or a load is negative.
 
     Examples
     --------
@@ -191,14 +171,7 @@ def bristle_limit(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_0):
     """
     if not np.all(np.asarray(sigma_0) > 0):
         raise ParameterError(f"sigma_0 = {np.min(sigma_0):g}: the bristles' stiffness must be positive.")
-    if np.any(np.asarray(load_N) < 0):
-        raise ParameterError(f"load_N = {np.min(load_N):g}: a normal load cannot be negative.")
-    mu_c = np.asarray(mu_c, float)
-    return (
-        np.asarray(load_N, float)
-        / sigma_0
-        * (mu_c + (np.asarray(mu_s, float) - mu_c) * stribeck_decay(speed_mm_s, v_s))
-    )
+    return _not_negative(load_N) / sigma_0 * _coefficient(speed_mm_s, mu_s, mu_c, v_s)
 
 
 @dataclass(frozen=True)
@@ -213,10 +186,6 @@ class LuGre:
     sigma_2: float = 0.0  # viscous coefficient in N s/mm
     contact: Contact | None = None  # with pressure-dependent friction
 
-    def elements(self, load_N: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return each element's share of the load and factor on mu, by `Contact.elements`."""
-        return (np.ones(1), np.ones(1)) if self.contact is None else self.contact.elements(load_N)
-
 
 def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_mm: float = 0.0) -> Bristles:
     """Return the friction force of the dynamic LuGre model along a history of the speed (Eqs. 1 to 7), in N.
@@ -225,16 +194,10 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
 
     Parameters
     ----------
-    time_s : ndarray, shape (n,)
-        Rising times in s.
-    speed_mm_s : ndarray, shape (n,)
-        Signed speed in mm/s: value k from time k - 1 to time k.
-    load_N : float
-        Normal load in N.
-    model : LuGre
-        Parameters.
-    deflection_mm : float
-        Initial deflection of all bristles in mm.
+    time_s, speed_mm_s : ndarray, shape (n,)
+        Rising times in s; signed speed in mm/s, value k from time k - 1 to time k.
+    load_N, deflection_mm : float
+        Normal load in N; initial deflection of all bristles in mm.
 
     Raises
     ------
@@ -249,8 +212,7 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
 
     Examples
     --------
-    From rest at 2 mm/s the force rises over a length of 0.25 mm; the first step reaches half of its final
-    value.
+    From rest at 2 mm/s the force rises over 0.25 mm; the first step reaches half of its final value.
 
     >>> import numpy as np
     >>> model = LuGre(mu_s=0.5, mu_c=0.5, v_s=5.0, sigma_0=100.0)
@@ -260,21 +222,18 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
     """
     time = np.asarray(time_s, float)
     if time.ndim != 1 or not time.size or not (np.diff(time) > 0).all():
-        raise ParameterError(
-            "time_s must be one-dimensional and increasing.", fix="Sort the rows and drop repeated times."
-        )
+        fix = "Sort the rows and drop repeated times."
+        raise ParameterError("time_s must be one-dimensional and increasing.", fix=fix)
     if not (model.sigma_1 >= 0 and model.sigma_2 >= 0):
-        raise ParameterError(
-            f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative."
-        )
+        reason = f"sigma_1 = {model.sigma_1:g}, sigma_2 = {model.sigma_2:g}: neither can be negative."
+        raise ParameterError(reason)
     if not load_N > 0:
         raise ParameterError(f"load_N = {load_N:g}: bristles need a load above 0.", fix="Give a load in N.")
-    share, factor = model.elements(load_N)
+    share, factor = model.contact.elements(load_N) if model.contact else (np.ones(1), np.ones(1))
     speed = np.asarray(speed_mm_s, float)
     if speed.shape != time.shape:
-        raise ParameterError(
-            f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time."
-        )
+        reason = f"speed_mm_s has shape {speed.shape}, time_s {time.shape}: give one speed a time."
+        raise ParameterError(reason)
     parameters = {name: getattr(model, name) for name in ("mu_s", "mu_c", "v_s", "sigma_0")}
     limit = bristle_limit(speed, load_N, **parameters)[:, None] * factor
     z = _stepped(time, speed, limit, np.full(share.size, float(deflection_mm)))
