@@ -13,6 +13,9 @@ ZERO_C = 273.15
 # Standard laboratory temperature of rubber tests in degrees Celsius, ISO 23529.
 STANDARD_C = 23.0
 WU = "Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102"
+# Search grid of the activation energy in J/mol.
+ENERGIES = (-1.2e5, -8e4, -4e4, 2e4, 4e4, 8e4, 1.2e5)
+E_MEANS = "activation energy; negative on b, which is a time"
 # Targets of laws over the days of aging, most likely first.
 ON_COEFFICIENTS = (
     ("mu", "multiply"), ("mu_c", "add"), ("mu_s", "add"), ("mu_c", "multiply"), ("mu_s", "multiply"),
@@ -27,19 +30,11 @@ ON_COEFFICIENTS = (
     acts_on=factors("a", "b"),
     parameters=(
         amplitude("A", "{y}", 1.0, "share of the aging that is thermally activated", (-10.0, 10.0)),
-        Parameter(
-            "E",
-            "J/mol",
-            8e4,
-            (-3e5, 3e5),
-            "activation energy; negative on b, which is a time",
-            search=(-1.2e5, -8e4, -4e4, 2e4, 4e4, 8e4, 1.2e5),
-        ),
+        Parameter("E", "J/mol", 8e4, (-3e5, 3e5), E_MEANS, search=ENERGIES),
     ),
     source="Arrhenius 1889, Z. Phys. Chem. 4, 226-248; for the life of rubber: ISO 11346. "
     "With a share that is not activated: ours.",
-    # By hand: E = R T_ref ln 16 and T = 2 T_ref: the exponent is ln 16 / 2 = ln 4, and 0.5 (4 - 1) = 1.5. In
-    # numbers: T_ref = 300 K, E = 8.314462618 * 300 * 2.772588722239781, T = 600 K.
+    # By hand: E = R T_ref ln 16, T_ref = 300 K and T = 2 T_ref: the exponent is ln 4, and 0.5 (4 - 1) = 1.5.
     worked=(
         {"temperature_C": 326.85, "temperature_C_ref": 26.85},
         {"A": 0.5, "E": 8.314462618 * 300 * 2.772588722239781},
@@ -49,12 +44,10 @@ ON_COEFFICIENTS = (
 def arrhenius_aging(inputs, *, A, E):
     r"""Arrhenius acceleration of aging with temperature: of the loss a, or of the time b of its onset.
 
-    Oxidation, scission and cross-linking of network bonds have an activation energy E, and a rate
-    proportional to :math:`e^{-E / R T}`, T in kelvin. A share A of the aging is of that kind; the rest is
-    assumed to be independent of temperature. A = 1 is Arrhenius' law, a factor
-    :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a, the rate of the loss, E is positive. On b, a time, E is
-    negative, and A = 1 shifts the curve of Eq. 15 along the logarithm of time (time-temperature
-    superposition). Unaged rubber does not change.
+    Oxidation, scission and cross-linking of network bonds have a rate proportional to :math:`e^{-E / R T}`,
+    T in kelvin. A share A of the aging is of that kind, the rest independent of temperature. On a, the rate
+    of the loss, E is positive. On b, a time, E is negative, and A = 1 shifts the curve of Eq. 15 along the
+    logarithm of time (time-temperature superposition).
 
     Two temperatures determine one parameter, three distinguish A and E; for a small exponent only A E is
     determined. The declared model has a separate a and b for each series. The effect can be seen only if one
@@ -79,13 +72,10 @@ def arrhenius_aging(inputs, *, A, E):
 def compression_factor(inputs, *, A):
     r"""Compression during aging: it changes aging, or friction after aging.
 
-    A seal ages under compression. Strain changes which bonds form and break (compression set), and the
-    surface has less contact with air. c is the height in per cent of the original height, and A the relative
-    change per full compression, so that 80 % gives A / 5. On a or b it changes aging; on mu it also changes
-    the friction of unaged rubber with a compression.
-
-    The declared model has a separate a and b for each series. An effect on a or b can be seen only if one
-    series contains several heights.
+    Strain changes which bonds form and break (compression set), and the surface has less contact with air. c
+    is the height in per cent of the original height, so that 80 % gives A / 5. On mu it also changes the
+    friction of unaged rubber with a compression. An effect on a or b can be seen only if one series contains
+    several heights.
     """
     return A * (100.0 - np.asarray(inputs["compression_ratio_pct"], dtype=float)) / 100.0
 
@@ -107,9 +97,8 @@ def compression_factor(inputs, *, A):
 def aging_floor(inputs, *, A, t_f):
     r"""Aging with a floor: after some day the coefficient falls less than by the logarithm.
 
-    Eq. 15 has no limit, but aging ends when the reactants are consumed. After a day t_f the fall is reduced.
-    As a change of mu_s or mu_c, A = a stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t
-    well beyond b, and a smaller A slows it. As a factor on mu, A is relative to mu.
+    Eq. 15 has no limit, but aging ends when the reactants are consumed. As a change of mu_s or mu_c, A = a
+    stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t well beyond b.
     """
     return A * np.log(np.maximum(np.asarray(inputs["aging_days"], dtype=float) / t_f, 1.0))
 
@@ -161,9 +150,8 @@ def aging_induction(inputs, *, A, t_i):
 def aging_delay(inputs, *, A, t_i, b):
     r"""Aging with a delay: Eq. 15 starts at a day t_i.
 
-    Antioxidants delay oxidation until they are consumed. The declared law starts at day 0, so the effect is
-    the difference of the two laws, which is zero at day 0 and vanishes as :math:`A t_i / t`. If A is the a of
-    the declared law (relative to mu, for a factor) and b its b, the law with the effect is Eq. 15 with
+    The effect is the difference of the delayed law and the declared one, which starts at day 0. If A is the a
+    of the declared law (relative to mu, for a factor) and b its b, the law with the effect is Eq. 15 with
     :math:`t - t_i` for t. `aging_induction` is a smooth delay.
     """
     days = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0)
@@ -192,9 +180,7 @@ ONSET = Parameter("t_0", "{x}", 1.0, (1e-4, 1e5), "aging time at which the chang
 def stribeck_speed_aging(inputs, *, A, t_0):
     r"""Stribeck velocity that changes with age; the declared model has one for all days.
 
-    v_s is the speed of the transition from boundary friction to a film or a molecular time scale. Hardened
-    rubber conforms less to roughness and relaxes more slowly, which changes v_s. As for the coefficients, the
-    change is a logarithm of time.
+    Hardened rubber conforms less to roughness and relaxes more slowly.
     """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 

@@ -39,10 +39,7 @@ from sealfit.effects.contract import (
     worked=({"x": 7.0, "x_ref": 3.0}, {"A": 0.5}, 2.0),
 )
 def linear(inputs, *, A):
-    r"""Straight line in any channel, zero at its reference.
-
-    Along `run_order` it is the drift along the campaign counted in runs.
-    """
+    """Straight line in any channel; along `run_order`, the drift along the campaign counted in runs."""
     return A * deviation(inputs, CHANNEL)
 
 
@@ -98,10 +95,7 @@ def quadratic(inputs, *, A, B):
     worked=({"x": 30.0, "x_ref": 3.0}, {"A": 0.5}, 0.5 * 2.302585092994046),
 )
 def log(inputs, *, A):
-    r"""Logarithm of any positive channel, zero at its reference.
-
-    A is the change per factor e of the channel; NaN where the channel is not positive.
-    """
+    """Logarithm of any channel; NaN where it is not positive."""
     return A * log_ratio(inputs, CHANNEL)
 
 
@@ -119,10 +113,7 @@ def log(inputs, *, A):
     worked=({"x": 3.0, "x_ref": 1.0}, {"A": 0.5, "x_0": 3.0}, 0.5 * 0.6931471805599453),
 )
 def log_growth(inputs, *, A, x_0):
-    r"""Logarithm of any channel that starts at 0: linear at first, then the same change in every decade.
-
-    It has the form of Eq. 15, for channels with a zero, such as time; NaN where the channel is negative.
-    """
+    """Logarithm of any channel that starts at 0, as in Eq. 15; NaN where it is negative."""
     return A * np.log1p(not_negative(inputs[CHANNEL]) / x_0)
 
 
@@ -139,11 +130,7 @@ def log_growth(inputs, *, A, x_0):
     worked=({"x": 12.0, "x_ref": 3.0}, {"A": 2.0, "n": 0.5}, 2.0),
 )
 def power(inputs, *, A, n):
-    r"""Power of any positive channel, zero at its reference.
-
-    n = -1 is a hyperbola, n = 1 the straight line; n towards 0 is the logarithm, with A growing as 1/n. NaN
-    where the channel is not positive.
-    """
+    """Power of any channel; NaN where it is not positive. n towards 0 is the logarithm, A growing as 1/n."""
     # expm1 keeps all digits where the power is close to one.
     return A * np.expm1(n * log_ratio(inputs, CHANNEL))
 
@@ -162,10 +149,7 @@ def power(inputs, *, A, n):
     worked=({"x": 3.0, "x_ref": 1.0}, {"A": 2.0, "tau": 3.0}, 2.0 * 0.6321205588285577),
 )
 def exponential_approach(inputs, *, A, tau):
-    r"""Exponential approach to a limit, from 0, in any channel that is not negative.
-
-    NaN where the channel is negative.
-    """
+    """Exponential approach to a limit, from 0; NaN where the channel is negative."""
     return -A * np.expm1(-not_negative(inputs[CHANNEL]) / tau)
 
 
@@ -184,11 +168,7 @@ def exponential_approach(inputs, *, A, tau):
     worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 1.5),
 )
 def saturation(inputs, *, A, x_half):
-    r"""Saturation by a hyperbola, from 0, in any channel that is not negative.
-
-    It approaches its limit more slowly than an exponential: half at x_half, nine tenths at nine times that.
-    NaN where the channel is negative.
-    """
+    """Saturation by a hyperbola, from 0: slower than an exponential. NaN where the channel is negative."""
     x = not_negative(inputs[CHANNEL])
     return A * x / (x + x_half)
 
@@ -208,14 +188,10 @@ def saturation(inputs, *, A, x_half):
     worked=({"x": 6.0, "x_ref": 1.0}, {"A": 2.0, "x_half": 2.0}, 0.5),
 )
 def hyperbolic(inputs, *, A, x_half):
-    r"""Hyperbolic decay from A to 0, in any channel that is not negative.
+    """Hyperbolic decay from A to 0; NaN where the channel is negative.
 
-    It falls to a half at x_half and to a tenth at nine times that. NaN where the channel is negative.
-
-    It equals a constant minus `saturation`. Coefficients, parameters and the friction force have a free
-    constant in the declared model, so that the two forms are equivalent on them, and `saturation` is used. An
-    added force has no free constant; this form acts only there. The hyperbola A (x_ref / x - 1) is `power`
-    with n = -1.
+    It equals a constant minus `saturation`, which is used where the declared model has a free constant. An
+    added force has none; this form acts only there.
     """
     return A / (1 + not_negative(inputs[CHANNEL]) / x_half)
 
@@ -234,7 +210,7 @@ def hyperbolic(inputs, *, A, x_half):
     worked=({"x": 3.0, "x_ref": 1.0}, {"A": -0.5, "x_0": 3.0}, -0.5),
 )
 def step(inputs, *, A, x_0):
-    r"""Step in any channel: something was changed, repaired or knocked.
+    """Step in any channel: something was changed, repaired or knocked.
 
     Only the interval between two neighbouring values of the channel is determined for x_0.
     """
@@ -282,8 +258,7 @@ def bump(inputs, *, A, x_0, w):
 def sinusoid(inputs, *, A, lambda_, phi):
     r"""Sine of any channel; along time it may be due to the mains, a servo or a pump.
 
-    Along the position the same form is the physical effect `ripple`. x_ref is 0, or near the channel's values
-    where these are far from 0.
+    Along the position it is the physical effect `ripple`. x_ref is 0, or near values that are far from 0.
     """
     angle = 2 * np.pi * deviation(inputs, CHANNEL) / lambda_ + phi
     return A * np.sin(angle) * sine_attenuation(inputs, CHANNEL, lambda_)
@@ -313,8 +288,7 @@ def sinusoid(inputs, *, A, lambda_, phi):
 def sinusoid_changing(inputs, *, A, B, lambda_, phi):
     r"""Sine of any channel whose amplitude is a straight line in a second one.
 
-    A screw that runs smoothly one way, a joint that is passed at speed, a guide that bends under load: the
-    ripple is stronger in one direction, at one end of the speeds, in some conditions.
+    A screw that runs smoothly one way, a joint that is passed at speed, a guide that bends under load.
     """
     return (A + B * deviation(inputs, SECOND)) * sinusoid(inputs, A=1.0, lambda_=lambda_, phi=phi)
 
@@ -324,7 +298,7 @@ def sinusoid_changing(inputs, *, A, B, lambda_, phi):
     label="periodic in {x}, with a second harmonic",
     equation="h = A sin(2 pi x / lambda + phi) + B sin(4 pi x / lambda + phi_2)",
     reference="mean over a wavelength",
-    acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
+    acts_on=sinusoid.effect.acts_on,
     parameters=(
         amplitude("A", "{y}", 0.1, "amplitude once per period"),
         amplitude("B", "{y}", 0.05, "amplitude twice per period"),
@@ -333,17 +307,15 @@ def sinusoid_changing(inputs, *, A, B, lambda_, phi):
         Parameter("phi_2", "rad", 0.0, PHASE, "phase of the harmonic at 0", search=PHASES),
     ),
     source="Form: ours. The first two Fourier terms of anything periodic.",
-    # By hand: 0.02 of a period of 0.04 is half a turn: 4 sin(pi + pi/6) = -2; a whole one: 1.5 sin(2 pi +
-    # pi/2) = 1.5.
+    # By hand: half a turn, 4 sin(pi + pi/6) = -2, and a whole one, 1.5 sin(2 pi + pi/2) = 1.5.
     worked=({"x": 0.02}, {"A": 4.0, "B": 1.5, "lambda_": 0.04, "phi": np.pi / 6, "phi_2": np.pi / 2}, -0.5),
     periodic=True,
 )
 def sinusoid_harmonics(inputs, *, A, B, lambda_, phi, phi_2):
-    r"""Sine of any channel with its second harmonic.
+    r"""Sine of any channel with its second harmonic, as of a bent and misaligned shaft.
 
-    A bent and misaligned shaft, or the torque of a motor with its pole pairs, has components once and twice
-    per turn. The loop does not try this form, as it finds harmonics one at a time, each a ripple or sine with
-    its own period. It is for simulated campaigns and effects of users.
+    The loop does not try it, as it finds harmonics one at a time, each a ripple or sine with its own period.
+    It is for simulated campaigns.
     """
     angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_
     once, twice = (sine_attenuation(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
@@ -413,8 +385,7 @@ def _factor(scale: str) -> str:
 def _closed_form(scales: Scales, kind: str, *, alone: bool) -> Effect:
     """Return the product of two channels, with the terms of each channel alone if wanted.
 
-    A product alone is for an effect that shows only where both channels are away from their means. Speed
-    times days: aged rubber loses more friction at high speed than unaged rubber does.
+    A product without them is for an effect that shows only where both channels are away from their means.
     """
     s, values = scales, {"A": 0.5, "B": 1.0, "C": 2.0}
     warped_plane = f"h = A u w + B u + C w, u = {s.u}, w = {s.w}"

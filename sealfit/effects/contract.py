@@ -1,8 +1,4 @@
-"""The description of an effect, and its shape as one pure function.
-
-The search, the fit, the tables, the plots and the report read the description, so that a new effect is one
-definition in the file of its family. Effects of users follow the same contract.
-"""
+"""The description of an effect, and its shape as one pure function; effects of users follow it, too."""
 
 from __future__ import annotations
 
@@ -88,9 +84,7 @@ class Parameter:
         return self.name.rstrip("_")
 
 
-def amplitude(
-    name: str, unit: str, start: float, meaning: str, bounds: tuple[float, float] = AMPLITUDE
-) -> Parameter:
+def amplitude(name: str, unit: str, start: float, meaning: str, bounds=AMPLITUDE) -> Parameter:
     """Return an amplitude: a parameter in which the shape is linear."""
     return Parameter(name, unit, start, bounds, meaning, linear=True)
 
@@ -105,12 +99,9 @@ class Effect:
     """One physical effect, or one closed form of any channel.
 
     `shape(inputs, **values)` is a pure function. `inputs` maps each name in `reads` to an array, shape (n,),
-    and `<name>_ref` to a fixed reference of the channel, its mean over the campaign, which a shape gets by
-    `reference`. The shape is the added force, the factor minus one, or the change of the parameter, shape
-    (n,). It is zero if all amplitudes are zero, and NaN (without a warning) where the form is not defined,
-    such as the logarithm of zero.
-
-    The effects of the catalogue are functions below an `effect` that describes them.
+    and `<name>_ref` to a fixed reference of the channel, its mean over the campaign. The shape is the added
+    force, the factor minus one, or the change of the parameter, shape (n,). It is zero if all amplitudes are
+    zero, and NaN (without a warning) where the form is not defined, such as the logarithm of zero.
 
     `reference` describes the state in which the shape is zero; mu_0, a and b of the after-model refer to it.
     `{x}`, `{z}` and `{load_N}` stand for channels, `{x_ref}` and the like for fixed reference values, `{x_0}`
@@ -132,7 +123,7 @@ class Effect:
     periodic: bool = False  # searched in the spectrum; its mean over a bin has a closed form
     narrow: bool = False  # may be as narrow as a bin; its mean over a bin needs more quadrature nodes
     along_calendar: bool = True  # false for a form that can imitate any order of tests
-    # whether a campaign with these values of the first channel can show it; None: any campaign can
+    # whether a campaign with these values of the first channel can show it; None: any can
     shown_by: Callable[[np.ndarray], bool] | None = None
 
     def __post_init__(self) -> None:
@@ -195,25 +186,13 @@ def reference(inputs: Mapping[str, object], name: str, default: float) -> float:
 
 
 def positive(values) -> np.ndarray:
-    """Return `values`, with NaN for those that are not positive, as their logarithm or power is not defined.
-
-    Examples
-    --------
-    >>> positive([2.0, 0.0, -1.0])
-    array([ 2., nan, nan])
-    """
+    """Return `values`, with NaN for those that are not positive, as their logarithm is not defined."""
     values = np.asarray(values, dtype=float)
     return np.where(values > 0, values, np.nan)
 
 
 def not_negative(values) -> np.ndarray:
-    """Return `values`, with NaN for negative ones, for forms that start at 0.
-
-    Examples
-    --------
-    >>> not_negative([2.0, 0.0, -1.0])
-    array([ 2.,  0., nan])
-    """
+    """Return `values`, with NaN for negative ones, for forms that start at 0."""
     values = np.asarray(values, dtype=float)
     return np.where(values >= 0, values, np.nan)
 
@@ -250,7 +229,7 @@ def fill_unit(unit: str, x: str, y: str, z: str = "") -> str:
     factors = [factor for factor in (known.get(name, name) for name in base.strip("()").split()) if factor]
     if not slash or not factors:
         return top
-    base = _in_brackets(" ".join(_in_brackets(f) for f in factors) if len(factors) > 1 else factors[0])
+    base = _in_brackets(" ".join(map(_in_brackets, factors)) if len(factors) > 1 else factors[0])
     return f"{top or 1}/{base}{hat}{power}"
 
 
@@ -259,13 +238,6 @@ def _in_brackets(unit: str) -> str:
 
 
 # ---------------------------------------------------------------- averaged
-# The factor by which averaging over the samples of a bin reduces a sine.
-#
-# .. math:: \frac{1}{n} \sum_k \sin(\alpha + \beta_k)
-#           = \frac{\sin(\pi w / \lambda)}{n \sin(\pi w / (n \lambda))} \sin \alpha
-#
-# for n samples spread evenly over a width w about the phase alpha (the Dirichlet kernel). It is small in bins
-# that are longer than the wavelength.
 
 # Key of the inputs of an effect: number of samples in each row's mean.
 SAMPLES = "samples"
@@ -277,7 +249,11 @@ def width_of(name: str) -> str:
 
 
 def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
-    """Return the factor by which averaging reduces a sine in each row, shape (n,); 1 if rows are not means.
+    r"""Return the factor by which averaging reduces a sine in each row, shape (n,); 1 if rows are not means.
+
+    .. math:: \frac{\sin(\pi w / \lambda)}{n \sin(\pi w / (n \lambda))}
+
+    This is the Dirichlet kernel for n samples spread evenly over a width w.
 
     Examples
     --------
@@ -293,6 +269,5 @@ def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
     half, samples = np.pi * np.asarray(width, float) / wavelength, np.asarray(inputs[SAMPLES], float)
     each = np.sin(half / samples)
     equal = np.abs(each) < 1e-9  # samples whole wavelengths apart have equal values
-    return np.where(
-        equal, np.cos(half) * np.cos(half / samples), np.sin(half) / np.where(equal, 1.0, samples * each)
-    )
+    whole = np.cos(half) * np.cos(half / samples)
+    return np.where(equal, whole, np.sin(half) / np.where(equal, 1.0, samples * each))

@@ -17,6 +17,10 @@ from sealfit.effects.contract import (
     sine_attenuation,
 )
 
+WAVELENGTH = "wavelength: pitch of the screw, or its whole fraction"
+# Targets of changes along the campaign, most likely first.
+IN_TIME = (("mu", "multiply"), ("force", "add"), ("force", "multiply"))
+
 
 @effect(
     label="ripple along the rig's position",
@@ -26,14 +30,7 @@ from sealfit.effects.contract import (
     acts_on=(("force", "add"), ("mu", "multiply"), ("force", "multiply")),
     parameters=(
         amplitude("A", "{y}", 0.1, "amplitude"),
-        Parameter(
-            "lambda_",
-            "{x}",
-            2.0,
-            (1e-4, 1e6),
-            "wavelength: pitch of the screw, or its whole fraction",
-            search="span",
-        ),
+        Parameter("lambda_", "{x}", 2.0, (1e-4, 1e6), WAVELENGTH, search="span"),
         Parameter("phi", "rad", 0.0, PHASE, "phase at position 0, or x_ref", search=PHASES),
     ),
     source="Form: ours. A cyclic error of a screw is periodic in its angle; "
@@ -45,12 +42,10 @@ from sealfit.effects.contract import (
 def ripple(inputs, *, A, lambda_, phi):
     r"""Ripple along the rig's position, due to a screw, a guide or a periodic track.
 
-    A lead screw with a pitch error, a bent shaft or an eccentric coupling gives a force that is periodic in
-    the rig's coordinate. The wavelength is the pitch, or an integer fraction of it for a screw of several
-    starts. It is an added force, the same in both directions, if the drive strains the sensor, and a factor
-    on friction if the pressure or the surface of the contact is periodic along the track. A harmonic is a
-    further ripple of half or a third of the wavelength. Positions beyond the tested ones are extrapolated in
-    phase. x_ref is 0, or near the positions of a rig that counts from far away.
+    It is an added force, the same in both directions, if the drive strains the sensor (a lead screw with a
+    pitch error, a bent shaft, an eccentric coupling), and a factor on friction if the pressure or the surface
+    of the contact is periodic along the track. A harmonic is a further ripple of half or a third of the
+    wavelength. x_ref is 0, or near the positions of a rig that counts from far away.
     """
     x = np.asarray(inputs["displacement_mm"], dtype=float) - reference(inputs, CHANNEL, 0.0)
     return A * np.sin(2 * np.pi * x / lambda_ + phi) * sine_attenuation(inputs, "displacement_mm", lambda_)
@@ -68,11 +63,7 @@ def ripple(inputs, *, A, lambda_, phi):
     worked=({"time_s": 20.0}, {"A": 0.02}, 0.4),
 )
 def drift(inputs, *, A):
-    r"""Drift of the force channel along a record: a strain-gauge bridge or its amplifier warming up.
-
-    A is the rate. The added force does not depend on the direction of motion. Time is that of the file, so
-    that the drift restarts with every file.
-    """
+    r"""Drift of the force channel along a file: a strain-gauge bridge or its amplifier warming up."""
     return A * np.asarray(inputs["time_s"], dtype=float)
 
 
@@ -90,9 +81,8 @@ def drift(inputs, *, A):
 def zero_offset(inputs, *, A):
     r"""Zero offset of the force channel: a constant added force, the same in both directions.
 
-    It is the half-sum of forward and backward force. Strokes in one direction do not distinguish it from
-    friction that is independent of speed, so that it reads the direction. An offset within the sensor's
-    accuracy is not significant.
+    Strokes in one direction do not distinguish it from friction that is independent of speed, so that it
+    reads the direction.
     """
     return A * np.ones_like(np.asarray(inputs["direction"], dtype=float))
 
@@ -115,8 +105,7 @@ def zero_offset(inputs, *, A):
 def offset_slope(inputs, *, A, B):
     r"""Zero offset of the force that changes with a channel, the same in both directions.
 
-    The force on a piston is pressure times area, so that an error dA of the area adds dA p to the measured
-    friction. A is then the error of the area, and B that error times the reference pressure. Another cause is
+    An error of a piston's area adds that error times the pressure to the measured friction. Another cause is
     an amplifier whose zero depends on the room temperature.
     """
     return A * deviation(inputs, CHANNEL) + B
@@ -140,9 +129,8 @@ def offset_slope(inputs, *, A, B):
 def asymmetry(inputs, *, A):
     r"""Direction asymmetry: a parameter that differs between the two directions.
 
-    Friction of a lip seal, a misaligned sample or a polished track depends on the direction d, +1 or -1. A is
-    the forward value minus the backward one, relative to their mean, or in its unit for an added change. The
-    mean of the two directions does not change.
+    Friction of a lip seal, a misaligned sample or a polished track depends on the direction. A is relative to
+    the mean of the two directions, or in its unit for an added change.
     """
     return A * np.asarray(inputs["direction"], dtype=float) / 2
 
@@ -152,7 +140,7 @@ def asymmetry(inputs, *, A):
     equation="h = A t",
     reference="start of the campaign",
     reads=("elapsed_h",),
-    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
+    acts_on=IN_TIME,
     parameters=(amplitude("A", "{y}/{x}", 1e-4, "change per time of the campaign"),),
     source="Form: ours. First order in time of a slow change.",
     # By hand: 200 h at 0.05 % per hour.
@@ -161,10 +149,9 @@ def asymmetry(inputs, *, A):
 def campaign_drift(inputs, *, A):
     r"""Drift along the campaign: a slow change over the days of testing.
 
-    It may be due to a track that polishes, a sensor that ages, or rubber that goes on aging in the
-    laboratory's air. t is the time since the campaign's first file. A is the change per time, relative for
-    friction, in N for the zero. A drift along the order of runs is `linear` in `run_order`. If tests follow
-    the calendar of aging it is not distinguishable from the aging law.
+    It may be due to a track that polishes, a sensor that ages, or rubber that goes on aging in air. t is the
+    time since the campaign's first file. A drift along the order of runs is `linear` in `run_order`. If tests
+    follow the calendar of aging it is not distinguishable from the aging law.
     """
     return A * np.asarray(inputs["elapsed_h"], dtype=float)
 
@@ -178,7 +165,7 @@ def _dated(hours: np.ndarray) -> bool:
     equation="h = A if t_1 <= t < t_2, else 0",
     reference="before {t_1} and from {t_2} on",
     reads=("elapsed_h",),
-    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
+    acts_on=IN_TIME,
     parameters=(
         amplitude("A", "{y}", 0.02, "size of the change"),
         Parameter("t_1", "{x}", 0.0, (-1e6, 1e6), "when it begins", search="between"),
@@ -201,6 +188,7 @@ def temporary_change(inputs, *, A, t_1, t_2):
 
 # Period of day and night, in h.
 DAY_H = 24.0
+TIME_OF_DAY = "a time of day at which it is largest, since the campaign's first file"
 # Days of tests, and the part of each that its tests must span, from which a daily change is looked for.
 LEAST_DAYS, LEAST_PART = 2, 0.25
 
@@ -218,17 +206,10 @@ def _shows_days(hours: np.ndarray) -> bool:
     equation="h = A cos(2 pi (t - t_max) / 24 h)",
     reference="mean over a day",
     reads=("elapsed_h",),
-    acts_on=(("mu", "multiply"), ("force", "add"), ("force", "multiply")),
+    acts_on=IN_TIME,
     parameters=(
         amplitude("A", "{y}", 0.02, "amplitude"),
-        Parameter(
-            "t_max",
-            "{x}",
-            6.0,
-            (-DAY_H, 2 * DAY_H),
-            "a time of day at which it is largest, since the campaign's first file",
-            search=(0.0, 3.0, 6.0, 9.0),
-        ),
+        Parameter("t_max", "{x}", 6.0, (-DAY_H, 2 * DAY_H), TIME_OF_DAY, search=(0.0, 3.0, 6.0, 9.0)),
     ),
     source="Form: ours. The first Fourier term of anything that repeats every day.",
     # By hand: 4 h from the largest value is a sixth of a day, and cos 60 degrees = 1/2.

@@ -1,8 +1,7 @@
 """Effects of users: Python files in a folder that the command line names (see `store.paths`).
 
 This is the only place where Python of a user is run. A file has one or more functions that `effect` describes
-at its top level, like the modules of this package. Modules it imports must be installed. Files whose name
-starts with an underscore are not read.
+at its top level, like the modules of this package. Files whose name starts with an underscore are not read.
 """
 
 from __future__ import annotations
@@ -32,31 +31,24 @@ TOLERANCE = 1e-9
 def load_user_effects(folder: Path | str | None) -> dict[str, Effect]:
     """Return the effects of every .py file in `folder`, by id, in the order of the file names; none for None.
 
-    Raises
-    ------
-    ConfigError
-        With the file and a fix: if the folder is missing, a file cannot be run or defines no effect, an id
-        exists already or is no identifier, or an effect violates the contract (worked value, linearity,
-        shape).
+    ConfigError if the folder is missing, a file cannot be run or defines no effect, an id exists already or
+    is no identifier, or an effect violates the contract (worked value, linearity, shape).
     """
     if folder is None:
         return {}
     folder = Path(folder)
     if not folder.is_dir():
-        raise ConfigError(
-            "there is no such folder.", file=folder, fix="Check loop.effects_folder in the config."
-        )
+        fix = "Check loop.effects_folder in the config."
+        raise ConfigError("there is no such folder.", file=folder, fix=fix)
     found: dict[str, Effect] = {}
     for path in sorted(folder.glob("*.py")):
         if path.name.startswith("_"):
             continue
         for effect in _effects_of(path):
             _refuse_taken(effect.id, found, path)
-            fault = contract_fault(effect)
-            if fault:
-                raise ConfigError(
-                    f"effect '{effect.id}': {fault}.", file=path, fix=f"Fix the file. {EXAMPLE}"
-                )
+            if fault := contract_fault(effect):
+                reason = f"effect '{effect.id}': {fault}."
+                raise ConfigError(reason, file=path, fix=f"Fix the file. {EXAMPLE}")
             found[effect.id] = replace(effect, shape=FileShape(path.resolve(), effect.id, effect.shape))
     return found
 
@@ -87,9 +79,8 @@ def _effects_of(path: Path) -> list[Effect]:
     # not what it imported
     unique = {id(one): one for one in effects_in(_run(path)) if EFFECTS.get(one.id) is not one}
     if not unique:
-        raise ConfigError(
-            "holds no effect.", file=path, fix=f"Define one at its top level, or move the file. {EXAMPLE}"
-        )
+        fix = f"Define one at its top level, or move the file. {EXAMPLE}"
+        raise ConfigError("holds no effect.", file=path, fix=fix)
     return list(unique.values())
 
 
@@ -107,11 +98,9 @@ def _run(path: Path) -> ModuleType:
         raise ConfigError(str(error), file=path, fix=f"Fix the file. {EXAMPLE}") from error
     except (Exception, SystemExit) as error:  # any error of the user's code
         del sys.modules[name]
-        line = _line_in(path, error)
         message = f"cannot be run: {type(error).__name__}: {error}."
-        raise ConfigError(
-            message, file=path, line=line, fix="Fix the file, or move it out of the folder."
-        ) from error
+        fix = "Fix the file, or move it out of the folder."
+        raise ConfigError(message, file=path, line=_line_in(path, error), fix=fix) from error
     return module
 
 
@@ -125,17 +114,14 @@ def _line_in(path: Path, error: BaseException) -> int | None:
 
 def _refuse_taken(name: str, found: Mapping[str, Effect], path: Path) -> None:
     if not (isinstance(name, str) and name.isidentifier()):
-        raise ConfigError(
-            f"id {name!r} is not a plain name.", file=path, fix="Use letters, digits and underscores."
-        )
-    if name in EFFECTS or name in FREE:
-        raise ConfigError(
-            f"the catalogue has an effect '{name}' already.", file=path, fix="Give it another id."
-        )
-    if name in found:
-        raise ConfigError(
-            f"another file of the folder has an effect '{name}' already.", file=path, fix="Rename one."
-        )
+        reason, fix = f"id {name!r} is not a plain name.", "Use letters, digits and underscores."
+    elif name in EFFECTS or name in FREE:
+        reason, fix = f"the catalogue has an effect '{name}' already.", "Give it another id."
+    elif name in found:
+        reason, fix = f"another file of the folder has an effect '{name}' already.", "Rename one."
+    else:
+        return
+    raise ConfigError(reason, file=path, fix=fix)
 
 
 def contract_fault(effect: Effect) -> str:
