@@ -9,6 +9,7 @@ import io
 import json
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -34,12 +35,10 @@ from sealfit.simulation.spec import Spec, load_spec, plan_files
 __all__ = ["Spec", "load_spec", "load_truth", "simulate", "truth_path"]
 
 # ---------------------------------------------------------------- truth
-# The truth of a campaign, `<campaign>.truth.json`.
 
 SCHEMA = 1
 MADE_BY = "sealfit simulate"
-# Decimals of a mean force in N. They are far below any noise.
-DIGITS = 9
+DIGITS = 9  # decimals of a mean force in N, far below any noise
 OF_EFFECT = ("id", "channels", "acts_on", "operation", "form", "parameters")
 PER_FILE = (
     "file", "run_id", "direction", "speed_mm_s", "mean_force_N", "gain", "offset_N", "outlier", "defect",
@@ -54,14 +53,12 @@ def truth_path(campaign: Path) -> Path:
 
 def load_truth(path: Path) -> dict:
     """Return the truth document at `path`; RequestError if the file was not written by `simulate`."""
-    try:
+    with suppress(ValueError, RecursionError):
         document = json.loads(Path(path).read_text("utf-8"))
-    except (ValueError, RecursionError):
-        document = None
-    if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
-        what = "is not the truth of a simulated campaign."
-        raise RequestError(what, file=path, fix="Simulate the campaign anew.")
-    return document
+        if isinstance(document, dict) and document.get("made_by") == MADE_BY:
+            return document
+    what = "is not the truth of a simulated campaign."
+    raise RequestError(what, file=path, fix="Simulate the campaign anew.")
 
 
 def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) -> dict:
@@ -100,15 +97,10 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
 
 # ---------------------------------------------------------------- campaign
 
-# Decimals of the displacement in mm: 10 nm, the resolution of a linear encoder.
-DISPLACEMENT_DECIMALS = 5
-# Keys and derived channels that ingest computes.
-NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]
-# Smallest speed at which effects are evaluated, as a share of the set speed. A law in log speed is not
-# defined at 0.
-CRAWL = 1e-3
-# Number of rows per file for the RMS of an effect. It gives two digits.
-RMS_ROWS = 64
+DISPLACEMENT_DECIMALS = 5  # of mm: 10 nm, the resolution of a linear encoder
+NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]  # computed by ingest
+CRAWL = 1e-3  # of the set speed, at least, where effects are evaluated: a law in log speed has no value at 0
+RMS_ROWS = 64  # per file for the RMS of an effect: it gives two digits
 
 
 def simulate(spec: Spec, out: Path) -> None:
@@ -192,18 +184,9 @@ def _write(spec: Spec, folder: Path) -> dict:
         true = np.broadcast_to(law.force_N(steady), steady["direction"].shape)
         for sign in np.unique(steady["direction"])[::-1].tolist():
             own = steady["direction"] == sign
-            known.append(
-                {
-                    **record,
-                    "direction": sign,
-                    "speed_mm_s": sign * speed,
-                    "mean_force_N": float(true[own].mean()),
-                    "gain": scatter.gain[number],
-                    "offset_N": scatter.offset_N[number],
-                    "outlier": bool(scatter.outlier[number]),
-                    "defect": defects.get(number),
-                }
-            )
+            found = {"mean_force_N": float(true[own].mean()), "defect": defects.get(number)}
+            drawn = {name: scatter[name][number] for name in ("gain", "offset_N", "outlier")}
+            known.append(record | {"direction": sign, "speed_mm_s": sign * speed} | found | drawn)
         few = slice(None, None, max(1, len(true) // RMS_ROWS))
         sample, whole = _rows(steady, few), true[few]
         squares += [np.mean((whole - law.without(k).force_N(sample)) ** 2) for k in range(len(law.effects))]
@@ -213,16 +196,10 @@ def _write(spec: Spec, folder: Path) -> dict:
 
 def _channels(record: dict, motion: Motion, along: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return a file's channels as sealfit's tables name them: shape (1,) for those of the file, else (n,)."""
-    return {
-        **{name: np.array([value]) for name, value in record.items()},
-        **along,
-        "time_s": motion.stroke_time_s,
-        "displacement_mm": motion.displacement_mm,
-        "distance_mm": motion.distance_mm,
-        "speed_mm_s": motion.speed_mm_s,
-        "direction": motion.direction,
-        "stroke": motion.stroke,
-    }
+    names = ("displacement_mm", "distance_mm", "speed_mm_s", "direction", "stroke")
+    of_file = {name: np.array([value]) for name, value in record.items()}
+    of_motion = {name: getattr(motion, name) for name in names}
+    return {**of_file, **along, "time_s": motion.stroke_time_s, **of_motion}
 
 
 def _rows(channels: dict[str, np.ndarray], rows: np.ndarray | slice) -> dict[str, np.ndarray]:
@@ -236,10 +213,8 @@ def _forces(
     parts = law.parts({**channels, **_begun(spec, motion, speed)})
     limit, viscous, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
     if not (np.isfinite(limit + viscous).all() and np.isfinite(added).all()):
-        raise ConfigError(
-            f"the effects give no number in {channels['file'][0]}.",
-            fix="Check their parameters and formulas.",
-        )
+        reason = f"the effects give no number in {channels['file'][0]}."
+        raise ConfigError(reason, fix="Check their parameters and formulas.")
     if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
         rise = np.full(motion.time_s.size, spec.design.stiffness_mm)
         return with_presliding(limit + viscous, motion, rise), added

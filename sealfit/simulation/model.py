@@ -36,9 +36,7 @@ class Growth(Strict):
     doubling_C: float = Field(
         40.0, gt=0, description="degrees that double `a`; ten is van 't Hoff's rule for a rate"
     )
-    reference_compression_pct: float = Field(
-        80.0, description="compression ratio at which `a` is as declared"
-    )
+    reference_compression_pct: float = Field(80.0, description="compression at which `a` is as declared")
     per_pct: float = Field(0.005, description="relative growth of `a` per percent of height taken away")
 
     def factor(self, temperature_C, compression_pct):
@@ -212,10 +210,8 @@ def _check(entry: EffectEntry, effect: Effect, channels: tuple[str, ...], place:
             raise ConfigError(f"{place}: parameter '{name}' is missing.", fix=f"{name}: {parameter.meaning}.")
         low, high = parameter.bounds
         if not parameter.linear and not low <= entry.parameters[name] <= high:
-            raise ConfigError(
-                f"{place}: parameter '{name}' is {entry.parameters[name]:g}.",
-                fix=f"Give {low:g} to {high:g}.",
-            )
+            reason = f"{place}: parameter '{name}' is {entry.parameters[name]:g}."
+            raise ConfigError(reason, fix=f"Give {low:g} to {high:g}.")
 
 
 def _target(entry: EffectEntry, effect: Effect, place: str) -> tuple[Target, Operation]:
@@ -224,9 +220,8 @@ def _target(entry: EffectEntry, effect: Effect, place: str) -> tuple[Target, Ope
             return target, operation
     known = ", ".join(f"{target} by {operation}" for target, operation in effect.acts_on)
     wanted = " by ".join(part for part in (entry.acts_on, entry.operation) if part)
-    raise ConfigError(
-        f"{place}: cannot act on {wanted}.", fix=f"It acts on {known}; write an expression for others."
-    )
+    fix = f"It acts on {known}; write an expression for others."
+    raise ConfigError(f"{place}: cannot act on {wanted}.", fix=fix)
 
 
 def _expression(entry: EffectEntry) -> tuple[tuple[str, ...], str, Shape]:

@@ -15,12 +15,10 @@ from sealfit.simulation.model import CONDITIONS, BoundEffect, Physics, declared_
 from sealfit.simulation.spec import STEADY_LENGTHS, Design, Spec
 
 # ---------------------------------------------------------------- motion
-# The motion of the platform: rest, ramp, constant speed, ramp, and the reverse in files with both directions.
+# Rest, ramp, constant speed, ramp, and the reverse in files with both directions.
 
-# Number of steps of constant speed in the simulation of a ramp.
-RAMP_STEPS = 256
-# Resolution of the logged time in s; sampling intervals are multiples of it.
-TICK_S = 1e-5
+RAMP_STEPS = 256  # of constant speed in the simulation of a ramp
+TICK_S = 1e-5  # resolution of the logged time in s; sampling intervals are multiples of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +26,7 @@ class Motion:
     """The sampled motion of one file, and the mask of steady sliding; arrays of shape (n,)."""
 
     time_s: np.ndarray  # from the start of the file
-    # `time_s` of sealfit's tables: from the start of the stroke if there are several
-    stroke_time_s: np.ndarray
+    stroke_time_s: np.ndarray  # `time_s` of the tables: from the start of the stroke if there are several
     displacement_mm: np.ndarray
     distance_mm: np.ndarray
     speed_mm_s: np.ndarray  # signed; zero at rest
@@ -102,15 +99,11 @@ def _trapezoid(
     remaining = 2.0 * ramp + cruise - since
     up, down = since < ramp, remaining < ramp
     rate = speed / ramp if ramp > 0.0 else 0.0
-    distance = np.where(
-        up,
-        0.5 * rate * since**2,
-        np.where(down, length - 0.5 * rate * remaining**2, speed * (since - 0.5 * ramp)),
-    )
-    moving = (since > 0.0) & (remaining > 0.0)
-    distance = np.where(moving, distance, np.where(since > 0.0, length, 0.0))
-    now = np.where(up, rate * since, np.where(down, rate * remaining, speed))
-    return distance, np.where(moving, now, 0.0)
+    before, after = since <= 0.0, remaining <= 0.0
+    phases = [before, after, up, down]
+    distances = [0.0, length, 0.5 * rate * since**2, length - 0.5 * rate * remaining**2]
+    distance = np.select(phases, distances, speed * (since - 0.5 * ramp))
+    return distance, np.select(phases, [0.0, 0.0, rate * since, rate * remaining], speed)
 
 
 def with_presliding(
@@ -204,10 +197,7 @@ class SteadyLaw:
 
 
 def steady_law(spec: Spec) -> SteadyLaw:
-    """Return the truth of a SPEC.
-
-    ConfigError if an effect is not in the catalogue.
-    """
+    """Return the truth of a SPEC; ConfigError if an effect is not in the catalogue."""
     return SteadyLaw(spec.physics, resolve_effects(spec.effects))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 from zlib import crc32
 
@@ -123,32 +122,18 @@ class BadData(Strict):
 
 
 Noise = Annotated[
-    White
-    | Autocorrelated
-    | Quantised
-    | RandomGain
-    | RunSetup
-    | Proportional
-    | DisplacementNoise
-    | SpeedScatter
-    | OutlierRepeats
-    | BadData,
+    White | Autocorrelated | Quantised | RandomGain | RunSetup | Proportional | DisplacementNoise
+    | SpeedScatter | OutlierRepeats | BadData,
     Field(discriminator="kind"),
-]
+]  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class FileScatter:
-    """Random numbers per file, shape (files,) each."""
+def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> pd.DataFrame:
+    """Return the scatter of `files`, their runs and specimens, a row per file.
 
-    gain: np.ndarray  # factor on the friction
-    offset_N: np.ndarray  # added to the force
-    speed: np.ndarray  # real speed over commanded speed
-    outlier: np.ndarray  # bool
-
-
-def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> FileScatter:
-    """Return the scatter of `files`, their runs and specimens; gains multiply each other."""
+    Columns: the `gain` of the friction, `offset_N` of the force, the real over the commanded `speed`, and
+    whether the file is an `outlier`. Gains multiply each other.
+    """
     n = len(files)
     gain, offset, speed, outlier = np.ones(n), np.zeros(n), np.ones(n), np.zeros(n, bool)
     for kind, random in _streams(noise, seed):
@@ -167,7 +152,7 @@ def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> File
                 chosen = random.random(n) < kind.share
                 gain[chosen] *= 1.0 + kind.size_rel
                 outlier |= chosen
-    return FileScatter(gain, offset, speed, outlier)
+    return pd.DataFrame({"gain": gain, "offset_N": offset, "speed": speed, "outlier": outlier})
 
 
 def logged(
@@ -176,8 +161,7 @@ def logged(
     """Return force in N and displacement in mm as the sensors of one trace give them, shape (n,) each.
 
     `force_N` is without noise, shape (n,), at equal time steps. The magnitude of the speed turns a length of
-    correlation in mm into one in s. Every `file`, by its number, has its own noise. The force is rounded to
-    the sensor's resolution.
+    correlation in mm into one in s. Every `file`, by its number, has its own noise.
     """
     n = len(force_N)
     of_force, of_displacement = np.zeros(n), np.zeros(n)
@@ -217,11 +201,8 @@ Columns = dict[str, np.ndarray]  # a trace's columns, each of shape (n,); NaN is
 
 def draw_defects(noise: Sequence[Noise], files: int, seed: int) -> dict[int, str]:
     """Return the defect of each file that has one; fewer than asked if there are not enough files."""
-    wanted: list[str] = []
-    for kind in noise:
-        if isinstance(kind, BadData):
-            for defect in DEFECTS:
-                wanted += getattr(kind, defect) * [defect]
+    bad = [kind for kind in noise if isinstance(kind, BadData)]
+    wanted = [defect for kind in bad for defect in DEFECTS for _ in range(getattr(kind, defect))]
     order = stream(seed, "bad_data").permutation(files).tolist()
     return dict(zip(order, wanted, strict=False))
 
@@ -265,10 +246,7 @@ class NumericChannel(Strict):
 
 
 class SlowChannel(Strict):
-    """A number per file that varies slowly, as a laboratory temperature.
-
-    It is an Ornstein-Uhlenbeck process with a daily sine added.
-    """
+    """A number per file that varies slowly: an Ornstein-Uhlenbeck process with a daily sine added."""
 
     kind: Literal["slow"]
     name: str
@@ -363,23 +341,19 @@ def trace_channel(channel: TraceChannel, time_s: np.ndarray, random: np.random.G
 
 def _slow(channel: SlowChannel, elapsed_h: np.ndarray, random: np.random.Generator) -> np.ndarray:
     order = np.argsort(elapsed_h, kind="stable")
-    memory = np.exp(-np.diff(elapsed_h[order], prepend=elapsed_h[order[0]]) / channel.correlation_h)
-    kicks = random.standard_normal(len(elapsed_h))
-    walk = np.empty(len(elapsed_h))
-    last = kicks[0]
-    for place, (rho, kick) in enumerate(zip(memory, kicks, strict=True)):
-        last = rho * last + np.sqrt(1.0 - rho**2) * kick if place else kick
-        walk[order[place]] = last
+    # Nothing is remembered before the first file.
+    memory = np.exp(-np.diff(elapsed_h[order], prepend=-np.inf) / channel.correlation_h)
+    walk, last = np.empty(len(elapsed_h)), 0.0
+    for row, rho, kick in zip(order, memory, random.standard_normal(len(elapsed_h)), strict=True):
+        walk[row] = last = rho * last + np.sqrt(1.0 - rho**2) * kick
     swing = channel.daily_amplitude * np.sin(2.0 * np.pi * elapsed_h / 24.0)
     return np.round(channel.mean + channel.sd * walk + swing, channel.decimals)
 
 
 def _categories(channel: CategoryChannel, groups: int, random: np.random.Generator) -> np.ndarray:
     if channel.assignment == "unique":
-        width = len(str(groups))
-        return np.array(
-            [f"{channel.name}-{number:0{width}d}" for number in random.permutation(groups) + 1], dtype=object
-        )
+        numbers, width = random.permutation(groups) + 1, len(str(groups))
+        return np.array([f"{channel.name}-{number:0{width}d}" for number in numbers], dtype=object)
     labels = np.array(channel.labels, dtype=object)
     if channel.assignment == "balanced":
         return labels[random.permutation(groups) % len(labels)]

@@ -22,9 +22,7 @@ from sealfit.simulation.noise import Channel, Noise
 
 # ---------------------------------------------------------------- design
 
-# Number of rise lengths after which sliding counts as steady: the force has reached 1 - exp(-9) = 0.9999 of
-# its limit.
-STEADY_LENGTHS = 9.0
+STEADY_LENGTHS = 9.0  # of the rise, after which the force has reached 1 - exp(-9) = 0.9999 of its limit
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -98,18 +96,15 @@ class Design(Strict):
                 raise ValueError(f"{name} names a value twice")
         if self.both_ways and len(self.directions) < 2:
             raise ValueError("strokes_per_file above 1 needs directions = [1, -1]: strokes go both ways")
-        if self.stroke_mm < 2.5 * STEADY_LENGTHS * self.stiffness_mm:
-            raise ValueError(
-                f"stroke_mm {self.stroke_mm:g} is too short for stiffness_mm {self.stiffness_mm:g}: "
-                f"make it at least {2.5 * STEADY_LENGTHS * self.stiffness_mm:g}"
-            )
+        if self.stroke_mm < (least := 2.5 * STEADY_LENGTHS * self.stiffness_mm):
+            short = f"stroke_mm {self.stroke_mm:g} is too short for stiffness_mm {self.stiffness_mm:g}"
+            raise ValueError(f"{short}: make it at least {least:g}")
         if self.max_rows < 40 * self.strokes_per_file:
             raise ValueError(f"max_rows must be at least {40 * self.strokes_per_file}: 40 per stroke")
         fastest = self.stroke_mm / max(self.speeds_mm_s) * self.sampling_Hz
         if fastest < 40:
-            raise ValueError(
-                f"only {fastest:.0f} samples in the fastest stroke: raise sampling_Hz or stroke_mm"
-            )
+            few = f"only {fastest:.0f} samples in the fastest stroke"
+            raise ValueError(f"{few}: raise sampling_Hz or stroke_mm")
         return self
 
 
@@ -121,9 +116,8 @@ def plan_files(design: Design, random: np.random.Generator) -> pd.DataFrame:
     """
     ways = design.directions[:1] if design.both_ways else design.directions
     rows = []
-    for (temperature, compression, days), specimen in product(
-        _conditions(design), range(1, design.specimens + 1)
-    ):
+    for state, specimen in product(_conditions(design), range(1, design.specimens + 1)):
+        temperature, compression, days = state
         parts = [f"{days:g}d" if days else "unaged"] if days is not None else []
         if days != 0:
             parts += [f"{temperature:g}C"] if temperature is not None else []
@@ -137,22 +131,10 @@ def plan_files(design: Design, random: np.random.Generator) -> pd.DataFrame:
             words += [{1: "fwd", -1: "back"}[direction]] if len(ways) > 1 else []
             run_id = "_".join(words)
             for repeat in range(1, design.repeats + 1):
-                rows.append(
-                    {
-                        "file": f"traces/{run_id}_r{repeat}.csv",
-                        "run_id": run_id,
-                        "repeat": repeat,
-                        "specimen_id": specimen_id,
-                        "temperature_C": temperature,
-                        "compression_ratio_pct": compression,
-                        "aging_days": days,
-                        "load_N": load,
-                        "speed_mm_s": speed,
-                        "condition": condition,
-                        "direction": direction,
-                    }
-                )
-    files = pd.DataFrame(rows)
+                file = f"traces/{run_id}_r{repeat}.csv"
+                rows.append((file, run_id, repeat, specimen_id, *state, load, speed, condition, direction))
+    of_run = ("file", "run_id", "repeat", "specimen_id", *CONDITIONS, "load_N", "speed_mm_s")
+    files = pd.DataFrame(rows, columns=[*of_run, "condition", "direction"])
     files = files.drop(columns=[name for name in (*CONDITIONS, "load_N") if name not in design.columns])
     return _dated(files, design, random) if design.dated else files
 
@@ -229,23 +211,20 @@ class Spec(Strict):
         try:
             return self.model_copy(update={"design": Design.model_validate(design)})
         except ValidationError as error:
-            raise ConfigError(
-                explain(error), fix="Raise physics.sigma_0: the rise is load * mu / sigma_0 long."
-            ) from error
+            fix = "Raise physics.sigma_0: the rise is load * mu / sigma_0 long."
+            raise ConfigError(explain(error), fix=fix) from error
 
     @model_validator(mode="after")
     def _names_are_free(self) -> Spec:
         seen: set[str] = set()
         for channel in self.channels:
-            if channel.name in TAKEN or channel.name in seen or not NAME.fullmatch(channel.name):
-                raise ValueError(
-                    f"channel name '{channel.name}' is taken, given twice, or not letters, digits and _"
-                )
-            seen.add(channel.name)
+            name = channel.name
+            if name in TAKEN or name in seen or not NAME.fullmatch(name):
+                raise ValueError(f"channel name '{name}' is taken, given twice, or not letters, digits and _")
+            seen.add(name)
             if channel.kind == "slow" and not self.design.dated:
-                raise ValueError(
-                    f"channel '{channel.name}' drifts with the calendar: design.order must not be undated"
-                )
+                undated = "drifts with the calendar: design.order must not be undated"
+                raise ValueError(f"channel '{name}' {undated}")
         labels = {c.name: c.labels for c in self.channels if c.kind == "category" and c.labels}
         for number, effect in enumerate(self.effects):
             place = f"effects.{number} ({effect.id})"
