@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sealfit.config import parse_config
 from sealfit.draft import run_keys, trace_keys
-from sealfit.draft.columns import columns_of, find_roles
+from sealfit.draft.columns import columns_of, find_roles, measured_speeds, motion_words
 from sealfit.draft.config_text import Doubt, Guess, Notes, config_text
 from sealfit.draft.file_names import read_names
 from sealfit.draft.files_found import VALUES, find_table, look, read_tables
@@ -43,7 +43,7 @@ def draft(folder: Path) -> Draft:
         fix = "Give the folder that holds traces: time, displacement and force in columns."
         raise RequestError(f"{tables}, but no time and no force.", file=folder, fix=f"{fix} {VALUES}")
     units = trace_keys.settled_units(roles, notes)
-    speeds = trace_keys.measured_speeds(roles, units, list(tables))
+    speeds = measured_speeds(roles, units, list(tables))
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)
     names = run_keys.suited_to(read_names(found.traces), roles)
     names = run_keys.improved(names, speeds, found, notes)
@@ -58,7 +58,7 @@ def draft(folder: Path) -> Draft:
     text = config_text(folder.resolve().name or "rig", shlex.quote(str(folder)), notes)
     # A draft that is no config is a fault of this module, and raises here.
     parse_config(text, "the drafted config")
-    words = trace_keys.motion_words(roles)
+    words = motion_words(roles)
     return Draft(text, len(found.traces), words, tuple(notes.guesses), tuple(notes.doubts))
 
 

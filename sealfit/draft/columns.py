@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sealfit.config import Strokes
 from sealfit.draft.dialect import Dialect
 from sealfit.draft.vocabulary import column_role, name_and_unit
-from sealfit.ingest.strokes import Stroke, find_strokes, turning_rows
-from sealfit.units import Unit, unit_of
+from sealfit.ingest.strokes import Stroke, find_strokes, several_speeds, turning_rows
+from sealfit.units import Unit, conversion, unit_of
 
 SMOOTHED = 7  # samples, as `strokes.smooth_samples`
 MOVING = 0.3  # of the highest smoothed speed: slower samples belong to rests, ramps and turns
@@ -29,40 +30,14 @@ COPY = 0.9999  # correlation of two columns that are the same signal in two unit
 BY_BEHAVIOUR = 0.5  # how well a column must behave to be taken without a name or a unit
 
 
-# ---------------------------------------------------------------- behaviour
-# Time rises evenly, displacement fills its range, force follows the motion.
-
-
 def rises(values: np.ndarray) -> bool:
     """Whether a column rises from row to row, as time and counters do."""
     return len(values) > 2 and bool((np.diff(values) > 0).mean() > 0.99)
 
 
-def evenness(values: np.ndarray) -> float:
-    """Return how even the steps of a rising column are: 1 where all are the same."""
-    steps = np.diff(values)
-    middle = np.median(steps)
-    return float(np.mean(np.abs(steps - middle) <= 0.2 * abs(middle))) if middle else 0.0
-
-
 def is_counter(values: np.ndarray) -> bool:
     """Whether a column counts rows: whole numbers one apart."""
     return rises(values) and bool((np.diff(values) == 1.0).all())
-
-
-def spread(values: np.ndarray) -> float:
-    """Return how a column fills its range: 0.9 if every tenth has as many samples, 0 for a constant."""
-    low, high = np.min(values), np.max(values)
-    if high <= low:
-        return 0.0
-    counts, _ = np.histogram(values, bins=10, range=(low, high))
-    return float(1.0 - counts.max() / counts.sum())
-
-
-def smoothness(values: np.ndarray) -> float:
-    """Return the share of a column's path that its strokes explain: 1 for a displacement, less with noise."""
-    path = float(np.abs(np.diff(values)).sum())
-    return float((stroke_count(values) * np.ptp(values)) / path) if path else 0.0
 
 
 def stroke_count(values: np.ndarray) -> int:
@@ -90,42 +65,34 @@ def mean_speed(speed: np.ndarray) -> float:
     return float(np.mean(size[size >= MOVING * np.quantile(size, 0.95)]))
 
 
-@dataclass(frozen=True, slots=True)
-class Follows:
-    """How a column follows the motion: `sign` is that of the column where the displacement rises.
+class Follows(NamedTuple):
+    """How a column follows the motion."""
 
-    `strength` is 0 to 1; `both_ways` whether the file moves in both directions.
-    """
-
-    sign: int
-    strength: float
-    both_ways: bool
+    sign: int  # of the column where the displacement rises
+    strength: float  # 0 to 1
+    both_ways: bool  # whether the file moves in both directions
 
 
 def follows(values: np.ndarray, speed: np.ndarray) -> Follows:
     """Return how a column follows the direction of the motion.
 
     With strokes both ways its means forward and backward are compared, so an offset does not matter; with one
-    direction the mean while moving is compared with zero, and its strength with the first samples at rest.
+    direction the mean while moving is compared with zero, and its strength with the first sample.
     """
     fast = np.quantile(np.abs(speed), 0.95) * MOVING
     forward, backward = values[speed > fast], values[speed < -fast]
     least = 0.05 * len(values)
-    if len(forward) > least and len(backward) > least:
-        apart = float(np.mean(forward) - np.mean(backward))
+    if both_ways := len(forward) > least and len(backward) > least:
+        difference = level = float(np.mean(forward) - np.mean(backward))
         scatter = float(0.5 * (np.std(forward) + np.std(backward)))
-        return Follows(int(np.sign(apart)), _share(apart, scatter), True)
-    moving, way = (forward, 1) if len(forward) >= len(backward) else (backward, -1)
-    if len(moving) == 0:
-        return Follows(0, 0.0, False)
-    mean = float(np.mean(moving))
-    rest = float(values[0])
-    return Follows(int(np.sign(mean)) * way, _share(mean - rest, float(np.std(moving))), False)
-
-
-def _share(difference: float, scatter: float) -> float:
+    else:
+        moving, way = (forward, 1) if len(forward) >= len(backward) else (backward, -1)
+        if len(moving) == 0:
+            return Follows(0, 0.0, False)
+        level, difference = float(np.mean(moving)) * way, float(np.mean(moving) - values[0])
+        scatter = float(np.std(moving))
     total = abs(difference) + 2.0 * scatter
-    return abs(difference) / total if total else 0.0
+    return Follows(int(np.sign(level)), abs(difference) / total if total else 0.0, both_ways)
 
 
 def moving_strokes(time: np.ndarray, displacement: np.ndarray) -> list[Stroke]:
@@ -169,13 +136,18 @@ class TraceColumn:
         """How a config names it: by name, or by position where the name is missing or stands twice."""
         return self.label if self.by_name else self.position
 
+    @property
+    def dimension(self) -> str:
+        """What its unit measures; "" without a unit."""
+        return "" if self.unit is None else self.unit.dimension
+
     def in_unit_of(self, role: str) -> bool:
         """Whether its unit is one of that role."""
-        return self.unit is not None and self.unit.dimension in DIMENSION[role]
+        return self.dimension in DIMENSION[role]
 
     def may_be(self, role: str) -> bool:
         """Whether its unit and its name leave it free to be that."""
-        if self.unit is not None and self.unit.dimension not in ("none", "share", *DIMENSION[role]):
+        if self.dimension not in ("", "none", "share", *DIMENSION[role]):
             return False
         return not self.sure or self.role == role or (self.sure == 1 and self.unit is not None)
 
@@ -200,7 +172,7 @@ class Roles:
     def dimension(self, role: str) -> str:
         """Return what the unit of a role's column measures; "" where there is no column or no unit."""
         column = getattr(self, role)
-        return column.unit.dimension if column is not None and column.unit is not None else ""
+        return "" if column is None else column.dimension
 
 
 def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[TraceColumn]:
@@ -223,20 +195,12 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[TraceColu
         if role == "torque":
             role = "force"
         by_name = bool(label) and dialect.names.count(label) == 1 and dialect.names_are_cells
-        values = tuple(table[:, i] for table in tables)
-        found.append(
-            TraceColumn(i + 1, label, role, sure, unit, values, by_name, said if unit is None else "")
-        )
-    return _copies_marked(found)
-
-
-def _copies_marked(columns: list[TraceColumn]) -> list[TraceColumn]:
-    """Return the columns, the earlier of two with the same signal marked: loggers write the raw one first."""
-    marked = []
-    for i, column in enumerate(columns):
-        later = next((other for other in columns[i + 1 :] if _same_signal(column, other)), None)
-        marked.append(replace(column, copy_of=later.position) if later else column)
-    return marked
+        values, unknown = tuple(table[:, i] for table in tables), said if unit is None else ""
+        found.append(TraceColumn(i + 1, label, role, sure, unit, values, by_name, unknown))
+    for i, column in enumerate(found):  # of two with the same signal loggers write the raw one first
+        if later := next((other for other in found[i + 1 :] if _same_signal(column, other)), None):
+            found[i] = replace(column, copy_of=later.position)
+    return found
 
 
 def _same_signal(one: TraceColumn, other: TraceColumn) -> bool:
@@ -284,14 +248,22 @@ def _best(columns: Sequence[TraceColumn], role: str, behaves) -> TraceColumn | N
 
 
 def _as_time(column: TraceColumn) -> float:
-    if not all(rises(values) for values in column.values):
+    """Return the share of steps that are like the median one: 1 for a clock, little for a count of rows."""
+    if not all(map(rises, column.values)):
         return 0.0
-    even = float(np.median([evenness(values) for values in column.values]))
-    return 0.3 * even if all(is_counter(values) for values in column.values) else max(even, 0.3)
+    steps = map(np.diff, column.values)
+    even = float(np.median([np.mean(np.abs(s - np.median(s)) <= 0.2 * np.median(s)) for s in steps]))
+    return 0.3 * even if all(map(is_counter, column.values)) else max(even, 0.3)
 
 
 def _as_displacement(column: TraceColumn) -> float:
-    return float(np.median([spread(v) * smoothness(v) for v in column.values]))
+    """Return how a column fills its range, times the share of its path that its strokes explain."""
+    found = []
+    for values in column.values:
+        counts, _ = np.histogram(values, bins=10)
+        path, strokes = np.abs(np.diff(values)).sum(), stroke_count(values) * np.ptp(values)
+        found.append((1.0 - counts.max() / counts.sum()) * (strokes / path) if path else 0.0)
+    return float(np.median(found))
 
 
 def _as_force(column: TraceColumn, velocities: Sequence[np.ndarray]) -> float:
@@ -334,3 +306,30 @@ def _with_sign(roles: Roles, velocities: Sequence[np.ndarray]) -> Roles:
         signed_files=agree,
         strength=max((one.strength for one in found if one.both_ways), default=0.0),
     )
+
+
+def measured_speeds(roles: Roles, units: Mapping[str, Unit], files: Sequence[str]) -> dict[str, float]:
+    """Return the speed in mm/s of each file with strokes of one speed, negative where all go backward."""
+    if roles.time is None or roles.dimension("displacement") == "angle":
+        return {}
+    if roles.displacement is None:
+        values = () if roles.speed is None else roles.speed.values
+        return dict(zip(files, map(mean_speed, values), strict=False))
+    given = {"time": "s", "displacement": "mm"} | {role: unit.name for role, unit in units.items()}
+    in_s, in_mm = conversion(given["time"], "s"), conversion(given["displacement"], "mm")
+    speeds: dict[str, float] = {}
+    for file, time, displacement in zip(files, roles.time.values, roles.displacement.values, strict=True):
+        found = moving_strokes(in_s(time), in_mm(displacement))
+        own = [stroke.speed_mm_s for stroke in found]
+        if own and not several_speeds(own):
+            speeds[file] = float(np.median(np.abs(own)) * (-1 if max(own) < 0 else 1))
+    return speeds
+
+
+def motion_words(roles: Roles) -> str:
+    """Return what the motion is like, for the summary."""
+    strokes = 1
+    if roles.displacement is not None:
+        strokes = int(np.median([stroke_count(values) for values in roles.displacement.values]))
+    many = "one stroke" if strokes == 1 else f"about {strokes} strokes"
+    return f"{many} in a file, {'both ways' if roles.both_ways else 'one way'}"

@@ -11,7 +11,6 @@ from sealfit.draft.dialect import When
 from sealfit.units import Unit, Units, unit_of
 
 WIDTH = 110  # characters of a comment's line
-
 SECTIONS = (
     "", "files", "files.columns", "files.values", "files.compute", "files.units", "files.runs_columns",
     "runs.compute", "trace", "trace.columns", "trace.header_fields", "trace.compute", "quantities",
@@ -60,10 +59,6 @@ class Notes:
         self.doubts.append(Doubt(key, reason, fix, tuple(lines)))
 
 
-# ---------------------------------------------------------------- lines for a column
-# The one place where a unit that is not the default, or a date that is not ISO 8601, becomes config lines.
-
-
 def file_column(name: str | int, unit: Unit | None, ours: str) -> Value:
     """Return a column of a file as a config writes it: with its unit where that is not the unit of `ours`."""
     return name if is_own_unit(unit, ours) else {"name": name, "unit": unit.name}
@@ -76,14 +71,11 @@ def is_own_unit(unit: Unit | None, ours: str) -> bool:
 
 def date_lines(when: When) -> list[str]:
     """Return the lines of config that a date needs which is not ISO 8601; those of `[files]` come last."""
-    lines = [f"started_at = {literal(when.pattern)}"]
+    lines = [("started_at", when.pattern)]
     if when.clock:
-        lines = [f"started_day = {literal(when.pattern)}", f"started_clock = {literal(when.clock)}"]
-        lines.append(f"started_at = {toml({'date': 'started_day', 'time': 'started_clock'})}")
-    return [*lines, f"date_format = {literal(when.format)}"]
-
-
-# ---------------------------------------------------------------- text
+        lines = [("started_day", when.pattern), ("started_clock", when.clock)]
+        lines.append(("started_at", {"date": "started_day", "time": "started_clock"}))
+    return [f"{key} = {toml(value)}" for key, value in [*lines, ("date_format", when.format)]]
 
 
 def literal(text: str) -> str:
@@ -135,11 +127,8 @@ def config_text(name: str, folder: str, notes: Notes) -> str:
         for guess in guesses:
             lines += _comment(guess.evidence) + doubts.pop(guess.key, [])
             lines.append(f"{_key(guess.key.rpartition('.')[2])} = {toml(guess.value)}")
-    if doubts:
-        lines.append("")
-    for rest in doubts.values():
-        lines += rest
-    return "\n".join(lines) + "\n"
+    rest = [line for about in doubts.values() for line in about]
+    return "\n".join([*lines, *([""] if rest else []), *rest]) + "\n"
 
 
 def _comment(text: str) -> list[str]:

@@ -1,6 +1,4 @@
-"""How a text file of numbers is written: separator, decimal sign, header, line of names, units, footer.
-
-Its header lines may say when the file was started and how the rig was set.
+"""How a text file of numbers is written, and what its header lines say of the date and the rig.
 
 The data are the lines that hold numbers where the last lines of the sample do; separator and decimal sign are
 those that leave nothing but numbers there, else the most of them.
@@ -13,6 +11,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import product
+from typing import NamedTuple
 
 from sealfit.config import AGING_CONDITION
 from sealfit.draft.vocabulary import column_role, name_and_unit, plain, setting
@@ -20,16 +20,11 @@ from sealfit.ingest.derived_columns import UNAGED_WORDS
 from sealfit.ingest.files import as_number, split_line
 from sealfit.units import Unit, conversion, unit_of
 
-# Lines from the top that are looked at: longer than the headers we know of, by five times.
-SAMPLE_LINES = 200
-# Lines at either end of a file that are looked at for lines that are no data.
-ENDS = 1000
-# Fewer rows of numbers are a table of settings or results, not a trace.
-MIN_ROWS = 8
-# Header lines above the data in which names and units are looked for.
-NAMES_ABOVE = 12
-# What lines end in without meaning: separators of empty columns, and those that a spreadsheet adds.
-STRAYS = ",;| \t"
+SAMPLE_LINES = 200  # from the top that are looked at: longer than the headers we know of, by five times
+ENDS = 1000  # lines at either end of a file that are looked at for lines that are no data
+MIN_ROWS = 8  # fewer rows of numbers are a table of settings or results, not a trace
+NAMES_ABOVE = 12  # header lines above the data in which names and units are looked for
+STRAYS = ",;| \t"  # what lines end in without meaning: separators of empty columns, or of a spreadsheet
 DELIMITERS = ("tab", ";", ",", "|", "whitespace")  # of equally good ones the first is taken
 
 # What header lines may set, and what its unit measures.
@@ -47,8 +42,7 @@ _NUMBER = re.compile(rf"{_SIZE}(?=$|[\s;,\t\"°%A-Za-zµ])")
 _SAMPLED = r"(?:sampl|abtast|mess|scan|acqui|logg|data|daten|campion|echantillon|muestre)"
 _RATE = re.compile(rf"{_SAMPLED}.*(?:rate|freq)|(?:rate|freq).*{_SAMPLED}")  # not that of a motion
 _STEP = re.compile(rf"{_SAMPLED}.*(?:interval|period)|(?:interval|period).*{_SAMPLED}|\bdt\b|\bdelta [tx]\b")
-# The header field that an expression for the rate reads; by its first letter it is no channel.
-RATE = "_rate"
+RATE = "_rate"  # header field that an expression for the rate reads; by its first letter it is no channel
 _DATE = re.compile(r"(?<!\d)(?:20\d\d([-/])\d\d?\1\d\d?|\d\d?(?P<mark>[./])\d\d?(?P=mark)20\d\d)(?!\d)")
 _DATES = ("%d.%m.%Y", "%Y-%m-%d", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y")
 _ISO = [f"%Y-%m-%d{mark}%H:%M{seconds}" for mark in " T" for seconds in ("", ":%S")]
@@ -59,30 +53,22 @@ CLOCK = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How one file is written.
-
-    `header` are the lines above the data; `names` and `units` have one entry per column, or none;
-    `names_back` and `units_back` count their lines back from the header's end, 1 the last; `names_are_cells`
-    is False where the reader cuts the line of names in another way, as names hold the separator. `numbers`
-    are the positions (from 0) that hold numbers, `first` is the first line of data, `footer` are the lines
-    below. `decimal` is "" where no number has one. `grouped` is a cell with marks between thousands, "" where
-    there is none.
-    """
+    """How one file is written."""
 
     delimiter: str
-    decimal: str
-    header: tuple[str, ...]
-    names: tuple[str, ...]
-    names_back: int | None
+    decimal: str  # "" where no number has one
+    header: tuple[str, ...]  # lines above the data
+    names: tuple[str, ...]  # one per column, or none
+    names_back: int | None  # their line, counted back from the header's end, 1 the last
     units: tuple[str, ...]
     units_back: int | None
-    numbers: tuple[int, ...]
+    numbers: tuple[int, ...]  # positions that hold numbers, from 0
     width: int
-    trailing: bool
-    first: str
-    names_are_cells: bool = True
-    footer: tuple[str, ...] = ()
-    grouped: str = ""
+    trailing: bool  # lines of data end in separators
+    first: str  # line of data
+    names_are_cells: bool  # False where the reader cuts the line of names otherwise: names hold separators
+    footer: tuple[str, ...]  # lines below the data
+    grouped: str  # a cell with marks between thousands, "" where there is none
 
 
 def sniff(text: str) -> Dialect | None:
@@ -94,22 +80,14 @@ def sniff(text: str) -> Dialect | None:
     if len(lines) > 2 * ENDS:
         lines = lines[:ENDS] + lines[-ENDS:]
     sample = lines[:SAMPLE_LINES]
-    found = [
-        _block(sample, delimiter, decimal)
-        for delimiter in DELIMITERS
-        for decimal in (".", ",")  # a point, where there are whole numbers only
-        if decimal != delimiter
-    ]
-    tables = [block for block in found if block.rows >= MIN_ROWS and len(block.numbers) >= 2]
+    # a point before a comma: where there are whole numbers only, the first is taken
+    blocks = [_block(sample, mark, decimal) for mark, decimal in product(DELIMITERS, ".,") if mark != decimal]
+    tables = [block for block in blocks if block is not None and block.rows >= MIN_ROWS]
     best = max(tables, key=lambda block: (block.pure, block.rows * len(block.numbers)), default=None)
     return None if best is None else _dialect(lines, best)
 
 
-# ---------------------------------------------------------------- data
-
-
-@dataclass(frozen=True, slots=True)
-class _Block:
+class _Block(NamedTuple):
     """Data lines under one separator and decimal sign: where they begin and which positions hold numbers."""
 
     delimiter: str
@@ -117,10 +95,10 @@ class _Block:
     start: int
     rows: int
     numbers: tuple[int, ...]
-    pure: bool = False  # nothing but numbers in its lines
+    pure: bool  # nothing but numbers in its lines
 
 
-def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
+def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block | None:
     """Return the data lines: those with numbers where most lines of the second half have them."""
     numbers = [_numeric(line, delimiter, decimal) for line in lines]
     several = [found for found in numbers[len(lines) // 2 :] if found and len(found) >= 2]
@@ -129,12 +107,11 @@ def _block(lines: Sequence[str], delimiter: str, decimal: str) -> _Block:
     data = [(i, found is not None and core <= found) for i, found in enumerate(numbers) if found is not None]
     start = _first_of_many([is_data for _, is_data in data])
     if len(core) < 2 or start is None:
-        return _Block(delimiter, decimal, 0, 0, ())
-    rows = sum(is_data for _, is_data in data[start:])
-    rows_of_cells = [split_line(lines[i], delimiter) for i, good in data[start:] if good]
-    full = [sum(bool(cell.strip()) for cell in cells) for cells in rows_of_cells]
-    pure = sum(count == len(core) for count in full) > 0.9 * len(full)
-    return _Block(delimiter, decimal, data[start][0], rows, tuple(sorted(core)), pure)
+        return None
+    rows = [split_line(lines[i], delimiter) for i, good in data[start:] if good]
+    full = [sum(bool(cell.strip()) for cell in cells) for cells in rows]
+    pure = full.count(len(core)) > 0.9 * len(full)
+    return _Block(delimiter, decimal, data[start][0], len(rows), tuple(sorted(core)), pure)
 
 
 def _numeric(line: str, delimiter: str, decimal: str) -> frozenset[int] | None:
@@ -153,9 +130,6 @@ def _first_of_many(data: Sequence[bool]) -> int | None:
         if is_data and sum(following) >= min(MIN_ROWS, len(data) - i) - 1:
             return i
     return None
-
-
-# ---------------------------------------------------------------- header
 
 
 # A number with marks between its thousands: 1.120,000 or 12'500.5.
@@ -197,13 +171,9 @@ def _dialect(lines: list[str], block: _Block) -> Dialect:
 
 
 def _header_cells(line: str, delimiter: str, width: int) -> list[str]:
-    """Return the cells of a header line.
-
-    A mark of comment in a cell of its own is left out; names with blanks in them, above columns of blanks,
-    are those that two blanks part.
-    """
+    """Return the cells of a header line; names with blanks, above columns of blanks, are two blanks apart."""
     cells = _cells_of(line, delimiter)
-    if len(cells) == width + 1 and cells[0] in ("#", "%", "//", ";"):
+    if len(cells) == width + 1 and cells[0] in ("#", "%", "//", ";"):  # a mark of comment
         return cells[1:]
     if delimiter == "whitespace" and len(cells) != width:
         apart = re.split(r"\s{2,}|\t", line.strip())
@@ -217,7 +187,7 @@ def _cells_of(line: str, delimiter: str) -> list[str]:
 
 def _units_line(rows: Sequence[Sequence[str]]) -> int | None:
     """Return the line of units nearest to the data: two or more, and more than half of the cells."""
-    for i in range(len(rows) - 1, max(-1, len(rows) - 1 - NAMES_ABOVE), -1):
+    for i in range(len(rows))[: -NAMES_ABOVE - 1 : -1]:
         full = [cell for cell in rows[i] if cell]
         units = sum(unit_of(cell) is not None for cell in full)
         if units >= 2 and units > 0.5 * len(full) and not all(as_number(cell) is not None for cell in full):
@@ -227,17 +197,13 @@ def _units_line(rows: Sequence[Sequence[str]]) -> int | None:
 
 def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, count: int) -> int | None:
     """Return the line of names: as wide as the data, no numbers, most words that are names of columns."""
-    best, most = None, -1
-    for i in range(len(rows) - 1, max(-1, len(rows) - 1 - NAMES_ABOVE), -1):
-        cells = rows[i]
-        full = [cell for cell in cells if cell]
-        texts = sum(as_number(cell) is None and as_number(cell, ",") is None for cell in full)
-        if i == units_at or len(cells) <= last or texts < max(2, count - 1) or texts < len(full):
-            continue
-        words = sum(column_role(cell)[1] for cell in full)
-        if words > most:
-            best, most = i, words
-    return best
+    found = []
+    for i in range(len(rows))[: -NAMES_ABOVE - 1 : -1]:
+        full = [cell for cell in rows[i] if cell]
+        texts = all(as_number(cell) is None and as_number(cell, ",") is None for cell in full)
+        if i != units_at and len(rows[i]) > last and texts and len(full) >= max(2, count - 1):
+            found.append(i)
+    return max(found, key=lambda i: sum(column_role(cell)[1] for cell in rows[i]), default=None)
 
 
 # ---------------------------------------------------------------- header lines
@@ -245,33 +211,26 @@ def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A setting in a header line of every file: our name of it, "" for none, and what the files call it.
+    """A setting in a header line of every file."""
 
-    `pattern` finds it, and `values` are what each of the files has; `line` and `text` are its line in the
-    first.
-    """
-
-    ours: str
-    name: str
-    pattern: str
+    ours: str  # "" for none
+    name: str  # what the files call it
+    pattern: str  # that finds it
     unit: Unit | None
-    values: tuple[str, ...]
-    line: int
-    text: str
+    values: tuple[str, ...]  # of each of the files
+    line: int  # of the first file
+    text: str  # of that line
 
 
 @dataclass(frozen=True, slots=True)
 class When:
-    """A date in header lines: the pattern that finds it and its format, "" for ISO 8601.
+    """A date in header lines."""
 
-    `clock` is the pattern for the time of day where that stands in a line of its own.
-    """
-
-    pattern: str
-    format: str
+    pattern: str  # that finds it
+    format: str  # "" for ISO 8601
     line: int
     text: str
-    clock: str = ""
+    clock: str = ""  # pattern of the time of day, where that stands in a line of its own
 
 
 def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Setting]:
@@ -313,10 +272,9 @@ def settings_in(headers: Sequence[Sequence[str]], decimal: str) -> list[Setting]
     """Return the settings that the header lines of every file give, those that their words name."""
     found: dict[str, Setting] = {}
     said = list(_settings(headers, decimal))
-    ovens = [
-        one for one in said if one.ours == "aging_days" and one.unit and one.unit.dimension == "temperature"
-    ]
-    for one in [*said, *(replace(oven, ours="temperature_C") for oven in ovens)]:
+    aged = [one for one in said if one.ours == "aging_days" and one.unit]
+    ovens = [replace(one, ours="temperature_C") for one in aged if one.unit.dimension == "temperature"]
+    for one in [*said, *ovens]:
         fits = one.unit is None or one.unit.dimension == SETTINGS.get(one.ours)
         differs = one.ours == "specimen_id" and len(set(one.values)) > 1
         if differs or (one.ours in SETTINGS and fits):

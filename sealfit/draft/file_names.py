@@ -11,6 +11,9 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
 
 from sealfit.config import AGING_CONDITION, Files
 from sealfit.draft.vocabulary import DIRECTIONS, RUBBERS, UNAGED, after_number, before_number
@@ -25,44 +28,34 @@ _TOKEN = re.compile(
     r"|(?P<number>(?:(?:(?<=[/_\s=(])|^)-)?\d+(?:[.,]\d+|p\d+)?)"
     r"|(?P<sep>[^\w%°]+|_+)"
 )
-# Different values up to which a word is a label and a bare number may be a repeat.
-FEW = 12
-# Percent: a smaller compression is how much the rubber was compressed; none is squeezed below half.
-HEIGHT_FROM = 50.0
-# Share of the names that another way of naming must have for a word to be optional; fewer are slips.
-ALIKE = 0.2
+FEW = 12  # different values up to which a word is a label and a bare number may be a repeat
+HEIGHT_FROM = 50.0  # percent: a smaller compression is how much was taken away; none is squeezed below half
+ALIKE = 0.2  # share of names that another way of naming must have for a word to be optional; fewer are slips
 # What numbers that count up from 1 are not, whatever letter stands before them: T1 and T2 are tests.
 NO_COUNTS = ("temperature_C", "compression_ratio_pct", "load_N")
-# Files from which on a number that is another in each of them counts files, not repeats.
-COUNTED = 6
+COUNTED = 6  # files from which on a number that is another in each of them counts files, not repeats
 
 
-@dataclass(frozen=True, slots=True)
-class Token:
-    """A piece of a name: `kind` is date, word, number or sep."""
+class Token(NamedTuple):
+    """A piece of a name."""
 
-    kind: str
+    kind: str  # date, word, number or sep
     text: str
 
 
 @dataclass(frozen=True)
 class NamePart:
-    """A piece of the names that stands for something.
-
-    `ours` is the column that it gives, "" for a piece that is matched only. `texts` are its different values;
-    `expression` what computes the column where it is not the number itself; `unit` that of the number, "" for
-    the column's own; `signs` those of words for a direction.
-    """
+    """A piece of the names that stands for something."""
 
     at: int
-    ours: str
+    ours: str  # the column that it gives, "" for a piece that is matched only
     pattern: str
-    texts: tuple[str, ...]
+    texts: tuple[str, ...]  # its different values
     why: str
-    expression: str = ""
-    unit: str = ""
+    expression: str = ""  # that computes the column where it is not the number itself
+    unit: str = ""  # of the number, "" for the column's own
     doubt: str = ""
-    signs: Mapping[str, float] = field(default_factory=dict)
+    signs: Mapping[str, float] = field(default_factory=dict)  # of words for a direction
 
     @property
     def group(self) -> str:
@@ -74,18 +67,14 @@ class NamePart:
 
 @dataclass(frozen=True)
 class Names:
-    """What names of files say: the pieces of the first of them, and the parts that stand for something.
-
-    One of the `words` for unaged rubber may stand in place of the pieces in the range `middle`. `templates`
-    are columns beside those of the parts.
-    """
+    """What names of files say: the pieces of the first of them, and the parts that stand for something."""
 
     files: tuple[str, ...]
-    pieces: tuple[Token, ...] = ()
-    parts: tuple[NamePart, ...] = ()
-    middle: tuple[int, int] | None = None
-    words: tuple[str, ...] = ()
-    templates: Mapping[str, str] = field(default_factory=dict)
+    pieces: tuple[Token, ...]
+    parts: tuple[NamePart, ...]
+    middle: tuple[int, int] | None  # the range of pieces in place of which one of the `words` may stand
+    words: tuple[str, ...]  # for unaged rubber
+    templates: Mapping[str, str] = field(default_factory=dict)  # of columns beside those of the parts
 
     @cached_property
     def settings(self) -> Files:
@@ -199,10 +188,7 @@ def settings_of(names: Names) -> Files:
 
 
 def _templates(names: Names, pattern: str) -> dict[str, str]:
-    """Return the columns that are put together from parts: the date, and the specimen.
-
-    Numbers of specimens that start again in every condition name pieces of each.
-    """
+    """Return the columns put together from parts: the date, and the specimen with its condition."""
     made = {}
     if "_year" in pattern:
         seconds = "{_second}" if "_second" in pattern else "00"
@@ -279,15 +265,15 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     """Return a number with what the letters around it say; without `ours` where they say nothing."""
     pattern = _number_pattern(texts)
     after, before = _around(rows, at)
+    unit = ""
     if after and (said := after_number(re.sub(r"[-_ /]", "", after))):
-        ours, unit = said
-        why = f"'{after}' stands after the number"
-        return _as_height(NamePart(at, ours, pattern, texts, why, unit=unit), before)
-    ours = before_number(before) if before else ""
-    if ours in NO_COUNTS and _counts_up(texts):
-        ours = ""
-    why = f"'{before}' stands before the number" if before else "a bare number"
-    return _as_height(NamePart(at, ours, pattern, texts, why), before)
+        (ours, unit), why = said, f"'{after}' stands after the number"
+    else:
+        ours = before_number(before) if before else ""
+        why = f"'{before}' stands before the number" if before else "a bare number"
+        if ours in NO_COUNTS and _counts_up(texts):
+            ours = ""
+    return _as_height(NamePart(at, ours, pattern, texts, why, unit=unit), before)
 
 
 def _counts_up(texts: Sequence[str]) -> bool:
@@ -351,17 +337,12 @@ def _with_bare_numbers(parts: Sequence[NamePart], rows: Sequence[Sequence[Token]
         elif not has_repeat and _repeats(part, known, rows):
             has_repeat = True
             made.append(replace(part, ours="repeat", why=f"{part.why}, few values, each once per setting"))
-        elif len(part.texts) == len(rows) and _counts(part):
+        elif len(part.texts) == len(rows) and np.ptp(list(map(as_float, part.texts))) < 2 * len(rows):
             made.append(replace(part, why=f"{part.why} that counts the files"))
         else:
             doubt = "what this number stands for is not known; it is kept as a channel"
             made.append(replace(part, ours=f"part_{part.at}", doubt=doubt))
     return made
-
-
-def _counts(part: NamePart) -> bool:
-    numbers = [as_float(text) for text in part.texts]
-    return max(numbers) - min(numbers) < 2 * len(numbers)
 
 
 def _repeats(part: NamePart, known: Sequence[NamePart], rows: Sequence[Sequence[Token]]) -> bool:
@@ -417,10 +398,7 @@ def _unaged(
 def _optional_word(
     main: Sequence[str], groups: Mapping[tuple, Sequence[str]], cut: Mapping[str, list[Token]]
 ) -> tuple[int, str] | None:
-    """Return place and text of a word before a number that many names have and the main ones do not.
-
-    `n25` beside `25` is the other direction.
-    """
+    """Return place and text of a word before a number that only some names have: `n25` beside `25`."""
     row = cut[main[0]]
     for members in groups.values():
         if len(members) >= ALIKE * len(main):

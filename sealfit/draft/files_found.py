@@ -42,21 +42,16 @@ MAX_BYTES = 4_000_000  # a larger file is no list of runs
 
 @dataclass(frozen=True)
 class Found:
-    """The files of a folder, as paths below it.
-
-    `traces` are those that one config can read, `dialects` how some of them are written, `wider` those of
-    them that have further columns; `otherwise` are traces written in another way, `others` files that are
-    none, `unreadable` files with the reason, `formats` counts by suffix the files that sealfit cannot read.
-    """
+    """The files of a folder, as paths below it."""
 
     folder: Path
-    traces: tuple[str, ...]
-    dialects: dict[str, Dialect]
-    wider: dict[str, Dialect]
-    otherwise: dict[str, Dialect]
-    others: tuple[str, ...]
-    unreadable: dict[str, str]
-    formats: Counter
+    traces: tuple[str, ...]  # those that one config can read
+    dialects: dict[str, Dialect]  # how some of them are written
+    wider: dict[str, Dialect]  # how those of them are written that have further columns
+    otherwise: dict[str, Dialect]  # traces written in another way
+    others: tuple[str, ...]  # files that are no traces
+    unreadable: dict[str, str]  # files with the reason
+    formats: Counter  # files that sealfit cannot read, by suffix
 
     @property
     def sniffed(self) -> list[Dialect]:
@@ -73,12 +68,8 @@ class Found:
 def look(folder: Path) -> Found:
     """Return what lies in a folder.
 
-    Raises
-    ------
-    RequestError
-        If there is no such folder, or no trace file in it.
-    CampaignError
-        If the library that reads a file is not installed.
+    RequestError if there is no such folder, or no trace file in it. CampaignError if the library that reads a
+    file is not installed.
     """
     if not folder.is_dir():
         reason = "is a file, not a folder." if folder.is_file() else "there is no such folder."
@@ -121,10 +112,8 @@ def _files(folder: Path) -> list[str]:
 
 
 def _may_be_trace(file: str) -> bool:
-    path = PurePosixPath(file)
-    if path.suffix.lower() in FORMATS or path.suffix.lower() in DOCUMENTS:
-        return False
-    return not path.name.lower().startswith(NO_TRACES)
+    path = PurePosixPath(file.lower())
+    return path.suffix not in FORMATS and path.suffix not in DOCUMENTS and not path.name.startswith(NO_TRACES)
 
 
 def _kind(file: str) -> tuple:
@@ -162,13 +151,7 @@ def text_of(folder: Path, file: str) -> str:
     """Return a file as text: cells of sheets and arrays lie between tabs.
 
     Of a large file it is the whole lines of the beginning, of a workbook the sheet with the most rows.
-
-    Raises
-    ------
-    BadFile
-        If it cannot be read.
-    CampaignError
-        If the library that reads it is not installed.
+    BadFile if it cannot be read. CampaignError if the library that reads it is not installed.
     """
     kind = kind_of(file)
     if kind in OF_ARRAYS:
@@ -220,24 +203,19 @@ def _holds(one: Dialect, usual: Dialect) -> bool:
 VALUES = "A table of values over aging days is fitted by: sealfit fit-aging --values TABLE --out OUT."
 
 
-def _no_traces(
-    folder: Path, files: Sequence[str], formats: Counter, unreadable: dict[str, str]
-) -> RequestError:
+def _no_traces(folder: Path, files: Sequence[str], formats: Counter, unreadable: dict) -> RequestError:
     fix = "Give the folder that holds the trace files, or export them as text (CSV)."
     if not files:
-        return RequestError("the folder is empty.", file=folder, fix=fix)
-    if unreadable:
-        file, reason = next(iter(unreadable.items()))
-        return RequestError(f"no trace file can be read: {file} {reason}", file=folder, fix=fix)
-    if formats:
+        reason = "the folder is empty."
+    elif unreadable:
+        reason = f"no trace file can be read: {' '.join(next(iter(unreadable.items())))}"
+    elif formats:
         what = ", ".join(f"{count} {FORMATS[suffix]} ({suffix})" for suffix, count in formats.most_common())
-        return RequestError(f"holds {what} and no trace file that can be read.", file=folder, fix=fix)
-    shown = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
-    reason = f"none of {len(files)} files holds a table of numbers with two columns or more ({shown})."
-    return RequestError(reason, file=folder, fix=f"{fix} {VALUES}")
-
-
-# ---------------------------------------------------------------- numbers
+        reason = f"holds {what} and no trace file that can be read."
+    else:
+        shown, fix = ", ".join(files[:3]) + (", ..." if len(files) > 3 else ""), f"{fix} {VALUES}"
+        reason = f"none of {len(files)} files holds a table of numbers with two columns or more ({shown})."
+    return RequestError(reason, file=folder, fix=fix)
 
 
 def read_tables(found: Found) -> dict[str, np.ndarray]:
@@ -269,17 +247,13 @@ def _numbers(lines: Sequence[str], dialect: Dialect) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RunsTable:
-    """A table with a line for each trace file.
-
-    `ours` is our name of each of its columns, by theirs; `units` the units that their names carry; `named` is
-    how many of its cells name a trace file, with or without folders and suffix.
-    """
+    """A table with a line for each trace file."""
 
     file: str
-    ours: Mapping[str, str]
-    units: Mapping[str, Unit]
+    ours: Mapping[str, str]  # our name of each of its columns, by theirs
+    units: Mapping[str, Unit]  # that the names of its columns carry
     cells: Mapping[str, Sequence[str]]
-    named: int
+    named: int  # cells that name a trace file, with or without folders and suffix
 
     @property
     def given(self) -> set[str]:
@@ -302,7 +276,7 @@ def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
         return None
     cells = {name: [cell or "" for cell in column] for name, column in columns.items()}
     naming = {name: _names_files(column, traces) for name, column in cells.items()}
-    best = max(naming, key=lambda name: naming[name], default=None)
+    best = max(naming, key=naming.get, default=None)
     if best is None or not cells[best] or naming[best] < NAMING * len(cells[best]):
         return None
     ours, units = _meanings(best, cells)

@@ -7,6 +7,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import PurePosixPath
 
@@ -42,16 +43,11 @@ def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, 
     """Return what the names of files say, by file."""
     settings = names.settings
     conversions = {name: conversion(unit, Units().of(name)) for name, unit in settings.units.items()}
-    found = {}
+    found: dict[str, dict[str, float | str]] = {file: {} for file in files}
     for file in files:
-        try:
+        with suppress(ConfigError):
             found[file] = channels_of(name_parts(file, settings, conversions))
-        except ConfigError:
-            found[file] = {}
     return found
-
-
-# ---------------------------------------------------------------- names
 
 
 def improved(names: Names, speeds: Mapping[str, float], found: Found, notes: Notes) -> Names:
@@ -86,11 +82,10 @@ def _with_speed(names: Names, speeds: Mapping[str, float], notes: Notes) -> Name
     if "speed_mm_s" in names.given:
         named = {f: v.get("speed_mm_s") for f, v in said.items()}
         ratio = _ratio(named, speeds)
-        if ratio is not None and abs(ratio - 1) > AGREES:
+        if ratio is None:
+            _doubt_speeds(named, speeds, notes)
+        elif abs(ratio - 1) > AGREES:
             return _speed_in_unit(names, ratio, notes)
-        if ratio is None and (other := _disagreement(named, speeds)):
-            fix = "Check the units of time and displacement, and whether this number is a speed."
-            notes.doubt("files.name_pattern", other, fix)
         return names
     for part in names.parts:
         if part.ours.startswith("part_") and len(part.texts) > 1:
@@ -112,13 +107,15 @@ def _ratio(said: Mapping[str, object], measured: Mapping[str, float]) -> float |
     return middle if agree >= MOSTLY * len(ratios) else None
 
 
-def _disagreement(said: Mapping[str, object], measured: Mapping[str, float]) -> str:
-    """Return the first file whose named speed is not that measured; "" if there is none."""
+def _doubt_speeds(said: Mapping[str, object], measured: Mapping[str, float], notes: Notes) -> None:
+    """Add a doubt about the first file whose named speed is not that measured."""
     for file, speed in said.items():
         found = abs(measured.get(file, 0.0))
         if isinstance(speed, int | float) and found and abs(abs(speed) / found - 1) > AGREES:
-            return f"the speed in the name of {file} is {abs(speed):g}, and {found:.3g} mm/s is measured."
-    return ""
+            reason = f"the speed in the name of {file} is {abs(speed):g}, and {found:.3g} mm/s is measured."
+            fix = "Check the units of time and displacement, and whether this number is a speed."
+            notes.doubt("files.name_pattern", reason, fix)
+            return
 
 
 def _speed_in_unit(names: Names, ratio: float, notes: Notes) -> Names:
@@ -196,10 +193,9 @@ def beside_table(names: Names, table: RunsTable) -> Names:
 
 
 def suited_to(names: Names, roles: Roles) -> Names:
-    """Return the names as the columns of traces ask for it.
+    """Return the names as the columns of traces ask for it: with rpm as the speed of a rotation.
 
-    Where these hold an angle or a rotational speed, rpm in names are the speed. Where they hold a torque, the
-    one load in names is matched only: their ratio is no friction coefficient.
+    Beside a torque the one load in names is matched only: their ratio is no friction coefficient.
     """
     ours = {part.ours: part for part in names.parts}
     rotates = roles.dimension("speed" if roles.displacement is None else "displacement")
@@ -240,10 +236,10 @@ def _otherwise(others: Mapping[str, Dialect], notes: Notes) -> None:
     one, shown = next(iter(others.values())), ", ".join(list(others)[:3])
     columns = ", ".join(one.names[:4]) or "without names"
     form = f"separator '{one.delimiter}', decimal '{one.decimal or '.'}', columns {columns}"
-    fix = "Move them to a folder of their own and draft a config for them, too."
     count = "1 file is" if len(others) == 1 else f"{len(others)} files are"
-    reason = f"{count} written otherwise ({form}): {shown}."
-    notes.doubt("files", reason, f"One config reads files of one form. {fix}")
+    fix = "One config reads files of one form. "
+    fix += "Move them to a folder of their own and draft a config for them, too."
+    notes.doubt("files", f"{count} written otherwise ({form}): {shown}.", fix)
 
 
 def _glob_keys(found: Found, names: Names, notes: Notes) -> None:
@@ -272,13 +268,11 @@ def glob_of(files: Sequence[str]) -> str:
     common = os.path.commonpath(folders) if "." not in folders else ""
     below = f"{glob.escape(common)}/" if common else ""
     deep = "**/" if folders != {common or "."} else ""
-    suffixes = {PurePosixPath(file).suffix for file in files}
-    if len(suffixes) == 1:
-        return f"{below}{deep}*{glob.escape(next(iter(suffixes)))}"
-    if len({suffix.lower() for suffix in suffixes}) == 1:
-        letters = next(iter(suffixes))
-        return f"{below}{deep}*" + "".join(f"[{c.lower()}{c.upper()}]" if c.isalpha() else c for c in letters)
-    return f"{below}{deep}*"
+    suffix, *others = {PurePosixPath(file).suffix for file in files}
+    ending = "" if others else glob.escape(suffix)
+    if others and {other.lower() for other in others} == {suffix.lower()}:
+        ending = "".join(f"[{c.lower()}{c.upper()}]" if c.isalpha() else c for c in suffix)
+    return f"{below}{deep}*{ending}"
 
 
 def _excluded(surplus: set[str], matched: set[str]) -> list[str]:
@@ -321,11 +315,11 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
 
 
 def _example(part: NamePart) -> str:
-    return next((text for text in part.texts if text), "")
+    return next(filter(None, part.texts), "")
 
 
 def _values(part: NamePart) -> str:
-    texts = sorted((text for text in part.texts if text), key=natural)
+    texts = sorted(filter(None, part.texts), key=natural)
     return ", ".join(texts[:5]) + (", ..." if len(texts) > 5 else "")
 
 
@@ -361,11 +355,14 @@ def compressed(cells: Sequence[str], theirs: str, notes: Notes) -> bool:
     numbers = [number for cell in cells if cell and (number := as_number(cell)) is not None]
     if not numbers or max(numbers) >= HEIGHT_FROM:
         return False
+    key, evidence = (
+        "runs.compute.compression_ratio_pct",
+        "the height that is left, in percent of the original",
+    )
     fix = "If it is the height that was left, name it compression_ratio_pct, and delete this line."
     reason = f"up to {max(numbers):g} % in '{theirs}' are taken as how much the rubber was compressed."
-    notes.doubt("runs.compute.compression_ratio_pct", reason, fix)
-    evidence = "the height that is left, in percent of the original"
-    notes.guess("runs.compute.compression_ratio_pct", "100 - _compressed_pct", evidence)
+    notes.doubt(key, reason, fix)
+    notes.guess(key, "100 - _compressed_pct", evidence)
     return True
 
 
@@ -374,7 +371,7 @@ def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> str:
     dates = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}")
     for name, cells in table.cells.items():
         full = [cell for cell in cells if cell]
-        if name not in table.ours and full and all(dates.search(cell) for cell in full):
+        if name not in table.ours and full and all(map(dates.search, full)):
             what = f"holds dates that are not ISO 8601, such as '{full[0]}'"
             started = f"files.runs_columns.started_at = '{name}'"
             if clock is not None:
@@ -387,9 +384,6 @@ def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> str:
     return ""
 
 
-# ---------------------------------------------------------------- condition
-
-
 def condition_keys(names: Names, table: RunsTable | None, header: Collection[str], notes: Notes) -> None:
     """Add which columns make a condition, and which tell rubbers apart."""
     of_table = set() if table is None else table.given
@@ -400,8 +394,7 @@ def condition_keys(names: Names, table: RunsTable | None, header: Collection[str
         notes.guess("rubber", ["rubber"], "a column of its own for each rubber")
     if aging:
         notes.guess("condition", aging, f"{', '.join(aging)}: what is known of the aging")
-        missing = [name for name in AGING_CONDITION if name not in given]
-        if missing:
+        if missing := [name for name in AGING_CONDITION if name not in given]:
             reason = f"nothing says {' or '.join(missing)}: the same is assumed for all files."
             where = f"a {RUNS_CSV}" if table is None else table.file
             notes.doubt("condition", reason, f"Add it to {where} if it differs.")

@@ -8,15 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sealfit.draft.columns import (
-    BY_BEHAVIOUR,
-    Roles,
-    TraceColumn,
-    mean_speed,
-    moving_strokes,
-    rises,
-    stroke_count,
-)
+from sealfit.draft.columns import BY_BEHAVIOUR, DIMENSION, Roles, TraceColumn, rises
 from sealfit.draft.config_text import Notes, date_lines, file_column, is_own_unit
 from sealfit.draft.dialect import RATE, STRAYS, rate_in, settings_in, started_in
 from sealfit.draft.files_found import Found
@@ -25,21 +17,16 @@ from sealfit.draft.vocabulary import name_and_unit, plain
 from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of
-from sealfit.ingest.strokes import several_speeds
 from sealfit.ingest.workbooks import rows_of_sheets
 from sealfit.units import UNITS, Unit, conversion
 
-# A trace without a time unit is not taken to last longer than an hour at a sample per second or slower.
-LONG_S = 3600.0
+LONG_S = 3600.0  # longer traces without a unit of time, at a sample per second or slower, are taken as ms
 BAD_ROWS = 2  # with a missing value, that may stand above the first whole row of data
 AS_LONG = 0.5  # share of the rows of a workbook's longest sheet above which another may be a recording
 
 SLOTS = {"time": "time_s", "displacement": "displacement_mm", "force": "force_N", "load": "load_N"}
 NEGATED = {"force": "with the sign of the motion", "load": "as a load that presses counts above 0"}
 CHANNELS = ("temperature", "humidity", "pressure")
-
-
-# ---------------------------------------------------------------- dialect
 
 
 def _footer_key(footers: Sequence[Sequence[str]], sniffed: int, notes: Notes) -> None:
@@ -51,29 +38,29 @@ def _footer_key(footers: Sequence[Sequence[str]], sniffed: int, notes: Notes) ->
     begins = re.match(r"[^\d\t;,]*", footers[0][0])[0]
     if any(map(str.isalpha, begins)) and all(footer[0].startswith(begins) for footer in footers):
         notes.guess("trace.footer", begins, what)
-        return
-    fix = "They are left out, and `check` lists them. If they begin alike, set trace.footer to that."
-    notes.doubt("trace", f"{what}.", fix)
+    else:
+        fix = "They are left out, and `check` lists them. If they begin alike, set trace.footer to that."
+        notes.doubt("trace", f"{what}.", fix)
 
 
 def _sheet_key(found: Found, notes: Notes) -> None:
     """Add the sheet of the workbooks, if they have several."""
-    if kind_of(found.traces[0]) == "xlsx":
-        file = found.traces[0]
-        (sheet, most), *others = rows_of_sheets(read_bytes(found.folder, file)).items()
-        if filled := sum(rows > 0 for _, rows in others):
-            evidence = f"has the most rows of the {filled + 1} sheets of a workbook"
-            notes.guess("trace.sheet", sheet, evidence)
-        if alike := [f"'{name}'" for name, rows in others if rows > AS_LONG * most]:
-            reason = f"only '{sheet}' of {file} is read, and {', '.join(alike[:5])} may be recordings, too."
-            notes.doubt("trace.sheet", reason, "If so, save each sheet in a file of its own.")
+    file = found.traces[0]
+    (sheet, most), *others = rows_of_sheets(read_bytes(found.folder, file)).items()
+    if filled := sum(rows > 0 for _, rows in others):
+        notes.guess("trace.sheet", sheet, f"has the most rows of the {filled + 1} sheets of a workbook")
+    if alike := [f"'{name}'" for name, rows in others if rows > AS_LONG * most]:
+        reason = f"only '{sheet}' of {file} is read, and {', '.join(alike[:5])} may be recordings, too."
+        notes.doubt("trace.sheet", reason, "If so, save each sheet in a file of its own.")
 
 
 def dialect_keys(found: Found, notes: Notes) -> None:
     """Add the keys of how the files are written."""
-    if kind_of(found.traces[0]) in OF_ARRAYS:
+    kind = kind_of(found.traces[0])
+    if kind in OF_ARRAYS:
         return  # no text: nothing is to be said of lines
-    _sheet_key(found, notes)
+    if kind == "xlsx":
+        _sheet_key(found, notes)
     one, sniffed = found.dialect, found.sniffed
     of = f"{len(sniffed)} of {len(sniffed)} files"
     if len(found.traces) > len(sniffed):
@@ -82,16 +69,15 @@ def dialect_keys(found: Found, notes: Notes) -> None:
         notes.guess("trace.delimiter", one.delimiter, f"the separator in {of}")
     if one.decimal == ",":
         number = re.search(r"[-+]?[0-9]+,[0-9]+", one.first)
-        example = f"such as '{number.group()}'" if number else "such as with a comma"
-        notes.guess("trace.decimal", ",", f"numbers {example} in {of}")
+        example = f"'{number.group()}'" if number else "with a comma"
+        notes.guess("trace.decimal", ",", f"numbers such as {example} in {of}")
     _header_keys(found, of, notes)
     extra = [set(other.names) - set(one.names) for other in found.wider.values()]
     if further := sorted(set().union(*extra)):  # none where the columns are in another order
         count = f"{sum(map(bool, extra))} of {len(sniffed)} files"
         reason = f"{count} have further columns: {', '.join(further)}."
         notes.doubt("trace", reason, "They are read by the names that all files have.")
-    trailing = sum(other.trailing for other in sniffed)
-    if trailing:
+    if trailing := sum(other.trailing for other in sniffed):
         evidence = f"lines of data end in separators in {trailing} of {len(sniffed)} files"
         notes.guess("trace.trailing_separator", True, evidence)
     _footer_key([other.footer for other in sniffed if other.footer], len(sniffed), notes)
@@ -125,8 +111,8 @@ def _varying_header(found: Found, notes: Notes) -> None:
     lengths = Counter(len(one.header) for one in found.sniffed)
     shown = ", ".join(f"{length} lines in {count} files" for length, count in sorted(lengths.items()))
     count = lengths.most_common(1)[0][0]
-    usual = next(one for one in found.sniffed if len(one.header) == count)
-    last = usual.header[-1].rstrip(STRAYS) if usual.header else ""
+    usual = next(one.header for one in found.sniffed if len(one.header) == count)
+    last = usual[-1].rstrip(STRAYS) if usual else ""
     pattern = "^" + re.escape(last[:80]).replace(r"\ ", " ").replace("\\\t", r"\t")
     if last and all(_ends_at(one.header, pattern) for one in found.sniffed):
         evidence = f"headers differ in length ({shown}), and this line ends all of them"
@@ -152,9 +138,7 @@ def _shown(line: str) -> str:
 # ---------------------------------------------------------------- columns
 
 
-def column_keys(
-    found: Found, roles: Roles, units: Mapping[str, Unit | None], read: int, notes: Notes
-) -> None:
+def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], read: int, notes: Notes) -> None:
     """Add which column goes into which slot, and what is done with the others.
 
     `units` are those of `settled_units`, `read` is the number of files whose columns were read.
@@ -176,17 +160,15 @@ def column_keys(
     if roles.coefficient is not None:
         evidence = f"{roles.coefficient.place}: by its name; there is no column of force"
         notes.guess("trace.columns.coefficient", roles.coefficient.key, evidence)
-        notes.guess(
-            "trace.compute.force_N", "coefficient * load_N", "a coefficient of friction times the load"
-        )
+        product = "a coefficient of friction times the load"
+        notes.guess("trace.compute.force_N", "coefficient * load_N", product)
         helpers.append("coefficient")
     if roles.displacement is None and roles.speed is not None:
         helpers.append(_integrated(roles.speed, notes))
     clock = _clock_or_rate(found, notes) if roles.time is None else None
     _missing_slots(roles, clock is not None, notes)
-    if roles.dimension("force") == "torque" or (
-        roles.dimension("force") and re.search("torque|moment", plain(roles.force.label))
-    ):
+    force = roles.dimension("force")
+    if force == "torque" or (force and re.search("torque|moment", plain(roles.force.label))):
         torque = {"quantity": "torque", "unit": roles.force.unit.name}
         notes.guess("quantities.force", torque, f"{roles.force.place} is a torque")
     if roles.dimension("displacement") == "angle":
@@ -198,11 +180,8 @@ def column_keys(
 
 
 def _evidence(column: TraceColumn, role: str, roles: Roles, read: int) -> str:
-    by = []
-    if column.role == role:
-        by.append("its name")
-    if column.in_unit_of(role):
-        by.append("its unit")
+    by = ["its name"] if column.role == role else []
+    by += ["its unit"] if column.in_unit_of(role) else []
     follows = f"it follows the direction of motion in {roles.signed_files} of {read} files"
     follows += ", with the other sign" if roles.sign < 0 else ""
     behaves = {"time": "it rises evenly", "displacement": "it goes along strokes", "force": follows}
@@ -256,10 +235,7 @@ def _rotation(angle: Unit, source: str, notes: Notes) -> None:
 
 
 def _clock_or_rate(found: Found, notes: Notes) -> str | None:
-    """Add the first column of times of day, or the header's rate; None if there is neither.
-
-    The name of the column is returned, which may be empty.
-    """
+    """Add the first column of times of day, or the header's rate; return its name, or None without either."""
     one = found.dialect
     for i, cell in enumerate(split_line(one.first, one.delimiter)):
         if i not in one.numbers and seconds_of_day([cell]) is not None:
@@ -280,14 +256,12 @@ def _clock_or_rate(found: Found, notes: Notes) -> str | None:
 
 def _missing_slots(roles: Roles, has_clock: bool, notes: Notes) -> None:
     wanted = {
-        "time": "no column of numbers rises evenly: there is no time.",
-        "displacement": "no column goes along strokes: there is no displacement, nor a speed.",
-        "force": "no column follows the motion: there is no force.",
+        "time": (has_clock, "no column of numbers rises evenly: there is no time."),
+        "displacement": (roles.speed, "no column goes along strokes: there is no displacement, nor a speed."),
+        "force": (roles.coefficient, "no column follows the motion: there is no force."),
     }
-    for role, reason in wanted.items():
-        instead = {"displacement": roles.speed, "force": roles.coefficient}
-        other = has_clock if role == "time" else instead[role] is not None
-        if getattr(roles, role) is None and not other:
+    for role, (instead, reason) in wanted.items():
+        if getattr(roles, role) is None and not instead:
             fix = f"Name it as {SLOTS[role]}, by the file's name of the column or by its position."
             fix += " Or give the rows per second as rate_Hz under [trace]." if role == "time" else ""
             notes.doubt("trace.columns", reason, fix, (f"{SLOTS[role]} = 1",))
@@ -302,8 +276,7 @@ def _other_columns(found: Found, roles: Roles, clock: str, notes: Notes) -> None
             notes.guess(f"trace.columns.{name}", column.key, f"{column.place}: kept as a channel")
         else:
             ignored.append(column)
-    words = [name for i, name in enumerate(one.names) if i not in one.numbers]
-    texts = [name for name in words if name and name != clock]
+    texts = [name for i, name in enumerate(one.names) if i not in one.numbers and name not in ("", clock)]
     if roles.speed is not None and roles.displacement is not None:
         ignored.append(roles.speed)
     if ignored or texts or one.width > len(one.numbers) + bool(clock):
@@ -326,20 +299,16 @@ def _channel(column: TraceColumn, taken: set[str]) -> str:
     return next(name for base in bases if (name := base + unit) not in taken)
 
 
-# ---------------------------------------------------------------- units
-
-
-def settled_units(roles: Roles, notes: Notes) -> dict[str, Unit | None]:
-    """Return the unit of each role's column; what files do not say is assumed, with a doubt."""
-    units: dict[str, Unit | None] = {}
+def settled_units(roles: Roles, notes: Notes) -> dict[str, Unit]:
+    """Return the units of the roles' columns, without torques and angles; what is assumed is a doubt."""
+    units = {}
     for role, slot in SLOTS.items():
         column = getattr(roles, role)
         if column is None:
             continue
-        if column.unit is None:
-            units[role] = _assumed(column, role, slot, notes)
-        elif column.in_unit_of(role) and column.unit.dimension not in ("torque", "angle"):
-            units[role] = column.unit
+        unit = column.unit or _assumed(column, role, slot, notes)
+        if unit is not None and unit.dimension in {*DIMENSION[role]} - {"torque", "angle"}:
+            units[role] = unit
     return units
 
 
@@ -359,7 +328,7 @@ def _assumed(column: TraceColumn, role: str, slot: str, notes: Notes) -> Unit | 
     return None
 
 
-# ---------------------------------------------------------------- header and motion
+# ---------------------------------------------------------------- header
 
 
 def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes) -> list[str]:
@@ -391,32 +360,3 @@ def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes
         if not is_own_unit(one.unit, one.ours):
             notes.guess(f"files.units.{one.ours}", one.unit.name, f"the unit in header line {one.line}")
     return [one.ours for one in settings]
-
-
-def measured_speeds(roles: Roles, units: Mapping[str, Unit | None], files: Sequence[str]) -> dict[str, float]:
-    """Return the speed in mm/s of each file with strokes of one speed, negative where all go backward."""
-    if roles.time is None or (roles.displacement is None and roles.speed is None):
-        return {}
-    if roles.dimension("displacement") == "angle":
-        return {}
-    given = {role: unit.name for role, unit in units.items() if unit is not None}
-    in_s, in_mm = conversion(given.get("time", "s"), "s"), conversion(given.get("displacement", "mm"), "mm")
-    speeds: dict[str, float] = {}
-    for i, file in enumerate(files):
-        if roles.displacement is None:
-            speeds[file] = mean_speed(roles.speed.values[i])
-            continue
-        found = moving_strokes(in_s(roles.time.values[i]), in_mm(roles.displacement.values[i]))
-        own = [stroke.speed_mm_s for stroke in found]
-        if own and not several_speeds(own):
-            speeds[file] = float(np.median(np.abs(own)) * (-1 if max(own) < 0 else 1))
-    return speeds
-
-
-def motion_words(roles: Roles) -> str:
-    """Return what the motion is like, for the summary."""
-    strokes = 1
-    if roles.displacement is not None:
-        strokes = int(np.median([stroke_count(values) for values in roles.displacement.values]))
-    many = "one stroke" if strokes == 1 else f"about {strokes} strokes"
-    return f"{many} in a file, {'both ways' if roles.both_ways else 'one way'}"

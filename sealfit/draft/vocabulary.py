@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Mapping
 
 from sealfit.units import Unit, unit_of
 
@@ -99,15 +100,10 @@ def column_role(name: str) -> tuple[str, int]:
 _SETTING_WORDS = (
     ("file", r"\bfile|datei|archivo|fichier"),
     ("started_at", r"\bstart|date\b|datum|fecha|begin|timestamp|zeitstempel|uhrzeit"),
-    (
-        "temperature_C",
-        r"^temp|^oven$|^ofen$|(aging|ageing|alterungs?|(aus)?lager(ungs?)?|ofen|oven) ?temp|temp.*aging",
-    ),
-    (
-        "aging_days",
-        r"aging|ageing|\baged?\b|alter|auslager|lager"
-        r"|\b(days?|tage?|dias|jours|giorni|dagen|weeks|wochen|semaines)\b",
-    ),
+    ("temperature_C", r"^temp|^oven$|^ofen$|temp.*aging"
+                      r"|(aging|ageing|alterungs?|(aus)?lager(ungs?)?|ofen|oven) ?temp"),
+    ("aging_days", r"aging|ageing|\baged?\b|alter|auslager|lager"
+                   r"|\b(days?|tage?|dias|jours|giorni|dagen|weeks|wochen|semaines)\b"),
     ("compression_ratio_pct", r"compres|verpress|verform|stauch|height|hoehe"),
     ("speed_mm_s", r"speed|velocit|velocid|vitesse|snelheid|geschwind|vorschub|feed"),
     ("load_N", r"load\b|normal|auflast|\blast\b|anpress|carga"),
@@ -115,7 +111,7 @@ _SETTING_WORDS = (
     ("specimen_id", r"specimen|probe\b|sample|pruefling|muster"),
     ("rubber", r"material|rubber|gummi|compound|werkstoff|mischung|elastomer"),
     ("run_id", r"\brun|versuch"),
-)
+)  # fmt: skip
 
 
 def setting(name: str) -> str:
@@ -134,39 +130,40 @@ def setting(name: str) -> str:
 # What stands before or after a number in a file name. The case of single letters matters: T80 is a
 # temperature.
 
-BEFORE = {
-    **dict.fromkeys(("T", "temp", "temperature", "temperatur"), "temperature_C"),
-    **dict.fromkeys(
-        ("C", "K", "comp", "compr", "compression", "verpressung", "H", "height"), "compression_ratio_pct"
-    ),
-    **dict.fromkeys(("d", "D", "t", "day", "days", "tag", "tage", "age", "aged", "alter", "j"), "aging_days"),
-    **dict.fromkeys(("v", "V", "speed", "vel", "velocity", "geschw"), "speed_mm_s"),
-    **dict.fromkeys(("r", "R", "rep", "repeat", "run", "w", "W", "wdh", "wiederholung"), "repeat"),
-    **dict.fromkeys(("test", "trial", "essai", "prova", "ensayo", "rip", "herhaling"), "repeat"),
-    **dict.fromkeys(("F", "FN", "Fn", "L", "N", "load", "last"), "load_N"),
-    **dict.fromkeys(("S", "s", "P", "sp", "spec", "specimen", "sample", "probe", "rawdata"), "specimen_id"),
-}
-AFTER = {
-    **dict.fromkeys(("C", "degC", "°C", "grad", "deg", "gradi", "grados", "graden"), ("temperature_C", "")),
-    **dict.fromkeys(("F", "degF", "°F"), ("temperature_C", "degF")),
-    **dict.fromkeys(("pct", "%", "percent", "prozent"), ("compression_ratio_pct", "")),
-    **dict.fromkeys(("d", "day", "days", "tag", "tage", "j", "jours"), ("aging_days", "")),
-    **dict.fromkeys(("giorni", "dias", "días", "dagen"), ("aging_days", "")),
-    **dict.fromkeys(("h", "hr", "hrs", "hours", "std"), ("aging_days", "h")),
-    **dict.fromkeys(("w", "wk", "weeks", "wochen"), ("aging_days", "week")),
-    **dict.fromkeys(("mms", "mmps", "mmpers"), ("speed_mm_s", "")),
-    **dict.fromkeys(("mmmin", "mmpmin", "mmpermin"), ("speed_mm_s", "mm/min")),
-    **dict.fromkeys(("ums",), ("speed_mm_s", "um/s")),
-    **dict.fromkeys(("ipm", "inmin", "inpmin", "inpermin"), ("speed_mm_s", "in/min")),
-    **dict.fromkeys(("cms",), ("speed_mm_s", "cm/s")),
-    **dict.fromkeys(("N",), ("load_N", "")),
-    **dict.fromkeys(("kN",), ("load_N", "kN")),
-    **dict.fromkeys(("kg", "kgf"), ("load_N", "kgf")),
-    **dict.fromkeys(("lbf", "lbs"), ("load_N", "lbf")),
-    **dict.fromkeys(("bar",), ("pressure_bar", "")),
-    **dict.fromkeys(("rpm",), ("speed_rpm", "")),
-    **dict.fromkeys(("Hz",), ("frequency_Hz", "")),
-}
+
+def _by_word(said: Mapping) -> dict:
+    return {word: meaning for meaning, words in said.items() for word in words.split()}
+
+
+BEFORE = _by_word({
+    "temperature_C": "T temp temperature temperatur",
+    "compression_ratio_pct": "C K comp compr compression verpressung H height",
+    "aging_days": "d D t day days tag tage age aged alter j",
+    "speed_mm_s": "v V speed vel velocity geschw",
+    "repeat": "r R rep repeat run w W wdh wiederholung test trial essai prova ensayo rip herhaling",
+    "load_N": "F FN Fn L N load last",
+    "specimen_id": "S s P sp spec specimen sample probe rawdata",
+})  # fmt: skip
+AFTER = _by_word({
+    ("temperature_C", ""): "C degC °C grad deg gradi grados graden",
+    ("temperature_C", "degF"): "F degF °F",
+    ("compression_ratio_pct", ""): "pct % percent prozent",
+    ("aging_days", ""): "d day days tag tage j jours giorni dias días dagen",
+    ("aging_days", "h"): "h hr hrs hours std",
+    ("aging_days", "week"): "w wk weeks wochen",
+    ("speed_mm_s", ""): "mms mmps mmpers",
+    ("speed_mm_s", "mm/min"): "mmmin mmpmin mmpermin",
+    ("speed_mm_s", "um/s"): "ums",
+    ("speed_mm_s", "in/min"): "ipm inmin inpmin inpermin",
+    ("speed_mm_s", "cm/s"): "cms",
+    ("load_N", ""): "N",
+    ("load_N", "kN"): "kN",
+    ("load_N", "kgf"): "kg kgf",
+    ("load_N", "lbf"): "lbf lbs",
+    ("pressure_bar", ""): "bar",
+    ("speed_rpm", ""): "rpm",
+    ("frequency_Hz", ""): "Hz",
+})  # fmt: skip
 UNAGED = {
     "unaged", "fresh", "new", "virgin", "neu", "ungealtert", "frisch", "ref", "reference", "rt", "initial",
     "neuf", "nuovo", "nuevo", "nieuw",
@@ -175,13 +172,10 @@ RUBBERS = {
     "nbr", "hnbr", "xnbr", "fkm", "ffkm", "epdm", "vmq", "fvmq", "acm", "aem", "nr", "sbr", "cr", "pu", "tpu",
     "ptfe",
 }  # fmt: skip
-DIRECTIONS = {
-    **dict.fromkeys(
-        ("fwd", "forward", "vor", "vorwaerts", "vorwärts", "hin", "pos", "up", "push", "cw"), 1.0
-    ),
-    **dict.fromkeys(("bwd", "rev", "back", "backward", "her", "neg", "down", "pull", "ccw"), -1.0),
-    **dict.fromkeys(("zurueck", "zurück", "rueck", "rück", "rueckwaerts", "rückwärts"), -1.0),
-}
+DIRECTIONS = _by_word({
+    1.0: "fwd forward vor vorwaerts vorwärts hin pos up push cw",
+    -1.0: "bwd rev back backward her neg down pull ccw zurueck zurück rueck rück rueckwaerts rückwärts",
+})  # fmt: skip
 
 
 def before_number(letters: str) -> str:
