@@ -26,8 +26,6 @@ from sealfit.effects.contract import (
     sine_attenuation,
 )
 
-# ---------------------------------------------------------------- one channel
-
 
 @effect(
     closed_form,

@@ -12,18 +12,12 @@ import numpy as np
 
 from sealfit.errors import ParameterError
 
-# Stands for any numeric channel in `Effect.reads`; its values are `inputs["x"]` of the shape.
-CHANNEL = "x"
-# Stands for any second channel in `Effect.reads`, after CHANNEL.
-SECOND = "z"
-# Allowed values of `Effect.reads` with CHANNEL.
-READS_ANY = ((CHANNEL,), (CHANNEL, "direction"), (CHANNEL, SECOND))
-# Bounds of an amplitude with units. They are far beyond the numbers of any rig.
-AMPLITUDE = (-1e9, 1e9)
-# Bounds of a phase in rad: two turns in each direction, so that a search can pass a full turn.
-PHASE = (-4 * np.pi, 4 * np.pi)
-# Search grid of a phase: half a turn, as amplitudes have a sign.
-PHASES = tuple(np.arange(4) * np.pi / 4)
+CHANNEL = "x"  # stands for any numeric channel in `Effect.reads`; its values are `inputs["x"]` of the shape
+SECOND = "z"  # stands for any second channel in `Effect.reads`, after CHANNEL
+READS_ANY = ((CHANNEL,), (CHANNEL, "direction"), (CHANNEL, SECOND))  # allowed `Effect.reads` with CHANNEL
+AMPLITUDE = (-1e9, 1e9)  # bounds of an amplitude with units, far beyond the numbers of any rig
+PHASE = (-4 * np.pi, 4 * np.pi)  # bounds in rad: a search can pass a full turn in each direction
+PHASES = tuple(np.arange(4) * np.pi / 4)  # search grid: half a turn, as amplitudes have a sign
 
 Target = Literal["force", "mu", "mu_s", "mu_c", "v_s", "sigma_2", "mu_0", "a", "b"]
 Operation = Literal["add", "multiply"]
@@ -43,8 +37,7 @@ ANYWHERE: tuple[tuple[Target, Operation], ...] = (
     ("v_s", "multiply"), ("sigma_2", "add"), ("sigma_2", "multiply"), ("a", "multiply"), ("b", "multiply"),
     ("mu_0", "multiply"), ("mu", "add"), ("mu_s", "add"), ("mu_c", "add"),
 )  # fmt: skip
-# Targets of the climate of the room.
-ROOM = ANYWHERE[:5]
+ROOM = ANYWHERE[:5]  # targets of the climate of the room
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +46,13 @@ class Parameter:
 
     In `unit`, `{x}` and `{z}` stand for the units of the channels and `{y}` for that of the result: the unit
     of force for an added force, none for a factor, that of the parameter for a change of it; see `fill_unit`.
-    A name that is a Python keyword ends in an underscore; `symbol` is the printed name.
+    A name that is a Python keyword ends in an underscore.
 
-    `linear` marks an amplitude: the shape is linear in the vector of amplitudes. `search` gives the grid of a
-    nonlinear parameter: numbers, or "inside" (quantiles of the channel), "between" (midpoints of its
-    neighbouring values, for a jump), "span" (logarithmic, from a fraction of the channel's range to a few
-    ranges), "ratio" (logarithmic, over the magnitudes of the channel). `vanishes_at` is a value at which the
-    shape is zero for every amplitude; no descent crosses it, so that a fit starts on both sides.
+    `linear` marks an amplitude. `search` gives the grid of a nonlinear parameter: numbers, or "inside"
+    (quantiles of the channel), "between" (midpoints of its neighbouring values, for a jump), "span"
+    (logarithmic, from a fraction of the channel's range to a few ranges), "ratio" (logarithmic, over its
+    magnitudes). `vanishes_at` is a value at which the shape is zero for every amplitude; no descent crosses
+    it, so that a fit starts on both sides.
     """
 
     name: str
@@ -237,10 +230,7 @@ def _in_brackets(unit: str) -> str:
     return f"({unit})" if any(sign in unit for sign in "/ *·") else unit
 
 
-# ---------------------------------------------------------------- averaged
-
-# Key of the inputs of an effect: number of samples in each row's mean.
-SAMPLES = "samples"
+SAMPLES = "samples"  # key of the inputs of an effect: number of samples in each row's mean
 
 
 def width_of(name: str) -> str:

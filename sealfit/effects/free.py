@@ -17,9 +17,9 @@ from sealfit.effects.contract import CHANNEL, SECOND, Effect, amplitude, closed_
 from sealfit.errors import ParameterError
 
 LEVELS, SLOPES, SMOOTH, SURFACE = "levels", "slopes", "smooth", "surface"
-# A positive channel with at least this ratio of its largest to its smallest value is transformed by the
-# logarithm.
-WIDE = 20.0
+WIDE = (
+    20.0  # ratio of the largest to the smallest value of a positive channel from which its logarithm is used
+)
 
 
 def _free(function: Callable, means: Sequence[float] | None, **description) -> Effect:
@@ -46,9 +46,6 @@ def _shape(function: Callable, means: np.ndarray | None, names: Sequence[str], i
 
 def _listed(values: Sequence[object]) -> str:
     return ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in values)
-
-
-# ---------------------------------------------------------------- categories
 
 
 def levels_effect(categories: Sequence[str], means: Sequence[float] | None = None) -> Effect:
@@ -118,11 +115,6 @@ def _by_category(names: tuple[str, ...], values: Sequence[float], channel: np.nd
     return found
 
 
-# ---------------------------------------------------------------- splines
-# The natural cubic splines that are 1 at one knot and 0 at the others. Beyond the outer knots they are
-# constant, as nothing was measured there.
-
-
 def smooth_effect(knots: Sequence[float], means: Sequence[float] | None = None) -> Effect:
     """Return a natural cubic spline of the channel, with its values at the knots as amplitudes.
 
@@ -161,14 +153,14 @@ def _rising(id: str, knots: Sequence[float]) -> tuple[float, ...]:
 
 @lru_cache(maxsize=64)
 def _cardinal(places: tuple[float, ...]):
-    """Return the cardinal splines of these knots."""
+    """Return the cardinal splines of these knots: natural, 1 at one knot and 0 at the others."""
     from scipy.interpolate import CubicSpline  # a slow import that listing the effects does not need
 
     return CubicSpline(places, np.eye(len(places)), bc_type="natural")
 
 
 def natural(places: tuple[float, ...], x: np.ndarray) -> np.ndarray:
-    """Return every cardinal spline B_j at x, shape (..., knots): constant beyond the outer knots."""
+    """Return every cardinal spline at x, shape (..., knots): constant beyond the outer knots."""
     return _cardinal(places)(np.clip(np.asarray(x, float), places[0], places[-1]))
 
 

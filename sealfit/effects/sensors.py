@@ -186,7 +186,6 @@ def temporary_change(inputs, *, A, t_1, t_2):
     return A * np.where(np.isnan(hours), np.nan, (hours >= t_1) & (hours < t_2))
 
 
-# Period of day and night, in h.
 DAY_H = 24.0
 TIME_OF_DAY = "a time of day at which it is largest, since the campaign's first file"
 # Days of tests, and the part of each that its tests must span, from which a daily change is looked for.

@@ -25,10 +25,10 @@ RESTS = (0.01, 0.1, 1.0, 10.0, 100.0, 1e3)
 EXPONENTS = (0.4, 0.6, 0.8, 1.0, 1.4, 3.0, 4.0, 6.0)
 POWERS = (0.2, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0)
 WIDTHS = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5)
-
-
-# ---------------------------------------------------------------- history
-# Conditioning, running-in and rest.
+REVIEW = (
+    "Armstrong-Helouvry, Dupont & Canudas de Wit 1994, Automatica 30(7), 1083-1138, "
+    "doi:10.1016/0005-1098(94)90209-7"
+)
 
 
 @effect(
@@ -107,9 +107,6 @@ def rest_strengthening(inputs, *, A, t_0):
     return A * np.log1p(not_negative(inputs["rest_s"]) / t_0)
 
 
-# ---------------------------------------------------------------- speed, load, humidity
-
-
 @effect(
     label="load exponent of rubber",
     equation="h = A ln(N / N_ref), A = n - 1 to first order in mu ~ N^(n-1)",
@@ -145,14 +142,9 @@ def load_exponent(inputs, *, A):
         Parameter("n", "", 1.0, (0.2, 10.0), "Stribeck exponent", search=EXPONENTS, vanishes_at=2.0),
     ),
     source="Exponents from 1/2 upwards: Bo & Pavelescu 1982, Wear 82(3), 277-289; review: "
-    "Armstrong-Helouvry, Dupont & Canudas de Wit 1994, Automatica 30(7), 1083-1138, "
-    "doi:10.1016/0005-1098(94)90209-7. As a difference: ours.",
-    # By hand: twice v_s, n = 1: exp(-2) - exp(-4) = 0.1353352832366127 - 0.01831563888873418.
-    worked=(
-        {"speed_mm_s": -10.0},
-        {"A": 0.3, "v_s": 5.0, "n": 1.0},
-        0.3 * (0.1353352832366127 - 0.01831563888873418),
-    ),
+    f"{REVIEW}. As a difference: ours.",
+    # By hand: twice v_s, n = 1: exp(-2) - exp(-4) = 0.11701964434787852.
+    worked=({"speed_mm_s": -10.0}, {"A": 0.3, "v_s": 5.0, "n": 1.0}, 0.3 * 0.11701964434787852),
 )
 def stribeck_exponent(inputs, *, A, v_s, n):
     r"""Stribeck exponent other than 2: friction falls with speed more gradually or abruptly than declared.
@@ -198,9 +190,7 @@ def log_rate(inputs, *, A):
         amplitude("A", "{y}", 1.0, "force at the reference speed"),
         Parameter("n", "", 0.5, (0.05, 4.0), "exponent of the speed", search=POWERS),
     ),
-    source="Form: Ostwald-de Waele power law as a friction term; speed-dependent friction terms: "
-    "Armstrong-Helouvry, Dupont & Canudas de Wit 1994, Automatica 30(7), 1083-1138, "
-    "doi:10.1016/0005-1098(94)90209-7.",
+    source=f"Form: Ostwald-de Waele power law as a friction term; speed-dependent friction terms: {REVIEW}.",
     # By hand: four times the reference speed, backward: -2 * sqrt(4).
     worked=({"speed_mm_s": -20.0, "speed_mm_s_ref": 5.0}, {"A": 2.0, "n": 0.5}, -4.0),
 )

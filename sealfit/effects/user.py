@@ -24,8 +24,7 @@ from sealfit.effects.free import FREE
 from sealfit.errors import ConfigError, ParameterError
 
 EXAMPLE = "See sealfit/effects/sensors.py for an example."
-# Relative tolerance of a worked value, which a user may have written with ten digits.
-TOLERANCE = 1e-9
+TOLERANCE = 1e-9  # relative, of a worked value, which a user may have written with ten digits
 
 
 def load_user_effects(folder: Path | str | None) -> dict[str, Effect]:

@@ -7,8 +7,7 @@ import numpy as np
 from sealfit.effects.contract import ROOM, Parameter, amplitude, deviation, effect, factors, reference
 
 FRICTION = factors("mu", "mu_c", "mu_s", "force")
-# Bounds of the share of friction that is lost.
-LOST = (-5.0, 0.95)
+LOST = (-5.0, 0.95)  # bounds of the share of friction that is lost
 FALL = "Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112."
 LUMPED = "Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford."
 
