@@ -34,8 +34,6 @@ from sealfit.simulation.spec import Spec, load_spec, plan_files
 
 __all__ = ["Spec", "load_spec", "load_truth", "simulate", "truth_path"]
 
-# ---------------------------------------------------------------- truth
-
 SCHEMA = 1
 MADE_BY = "sealfit simulate"
 DIGITS = 9  # decimals of a mean force in N, far below any noise

@@ -15,9 +15,6 @@ from sealfit.effects.free import LEVELS, SMOOTH, smooth_effect
 from sealfit.errors import ConfigError, ParameterError, nearest
 from sealfit.ingest.expression import evaluate, parse
 
-# ---------------------------------------------------------------- physics
-# The declared model of a SPEC: Eq. 14 with Eq. 15, one law for all series or one each.
-
 CONDITIONS = ("temperature_C", "compression_ratio_pct", "aging_days")
 
 
@@ -33,9 +30,7 @@ class Growth(Strict):
     """The dependence of `a` on temperature and compression, for series that are not listed."""
 
     reference_temperature_C: float = Field(60.0, description="temperature at which `a` is as declared")
-    doubling_C: float = Field(
-        40.0, gt=0, description="degrees that double `a`; ten is van 't Hoff's rule for a rate"
-    )
+    doubling_C: float = Field(40.0, gt=0, description="degrees that double `a`")
     reference_compression_pct: float = Field(80.0, description="compression at which `a` is as declared")
     per_pct: float = Field(0.005, description="relative growth of `a` per percent of height taken away")
 
@@ -65,20 +60,17 @@ class Physics(Strict):
     mu_c: Law = Law(mu_0=0.609, a=0.03307, b=0.1324)
     v_s: float = Field(5.0, gt=0, description="mm/s")
     sigma_2: float = Field(0.05, description="N s/mm")
-    sigma_0: float | None = Field(
-        None, gt=0, description="N/mm; none: every rise is design.stiffness_mm long"
-    )
+    sigma_0: float | None = Field(None, gt=0, description="N/mm; none: rises are design.stiffness_mm long")
     sigma_1: float = Field(0.0, ge=0, description="N s/mm; only with sigma_0")
     growth: Growth | None = Field(None, description="none: one law for all series")
     series: tuple[SeriesLaw, ...] = ()
 
 
 def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the parameters of the declared model without effects at given conditions, shape (n,) each.
+    """Return mu_0s, a_s, b_s, mu_0c, a_c, b_c, v_s and sigma_2 without effects, shape (n,) each.
 
-    They are mu_0s, a_s, b_s of mu_s, mu_0c, a_c, b_c of mu_c, v_s and sigma_2. `conditions` has those of
-    `CONDITIONS` that the design has, shape (n,) each. Unaged rubber (day 0) has v_s and sigma_2 of `physics`
-    itself, whatever its temperature cell says.
+    `conditions` has those of `CONDITIONS` that the design has, shape (n,) each. Unaged rubber (day 0) has v_s
+    and sigma_2 of `physics` itself, whatever its temperature cell says.
     """
     n = len(next(iter(conditions.values()))) if conditions else 1
     values = {}
@@ -112,16 +104,10 @@ class EffectEntry(Strict):
 
     id: str
     channels: tuple[str, ...] = Field((), description="in the order in which the effect reads them")
-    acts_on: Target | None = Field(
-        None, description="default: the catalogue's likeliest; force for an expression"
-    )
-    operation: Operation | None = Field(
-        None, description="default: the catalogue's likeliest; add for an expression"
-    )
+    acts_on: Target | None = Field(None, description="default: the likeliest; force for an expression")
+    operation: Operation | None = Field(None, description="default: the likeliest; add for an expression")
     parameters: dict[str, float] = Field(default_factory=dict)
-    reference: dict[str, float] = Field(
-        default_factory=dict, description="where it is zero or one, e.g. load_N_ref"
-    )
+    reference: dict[str, float] = Field(default_factory=dict, description="of channels: load_N_ref = ...")
     knots: tuple[float, ...] = Field((), description="of a smooth shape")
     formula: Expression | None = Field(None, description="of an expression")
 
@@ -134,8 +120,7 @@ class EffectEntry(Strict):
         return self
 
 
-# Channels -> added force, factor minus one or change.
-Shape = Callable[[Mapping[str, np.ndarray]], np.ndarray]
+Shape = Callable[[Mapping[str, np.ndarray]], np.ndarray]  # channels -> added force, factor less 1 or change
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,11 +137,7 @@ class BoundEffect:
 
 
 def resolve_effects(entries: Sequence[EffectEntry]) -> tuple[BoundEffect, ...]:
-    """Return the effects of a SPEC bound to the catalogue, in the SPEC's order.
-
-    ConfigError if an id, a parameter or the number of channels is not the catalogue's, or an effect cannot
-    act on a target.
-    """
+    """Return the effects of a SPEC bound to the catalogue; ConfigError if one does not fit it."""
     return tuple(_resolve(entry, f"effects.{number} ({entry.id})") for number, entry in enumerate(entries))
 
 

@@ -14,16 +14,13 @@ from sealfit.physics.lugre import stribeck_decay
 from sealfit.simulation.model import CONDITIONS, BoundEffect, Physics, declared_parameters, resolve_effects
 from sealfit.simulation.spec import STEADY_LENGTHS, Design, Spec
 
-# ---------------------------------------------------------------- motion
-# Rest, ramp, constant speed, ramp, and the reverse in files with both directions.
-
 RAMP_STEPS = 256  # of constant speed in the simulation of a ramp
 TICK_S = 1e-5  # resolution of the logged time in s; sampling intervals are multiples of it
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The sampled motion of one file, and the mask of steady sliding; arrays of shape (n,)."""
+    """The sampled motion of one file: rest, ramp, constant speed, ramp, and the reverse; shape (n,) each."""
 
     time_s: np.ndarray  # from the start of the file
     stroke_time_s: np.ndarray  # `time_s` of the tables: from the start of the stroke if there are several
@@ -33,7 +30,7 @@ class Motion:
     direction: np.ndarray
     stroke: np.ndarray
     cruising: np.ndarray  # bool: between the ramps
-    steady: np.ndarray
+    steady: np.ndarray  # bool
 
 
 def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> Motion:

@@ -19,13 +19,12 @@ from sealfit.ingest.expression import evaluate, parse
 if TYPE_CHECKING:
     from sealfit.simulation.motion import Motion
 
-# ---------------------------------------------------------------- draws
-# Random numbers depend only on the seed and their purpose. Adding a kind of noise or a channel to a SPEC
-# changes no other draw, so that campaigns can be compared draw by draw.
-
 
 def stream(seed: int, *purpose: str | int) -> np.random.Generator:
-    """Return a generator for one purpose, e.g. `stream(seed, "white", 0, 12)` for the thirteenth file."""
+    """Return a generator for one purpose, e.g. `stream(seed, "white", 0, 12)` for the thirteenth file.
+
+    A kind of noise or a channel that is added to a SPEC changes no other draw.
+    """
     key = [crc32(part.encode("utf-8")) if isinstance(part, str) else part for part in purpose]
     return np.random.default_rng([seed, *key])
 
@@ -193,7 +192,6 @@ def _streams(noise: Sequence[Noise], seed: int, *file: int) -> Iterator[tuple[No
 
 
 # ---------------------------------------------------------------- defects
-# Defects that ingest must find, in files that the truth lists.
 
 DEFECTS = ("missing_cells", "spikes", "gaps", "saturated", "reversed")  # keys of `BadData`
 Columns = dict[str, np.ndarray]  # a trace's columns, each of shape (n,); NaN is written as an empty cell

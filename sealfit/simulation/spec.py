@@ -20,8 +20,6 @@ from sealfit.ingest.expression import parse
 from sealfit.simulation.model import CONDITIONS, EffectEntry, Physics, resolve_effects
 from sealfit.simulation.noise import Channel, Noise
 
-# ---------------------------------------------------------------- design
-
 STEADY_LENGTHS = 9.0  # of the rise, after which the force has reached 1 - exp(-9) = 0.9999 of its limit
 
 Positive = Annotated[float, Field(gt=0)]
@@ -48,17 +46,12 @@ class Design(Strict):
     sampling_Hz: float = Field(1000.0, gt=0, description="slower where a file would have more than max_rows")
     max_rows: int = Field(1000, ge=40)
     stiffness_mm: float = Field(0.3, gt=0, description="length of the pre-sliding rise")
-    ramp_s: float = Field(
-        0.2, ge=0, description="speed ramp at start and stop; at most a tenth of the sliding time"
-    )
-    dwell_s: float = Field(
-        0.5, ge=0, description="rest before every stroke; at most a tenth of the sliding time"
-    )
-    order: Literal["calendar", "randomised", "listed", "undated"] = Field(
-        "calendar",
-        description="calendar: day by day as the rubber ages, runs of a day at random; "
-        "randomised: all runs at random; listed: as written here; undated: no started_at",
-    )
+    # Ramps and rests last at most a tenth of the sliding time.
+    ramp_s: float = Field(0.2, ge=0, description="speed ramp at start and stop")
+    dwell_s: float = Field(0.5, ge=0, description="rest before every stroke")
+    # calendar: day by day as the rubber ages, runs of a day at random; randomised: all runs at random;
+    # listed: as written here; undated: no started_at.
+    order: Literal["calendar", "randomised", "listed", "undated"] = "calendar"
     first_start: datetime = datetime(2024, 1, 8, 8, 0, 0)
     minutes_per_file: float = Field(4.0, gt=0)
 
@@ -80,13 +73,8 @@ class Design(Strict):
     @property
     def columns(self) -> list[str]:
         """The condition columns and load that runs.csv has."""
-        values = {
-            "temperature_C": self.temperatures_C,
-            "compression_ratio_pct": self.compressions_pct,
-            "aging_days": self.aging,
-            "load_N": self.loads_N,
-        }
-        return [name for name, there in values.items() if there]
+        values = (self.temperatures_C, self.compressions_pct, self.aging, self.loads_N)
+        return [name for name, there in zip((*CONDITIONS, "load_N"), values, strict=True) if there]
 
     @model_validator(mode="after")
     def _holds_together(self) -> Design:
@@ -173,8 +161,6 @@ def _dated(files: pd.DataFrame, design: Design, random: np.random.Generator) -> 
     return files.assign(started_at=started, run_order=run_order, elapsed_h=seconds / 3600)
 
 
-# ---------------------------------------------------------------- spec
-
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 TAKEN = {*SLOTS, *RESERVED, *CONDITIONS, "pi"}  # of traces, of tables, and of formulas
 
@@ -241,7 +227,7 @@ class Spec(Strict):
 
 
 def load_spec(path: Path) -> Spec:
-    """Return the SPEC at `path`, its effects resolved against the catalogue.
+    """Return the SPEC at `path`.
 
     ConfigError if the file is missing, is not TOML, has a key or value that is not allowed, or names an
     effect, parameter or channel that does not exist; one sentence per fault.
