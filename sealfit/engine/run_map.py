@@ -40,12 +40,6 @@ MAX_CHUNK = 32  # items; keeps the progress bar moving
 
 _cluster: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
 
-WAITING_PER_THREAD = 2  # chunks submitted per thread of the cluster; bounds the memory of the scheduler
-CONNECT_S = 15.0
-EXAMPLE = "tcp://host:8786"
-LOOK_S = 1.0  # interval between checks for workers, in s
-ALONE_S = 60.0  # time without workers before an error, in s; a batch system needs time to start the next
-
 
 def cores() -> int:
     """Return the number of cores this process may use."""
@@ -84,7 +78,8 @@ def run_map(
     """Yield `function(item)` for every item, in the order of the items.
 
     With one worker, one item, or inside a worker, the work is done here; otherwise in `workers` new
-    processes, or on the cluster of `on_cluster`, several items at a time. Results do not depend on where.
+    processes, or on the cluster of `on_cluster`. Results do not depend on where. WorkerError if a process
+    dies before it has answered (killed, or out of memory), or the cluster gives up.
 
     Parameters
     ----------
@@ -93,15 +88,9 @@ def run_map(
         ends the map and is raised here.
     items : iterable
         What to map over; each item is sent to a process, so keep it small.
-    workers : int
-        Processes to use, at least 1; has no meaning on a cluster.
-    together : int, optional
-        Items that are sent to a process at once; by default as many as keep the cost of sending low.
-
-    Raises
-    ------
-    WorkerError
-        If a process dies before it has answered (killed, or out of memory), or the cluster gives up.
+    workers, together : int
+        Processes to use, which has no meaning on a cluster; items that are sent to one at once, by default as
+        many as keep the cost of sending low.
     """
     items = items if isinstance(items, Sequence) else list(items)
     cluster = _cluster.get()
@@ -142,8 +131,8 @@ def in_processes(
 ) -> Iterator[list]:
     """Yield the list that `apply`, which is at the top level of a module, returns for each chunk.
 
-    `workers` processes are used. Their server imports the module `load` once, so that none imports it again.
-    WorkerError if a process dies before it has answered (killed, or out of memory).
+    The server of the processes imports the module `load` once, so that none imports it again. WorkerError if
+    a process dies before it has answered (killed, or out of memory).
     """
     context = multiprocessing.get_context(START)
     context.set_forkserver_preload([load])
@@ -180,8 +169,7 @@ def in_processes(
 def _no_interrupt_for_children() -> Iterator[None]:
     """Start processes that ignore Ctrl-C; the parent stops them, so that they print no traceback.
 
-    A process inherits the blocked signals of the thread that starts it. Other threads do not block it, and
-    the main thread would handle it all the same.
+    A process inherits the blocked signals of the thread that starts it.
     """
     resource_tracker.ensure_running()  # started here, because it unblocks Ctrl-C when it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -193,11 +181,7 @@ def _no_interrupt_for_children() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _main_out_of_sight() -> Iterator[None]:
-    """Start processes that do not load the script that runs.
-
-    A script that calls `sealfit.run` would be run again in each of them. They need nothing of it: what they
-    do is found in modules.
-    """
+    """Start processes that do not load the script that runs, which would run again in each of them."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -226,11 +210,16 @@ def _end_with_parent() -> None:
 # ---------------------------------------------------------------- cluster
 # Chunks of work on a Dask cluster, with results in order; Dask is loaded where one is used.
 
+WAITING_PER_THREAD = 2  # chunks submitted per thread of the cluster; bounds the memory of the scheduler
+CONNECT_S = 15.0
+EXAMPLE = "tcp://host:8786"
+LOOK_S = 1.0  # interval between checks for workers, in s
+ALONE_S = 60.0  # time without workers before an error, in s; a batch system needs time to start the next
+
 
 class Cluster:
-    """A connection to a running Dask scheduler.
+    """A connection to a Dask scheduler, by its address ("tcp://host:8786") or the path of its scheduler file.
 
-    `scheduler` is its address ("tcp://host:8786"), or the path of the scheduler file that it wrote.
     RequestError if Dask is not installed here, or nobody answers.
     """
 
@@ -243,10 +232,9 @@ class Cluster:
         try:
             versions = self._client.run(_version)
         except ModuleNotFoundError as error:
-            raise RequestError(
-                f"the workers of {self.scheduler} cannot import {error.name}.",
-                fix=f"Install sealfit {__version__} in the environment that they are started from.",
-            ) from error
+            fix = f"Install sealfit {__version__} in the environment that they are started from."
+            reason = f"the workers of {self.scheduler} cannot import {error.name}."
+            raise RequestError(reason, fix=fix) from error
         if not versions:
             fix = f"Start one: dask worker {self.scheduler} --nthreads 1"
             raise RequestError(f"the cluster {self.scheduler} has no workers.", fix=fix)

@@ -33,14 +33,10 @@ def aging_law(days, *, mu_0, a, b):
         Aging time t in days, at least 0; value of the unaged rubber; loss per factor e of time, same unit;
         time at which the loss sets in, in days.
 
-    Raises
-    ------
-    ParameterError
-        If any `b` is not positive or any time is negative.
-
     Notes
     -----
-    Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102, Eq. 15.
+    ParameterError if any `b` is not positive or any time is negative. Wu et al. 2020, Polymers 12(1), 102,
+    doi:10.3390/polym12010102, Eq. 15.
 
     Examples
     --------

@@ -81,9 +81,6 @@ class Contact:
         return share / share.sum(), (mean * relative / reference) ** (self.exponent - 1)
 
 
-# ---------------------------------------------------------------- steady sliding
-
-
 def stribeck_decay(speed_mm_s, v_s):
     r"""Return the decay :math:`e^{-(v / v_s)^2}` of the static rise mu_s - mu_c with speed.
 
@@ -114,15 +111,10 @@ def stribeck_force(speed_mm_s, load_N, *, mu_s, mu_c, v_s, sigma_2):
     mu_s, mu_c, v_s, sigma_2 : float or ndarray, shape (n,)
         Static and Coulomb coefficients; Stribeck velocity in mm/s; viscous coefficient in N s/mm.
 
-    Raises
-    ------
-    ParameterError
-        If any `v_s` is not positive or any load is negative.
-
     Notes
     -----
     The force has the sign of the speed. F(0) = 0 is not the break-away force; sigma_0 and sigma_1 have no
-    effect in steady sliding. Wu et al. 2020, Eq. 14.
+    effect in steady sliding. ParameterError if any `v_s` is not positive or any load is negative.
 
     Examples
     --------
@@ -142,9 +134,6 @@ def _not_negative(load_N):
 def _coefficient(speed_mm_s, mu_s, mu_c, v_s):
     mu_c = np.asarray(mu_c, float)
     return mu_c + (np.asarray(mu_s, float) - mu_c) * stribeck_decay(speed_mm_s, v_s)
-
-
-# ---------------------------------------------------------------- history of the speed
 
 
 @dataclass(frozen=True)
@@ -199,16 +188,12 @@ def lugre_force(time_s, speed_mm_s, load_N: float, model: LuGre, *, deflection_m
     load_N, deflection_mm : float
         Normal load in N; initial deflection of all bristles in mm.
 
-    Raises
-    ------
-    ParameterError
-        If a parameter is out of its range, times do not rise, or shapes differ.
-
     Notes
     -----
-    The heat is not negative with sigma_1 = 0. With damping this is true for every history if and only if
-    sigma_2 >= sigma_1 (mu_s - mu_c) / mu_c (Barahanov & Ortega 2000, IEEE Trans. Automatic Control 45(4),
-    830-832, doi:10.1109/9.847131).
+    ParameterError if a parameter is out of its range, times do not rise, or shapes differ. The heat is not
+    negative with sigma_1 = 0. With damping this is true for every history if and only if sigma_2 >= sigma_1
+    (mu_s - mu_c) / mu_c (Barahanov & Ortega 2000, IEEE Trans. Automatic Control 45(4), 830-832,
+    doi:10.1109/9.847131).
 
     Examples
     --------
