@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from sealfit.effects.contract import QUANTITIES_OF
-from sealfit.physics.aging_laws import aging_law
-from sealfit.physics.lugre import stribeck_decay
+from sealfit.physics import aging_law, stribeck_decay
 from sealfit.simulation.model import CONDITIONS, BoundEffect, Physics, declared_parameters, resolve_effects
 from sealfit.simulation.spec import STEADY_LENGTHS, Design, Spec
 

@@ -6,8 +6,7 @@ import pytest
 from scipy.integrate import quad
 
 from sealfit.errors import ParameterError
-from sealfit.physics import PRESSURES, Contact
-from sealfit.physics.lugre import exponential
+from sealfit.physics import PRESSURES, Contact, exponential
 
 uniform, sine, _, parabolic = PRESSURES.values()
 
