@@ -184,8 +184,5 @@ def stribeck_speed_aging(inputs, *, A, t_0):
     worked=({"aging_days": 9.0}, {"A": -0.02, "t_0": 1.0}, -0.02 * 2.302585092994046),
 )
 def viscosity_aging(inputs, *, A, t_0):
-    r"""Viscous coefficient that changes with age; the declared model has one for all days.
-
-    The remaining lubricant and the damping of the rubber change with age, and sigma_2 with them.
-    """
+    """Aging ends with its reactants. As a change of mu_s or mu_c, A = a stops the fall of Eq. 15."""
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)

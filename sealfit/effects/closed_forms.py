@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from sealfit.effects.contract import (
     PHASE,
     PHASES,
     SECOND,
-    Effect,
     Parameter,
     amplitude,
     closed_form,
@@ -321,94 +319,85 @@ def sinusoid_harmonics(inputs, *, A, B, lambda_, phi, phi_2):
 
 
 # ---------------------------------------------------------------- two channels
-# A product, and a slope along one channel that changes with the other.
-
-
-class Scales(NamedTuple):
-    """How two channels enter a product: x through u and z through w, both zero at the channel's reference.
-
-    The references are the channels' means over the campaign, so that a product excludes what either channel
-    does alone.
-    """
-
-    suffix: str  # of the id
-    label: str
-    u: str  # in the equation
-    w: str
-    first: Callable  # (inputs, CHANNEL) -> u, shape (n,)
-    second: Callable  # (inputs, SECOND) -> w, shape (n,)
-    units: tuple[str, str, str]  # of A, B and C
-    meaning: str  # of A in the product alone
-    variables: str  # of the Taylor series
-    inputs: dict[str, float]  # of the worked values
-    worked: tuple[float, float]  # A u w at A = 0.5; A u w + B u + C w at A = 0.5, B = 1, C = 2
-
-
-# ln x is for a channel that spans decades, such as the speed; it is NaN where x is not positive. ln(1 + z) is
-# for a channel that starts at 0 and acts ever more slowly, as days of aging do; it is NaN where z is
-# negative.
-SCALES = (
-    Scales(
-        "", "{x} and {z}", "x - x_ref", "z - z_ref", deviation, deviation,
-        ("{y}/({x} {z})", "{y}/{x}", "{y}/{z}"), "slope of a slope", "two channels",
-        # By hand: u = 2, w = -3; 0.5 * 2 * -3 = -3, and -3 + 2 - 6.
-        {"x": 12.0, "x_ref": 10.0, "z": 1.0, "z_ref": 4.0}, (-3.0, -7.0),
-    ),
-    Scales(
-        "_log", "log {x} and {z}", "ln(x / x_ref)", "z - z_ref", log_ratio, deviation,
-        ("{y}/{z}", "{y}", "{y}/{z}"), "slope in z of the slope in ln x", "ln x and z",
-        # By hand: u = ln e = 1, w = -3; -1.5, and -1.5 + 1 - 6.
-        {"x": np.e, "x_ref": 1.0, "z": 1.0, "z_ref": 4.0}, (-1.5, -6.5),
-    ),
-    Scales(
-        "_logs", "log {x} and log of 1 + {z}", "ln(x / x_ref)", "ln((1 + z) / (1 + z_ref))",
-        log_ratio, log_ratio_from_zero, ("{y}", "{y}", "{y}"), "slope of a slope, in logarithms",
-        "ln x and ln(1 + z)",
-        # By hand: u = ln e = 1, w = ln e^2 = 2; 1, and 1 + 1 + 4.
-        {"x": np.e, "x_ref": 1.0, "z": np.e**2 - 1.0, "z_ref": 0.0}, (1.0, 6.0),
-    ),
-)  # fmt: skip
+# A product of two channels, and the product with what each does alone: a slope along one channel that changes
+# with the other. ln x is for a channel that spans decades, such as the speed; it is NaN where x is not
+# positive. ln(1 + z) is for a channel that starts at 0 and acts ever more slowly, as days of aging do; it is
+# NaN where z is negative. The references are the channels' means over the campaign, so that a product
+# excludes what either channel does alone.
 
 
 def bilinear_shape(first: Callable, second: Callable, inputs, *, A, B=0.0, C=0.0) -> np.ndarray:
-    """Return A u w + B u + C w, shape (n,): a product of two channels, and with B and C a warped plane."""
+    """Return A u w + B u + C w, shape (n,): u and w are functions of the inputs and x, and of these and z."""
     u, w = first(inputs, CHANNEL), second(inputs, SECOND)
     return A * u * w + B * u + C * w
 
 
-def _factor(scale: str) -> str:
-    return scale if scale.startswith("ln") else f"({scale})"
-
-
-def _closed_form(scales: Scales, kind: str, *, alone: bool) -> Effect:
-    """Return the product of two channels, with the terms of each channel alone if wanted.
-
-    A product without them is for an effect that shows only where both channels are away from their means.
-    """
-    s, values = scales, {"A": 0.5, "B": 1.0, "C": 2.0}
-    warped_plane = f"h = A u w + B u + C w, u = {s.u}, w = {s.w}"
-    meanings = (
-        "slope of a slope" if alone else s.meaning,
-        "slope in the first channel",
-        "slope in the second channel",
-    )
-    names = ("A", "B", "C")[: 3 if alone else 1]
-    return closed_form(
-        id=kind + s.suffix,
-        label=f"product of {s.label}" + ", and each alone" * alone,
-        equation=warped_plane if alone else f"h = A {_factor(s.u)} {_factor(s.w)}",
-        reference=f"{{x}} = {{x_ref}} {'and' if alone else 'or'} {{z}} = {{z_ref}}",
-        reads=(CHANNEL, SECOND),
-        parameters=tuple(
-            amplitude(name, unit, 0.01 if name == "A" else 0.0, meaning)
-            for name, unit, meaning in zip(names, s.units, meanings, strict=False)
-        ),
-        shape=partial(bilinear_shape, s.first, s.second),
-        source=f"Form: ours, the first {'terms' if alone else 'mixed term'} of a Taylor series "
-        f"in {s.variables}.",
-        worked=(s.inputs, {name: values[name] for name in names}, s.worked[alone]),
+def _bilinear(of_a: str, of_b: str, of_c: str) -> tuple[Parameter, ...]:
+    """Return the parameters of a product with each channel alone, which have these units."""
+    return (
+        amplitude("A", of_a, 0.01, "slope of a slope"),
+        amplitude("B", of_b, 0.0, "slope in the first channel"),
+        amplitude("C", of_c, 0.0, "slope in the second channel"),
     )
 
 
-PRODUCT, PRODUCT_LOG, PRODUCT_LOGS = (_closed_form(s, "product", alone=False) for s in SCALES)
-BILINEAR, BILINEAR_LOG, BILINEAR_LOGS = (_closed_form(s, "bilinear", alone=True) for s in SCALES)
+product = partial(closed_form, reads=(CHANNEL, SECOND), reference="{x} = {x_ref} or {z} = {z_ref}")
+bilinear = partial(closed_form, reads=(CHANNEL, SECOND), reference="{x} = {x_ref} and {z} = {z_ref}")
+
+# By hand: u = 2, w = -3; 0.5 * 2 * -3 = -3, and -3 + 2 - 6 = -7 with each alone.
+PRODUCT = product(
+    id="product",
+    label="product of {x} and {z}",
+    equation="h = A (x - x_ref) (z - z_ref)",
+    parameters=(amplitude("A", "{y}/({x} {z})", 0.01, "slope of a slope"),),
+    shape=partial(bilinear_shape, deviation, deviation),
+    source="Form: ours, the first mixed term of a Taylor series in two channels.",
+    worked=({"x": 12.0, "x_ref": 10.0, "z": 1.0, "z_ref": 4.0}, {"A": 0.5}, -3.0),
+)
+# By hand: u = ln e = 1, w = -3; -1.5, and -1.5 + 1 - 6 = -6.5.
+PRODUCT_LOG = product(
+    id="product_log",
+    label="product of log {x} and {z}",
+    equation="h = A ln(x / x_ref) (z - z_ref)",
+    parameters=(amplitude("A", "{y}/{z}", 0.01, "slope in z of the slope in ln x"),),
+    shape=partial(bilinear_shape, log_ratio, deviation),
+    source="Form: ours, the first mixed term of a Taylor series in ln x and z.",
+    worked=({"x": np.e, "x_ref": 1.0, "z": 1.0, "z_ref": 4.0}, {"A": 0.5}, -1.5),
+)
+# By hand: u = ln e = 1, w = ln e^2 = 2; 1, and 1 + 1 + 4 = 6.
+PRODUCT_LOGS = product(
+    id="product_logs",
+    label="product of log {x} and log of 1 + {z}",
+    equation="h = A ln(x / x_ref) ln((1 + z) / (1 + z_ref))",
+    parameters=(amplitude("A", "{y}", 0.01, "slope of a slope, in logarithms"),),
+    shape=partial(bilinear_shape, log_ratio, log_ratio_from_zero),
+    source="Form: ours, the first mixed term of a Taylor series in ln x and ln(1 + z).",
+    worked=({"x": np.e, "x_ref": 1.0, "z": np.e**2 - 1.0, "z_ref": 0.0}, {"A": 0.5}, 1.0),
+)
+BILINEAR = bilinear(
+    id="bilinear",
+    label="product of {x} and {z}, and each alone",
+    equation="h = A u w + B u + C w, u = x - x_ref, w = z - z_ref",
+    parameters=_bilinear("{y}/({x} {z})", "{y}/{x}", "{y}/{z}"),
+    shape=PRODUCT.shape,
+    source="Form: ours, the first terms of a Taylor series in two channels.",
+    worked=(PRODUCT.worked[0], {"A": 0.5, "B": 1.0, "C": 2.0}, -7.0),
+)
+BILINEAR_LOG = bilinear(
+    id="bilinear_log",
+    label="product of log {x} and {z}, and each alone",
+    equation="h = A u w + B u + C w, u = ln(x / x_ref), w = z - z_ref",
+    parameters=_bilinear("{y}/{z}", "{y}", "{y}/{z}"),
+    shape=PRODUCT_LOG.shape,
+    source="Form: ours, the first terms of a Taylor series in ln x and z.",
+    worked=(PRODUCT_LOG.worked[0], {"A": 0.5, "B": 1.0, "C": 2.0}, -6.5),
+)
+BILINEAR_LOGS = bilinear(
+    id="bilinear_logs",
+    label="product of log {x} and log of 1 + {z}, and each alone",
+    equation="h = A u w + B u + C w, u = ln(x / x_ref), w = ln((1 + z) / (1 + z_ref))",
+    parameters=_bilinear("{y}", "{y}", "{y}"),
+    shape=PRODUCT_LOGS.shape,
+    source="Form: ours, the first terms of a Taylor series in ln x and ln(1 + z).",
+    worked=(PRODUCT_LOGS.worked[0], {"A": 0.5, "B": 1.0, "C": 2.0}, 6.0),
+)

@@ -216,10 +216,6 @@ def _shows_days(hours: np.ndarray) -> bool:
     shown_by=_shows_days,
 )
 def day_and_night(inputs, *, A, t_max):
-    r"""Change with the time of day: laboratory, drive and oil are warmer in the afternoon than at night.
-
-    t is the time since the campaign's first file. With files in working hours only it describes the change
-    within them and must not be used for the night.
-    """
+    """Difference of the directions, relative to their mean, or in its unit for an added change."""
     hours = np.asarray(inputs["elapsed_h"], dtype=float) - t_max
     return A * np.cos(2 * np.pi * hours / DAY_H)

@@ -244,8 +244,5 @@ def grosch_peak(inputs, *, A, v_p, w):
     worked=({"humidity_pct": 35.0, "humidity_pct_ref": 55.0}, {"A": -0.001}, 0.02),
 )
 def humidity(inputs, *, A):
-    r"""Humidity of the laboratory: water from the air weakens adhesion and lubricates at speed.
-
-    It needs a column `humidity_pct`; for another name the effect is `linear`.
-    """
+    """Water from the air weakens adhesion and lubricates; under another name the effect is `linear`."""
     return A * deviation(inputs, "humidity_pct")

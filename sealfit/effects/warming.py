@@ -171,9 +171,5 @@ def warming_conduction_load(inputs, *, A):
     worked=({"lab_temperature_C": 25.0, "lab_temperature_C_ref": 22.0}, {"A": -0.004}, -0.012),
 )
 def lab_temperature(inputs, *, A):
-    r"""Laboratory temperature: friction follows the room, a few per mille for each degree.
-
-    It needs a column `lab_temperature_C`, which is not the aging temperature; for another name the effect is
-    `linear`.
-    """
+    """Temperature of the room, not of aging; under another name the effect is `linear`."""
     return A * deviation(inputs, "lab_temperature_C")
