@@ -107,22 +107,17 @@ def moving_strokes(time: np.ndarray, displacement: np.ndarray) -> list[Stroke]:
 
 @dataclass(frozen=True)
 class TraceColumn:
-    """A column of the trace files, and what each of some files holds in it.
+    """A column of the trace files."""
 
-    `position` counts from 1; `label` is what the files call it, "" if nothing; `role` is what its name says,
-    with `sure` 3 for a word, 1 for a letter, 0 for nothing. `unknown` is a unit that is not known here,
-    `copy_of` the position of another column that is the same signal.
-    """
-
-    position: int
-    label: str
-    role: str
-    sure: int
+    position: int  # from 1
+    label: str  # what the files call it, "" if nothing
+    role: str  # what its name says
+    sure: int  # of the role: 3 for a word, 1 for a letter, 0 for nothing
     unit: Unit | None
-    values: tuple[np.ndarray, ...]
-    by_name: bool
-    unknown: str = ""
-    copy_of: int | None = None
+    values: tuple[np.ndarray, ...]  # what each of some files holds in it
+    by_name: bool  # whether a config can name it by its label
+    unknown: str = ""  # a unit that is not known here
+    copy_of: int | None = None  # position of another column that is the same signal
 
     @property
     def place(self) -> str:

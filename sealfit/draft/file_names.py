@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealfit.config import AGING_CONDITION, Files
-from sealfit.draft.vocabulary import DIRECTIONS, RUBBERS, UNAGED, after_number, before_number
+from sealfit.draft.vocabulary import AFTER, BEFORE, DIRECTIONS, RUBBERS, UNAGED, said_by
 
 # The ending of a file's name: with a letter, as in `v0.5` the last figure is none.
 SUFFIX = re.compile(r"\.(?=[^./]*[^\W\d])[^./]*$")
@@ -123,9 +123,6 @@ def as_float(text: str) -> float:
     return float(text.replace(",", ".").replace("p", "."))
 
 
-# ---------------------------------------------------------------- pattern
-
-
 def pattern_of(names: Names) -> str:
     """Return the regular expression that finds the parts of names."""
     optional = next((part for part in names.parts if part.texts[0] == ""), None)
@@ -227,9 +224,6 @@ def read_names(files: Sequence[str]) -> Names:
     return Names(tuple(files), tuple(rows[0]), tuple(parts), middle, tuple(words))
 
 
-# ---------------------------------------------------------------- parts
-
-
 def _parts(rows: Sequence[Sequence[Token]]) -> list[NamePart]:
     """Return the parts of names that are cut alike."""
     found: list[NamePart] = []
@@ -266,10 +260,10 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     pattern = _number_pattern(texts)
     after, before = _around(rows, at)
     unit = ""
-    if after and (said := after_number(re.sub(r"[-_ /]", "", after))):
+    if after and (said := said_by(AFTER, re.sub(r"[-_ /]", "", after))):
         (ours, unit), why = said, f"'{after}' stands after the number"
     else:
-        ours = before_number(before) if before else ""
+        ours = said_by(BEFORE, before) or ""
         why = f"'{before}' stands before the number" if before else "a bare number"
         if ours in NO_COUNTS and _counts_up(texts):
             ours = ""

@@ -206,9 +206,6 @@ def suited_to(names: Names, roles: Roles) -> Names:
     return names
 
 
-# ---------------------------------------------------------------- keys
-
-
 def source_keys(
     found: Found, names: Names, table: RunsTable | None, header: Collection[str], notes: Notes
 ) -> None:

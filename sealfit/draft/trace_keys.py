@@ -135,9 +135,6 @@ def _shown(line: str) -> str:
     return f"'{text[:70]}...'" if len(text) > 70 else f"'{text}'"
 
 
-# ---------------------------------------------------------------- columns
-
-
 def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], read: int, notes: Notes) -> None:
     """Add which column goes into which slot, and what is done with the others.
 
@@ -212,7 +209,7 @@ def _column_doubts(column: TraceColumn, role: str, key: str, roles: Roles, notes
 
 def _integrated(speed: TraceColumn, notes: Notes) -> str:
     """Add what makes a displacement of a speed; return the helper column."""
-    rotation = speed.unit is not None and speed.unit.dimension == "rotation"
+    rotation = speed.dimension == "rotation"
     helper = "speed_rpm" if rotation else "speed_column_mm_s"
     value = speed.key if rotation else file_column(speed.key, speed.unit, helper)
     notes.guess(f"trace.columns.{helper}", value, f"{speed.place}: by its name or unit")
@@ -289,7 +286,7 @@ def _other_columns(found: Found, roles: Roles, clock: str, notes: Notes) -> None
 
 def _channel(column: TraceColumn, taken: set[str]) -> str:
     """Return a name for a column as a channel, none of those taken; "" for a ratio, a counter or a copy."""
-    role = column.role or (column.unit.dimension if column.unit is not None else "")
+    role = column.role or column.dimension
     if column.copy_of or role not in CHANNELS or all(rises(values) for values in column.values):
         return ""
     unit = f"_{column.unit.suffix}" if column.unit is not None else ""
@@ -326,9 +323,6 @@ def _assumed(column: TraceColumn, role: str, slot: str, notes: Notes) -> Unit | 
         fix = f"If it is another, name it: {slot} = {{ name = ..., unit = ... }}."
         notes.doubt(f"trace.columns.{slot}", reason, fix)
     return None
-
-
-# ---------------------------------------------------------------- header
 
 
 def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes) -> list[str]:

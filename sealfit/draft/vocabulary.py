@@ -25,12 +25,10 @@ def name_and_unit(text: str) -> tuple[str, Unit | None]:
 
     Examples
     --------
-    >>> name_and_unit("Weg [mm]")[0], name_and_unit("t/s")[1].name, name_and_unit("Kraft in kN")[1].name
-    ('Weg', 's', 'kN')
-    >>> name_and_unit("Speed_mm_s")[1].name, name_and_unit("Reibkraft")
-    ('mm/s', ('Reibkraft', None))
-    >>> name_and_unit("Weeks")[1].name
-    'week'
+    >>> name_and_unit("Weg [mm]")[0], name_and_unit("t/s")[1].name, name_and_unit("Speed_mm_s")[1].name
+    ('Weg', 's', 'mm/s')
+    >>> name_and_unit("Kraft in kN")[1].name, name_and_unit("Weeks")[1].name, name_and_unit("Reibkraft")
+    ('kN', 'week', ('Reibkraft', None))
     """
     for pattern in _NAME_AND_UNIT:
         if match := pattern.match(text.strip()):
@@ -42,12 +40,9 @@ def name_and_unit(text: str) -> tuple[str, Unit | None]:
     return text.strip(), unit_of(text) if setting(text) == "aging_days" else None
 
 
-# ---------------------------------------------------------------- words
-# What a column holds, by its name: the first row that fits decides, so `Reibungszahl` is no force.
-
 STRONG, WEAK = 3, 1  # a word that says it, a single letter that may
-
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
+# What a column holds, by its name: the first row that fits decides, so `Reibungszahl` is no force.
 _COLUMN_WORDS = (
     ("coefficient", r"\bcof\b|\bmue?\b|coefficient|reibwert|reibungszahl|reibzahl"),
     ("none", r"\bindex\b|\bscan\b|\bsample\b|\bnr\b|\bno\b|count|segment|cycle|zyklus|comment|kommentar|alarm"
@@ -126,15 +121,11 @@ def setting(name: str) -> str:
     return next((ours for ours, pattern in _SETTING_WORDS if re.search(pattern, words)), "")
 
 
-# ---------------------------------------------------------------- parts of file names
-# What stands before or after a number in a file name. The case of single letters matters: T80 is a
-# temperature.
-
-
 def _by_word(said: Mapping) -> dict:
     return {word: meaning for meaning, words in said.items() for word in words.split()}
 
 
+# What stands before or after a number in a file name, by our column, or by it and the unit, "" for ours.
 BEFORE = _by_word({
     "temperature_C": "T temp temperature temperatur",
     "compression_ratio_pct": "C K comp compr compression verpressung H height",
@@ -178,11 +169,6 @@ DIRECTIONS = _by_word({
 })  # fmt: skip
 
 
-def before_number(letters: str) -> str:
-    """Return what a number after these letters is; "" if they do not say. Case counts for single letters."""
-    return BEFORE.get(letters) or (BEFORE.get(letters.lower(), "") if len(letters) > 1 else "")
-
-
-def after_number(letters: str) -> tuple[str, str] | None:
-    """Return what a number followed by this unit is, and its unit, "" for ours; None if it does not say."""
-    return AFTER.get(letters) or (AFTER.get(letters.lower()) if len(letters) > 1 else None)
+def said_by(table: Mapping, letters: str):
+    """Return what letters beside a number say by `BEFORE` or `AFTER`, or None; case counts for one letter."""
+    return table.get(letters) or (table.get(letters.lower()) if len(letters) > 1 else None)
