@@ -201,10 +201,8 @@ def _start_worker() -> None:
 
 def _end_with_parent() -> None:
     """End this process when its parent has died, so that a killed run leaves no waiting workers."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    multiprocessing.parent_process().join()
+    os._exit(1)
 
 
 # ---------------------------------------------------------------- cluster

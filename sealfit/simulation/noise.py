@@ -39,9 +39,6 @@ def remembering(kicks: np.ndarray, memory: float) -> np.ndarray:
     return lfilter([1.0], [1.0, -memory], scaled)
 
 
-# ---------------------------------------------------------------- noise
-
-
 class White(Strict):
     """Independent noise on every sample."""
 
@@ -190,8 +187,6 @@ def _streams(noise: Sequence[Noise], seed: int, *file: int) -> Iterator[tuple[No
         yield kind, stream(seed, kind.kind, seen[kind.kind], *file)
         seen[kind.kind] += 1
 
-
-# ---------------------------------------------------------------- defects
 
 DEFECTS = ("missing_cells", "spikes", "gaps", "saturated", "reversed")  # keys of `BadData`
 Columns = dict[str, np.ndarray]  # a trace's columns, each of shape (n,); NaN is written as an empty cell
