@@ -42,27 +42,21 @@ ROOM = ANYWHERE[:5]  # targets of the climate of the room
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter of an effect.
+    """One parameter of an effect."""
 
-    In `unit`, `{x}` and `{z}` stand for the units of the channels and `{y}` for that of the result: the unit
-    of force for an added force, none for a factor, that of the parameter for a change of it; see `fill_unit`.
-    A name that is a Python keyword ends in an underscore.
-
-    `linear` marks an amplitude. `search` gives the grid of a nonlinear parameter: numbers, or "inside"
-    (quantiles of the channel), "between" (midpoints of its neighbouring values, for a jump), "span"
-    (logarithmic, from a fraction of the channel's range to a few ranges), "ratio" (logarithmic, over its
-    magnitudes). `vanishes_at` is a value at which the shape is zero for every amplitude; no descent crosses
-    it, so that a fit starts on both sides.
-    """
-
-    name: str
+    name: str  # ends in an underscore if it is a Python keyword
+    # {x} and {z} stand for the units of the channels and {y} for that of the result: the unit of force for an
+    # added force, none for a factor, that of the parameter for a change of it; see `fill_unit`.
     unit: str
     start: float
     bounds: tuple[float, float]
     meaning: str
-    linear: bool = False
+    linear: bool = False  # an amplitude
+    # Grid of a nonlinear parameter: numbers, or "inside" (quantiles of the channel), "between" (midpoints of
+    # its neighbouring values, for a jump), "span" (logarithmic, from a fraction of the channel's range to a
+    # few ranges), "ratio" (logarithmic, over its magnitudes).
     search: tuple[float, ...] | Literal["inside", "between", "span", "ratio"] = ()
-    vanishes_at: float | None = None
+    vanishes_at: float | None = None  # where the shape is zero for every amplitude: no descent crosses it
 
     def __post_init__(self) -> None:
         low, high = self.bounds
@@ -146,8 +140,7 @@ class Effect:
         return {p.name: p.start for p in self.parameters}
 
 
-# A closed form is of any one channel, zero at its reference, acts anywhere and names no mechanism, unless it
-# says otherwise.
+# A closed form is of any one channel and zero at its reference, unless it says otherwise.
 closed_form = partial(Effect, reads=(CHANNEL,), acts_on=ANYWHERE, reference="{x} = {x_ref}", physical=False)
 
 
