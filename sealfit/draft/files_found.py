@@ -242,9 +242,6 @@ def _numbers(lines: Sequence[str], dialect: Dialect) -> np.ndarray:
     return np.array(rows)
 
 
-# ---------------------------------------------------------------- table of runs
-
-
 @dataclass(frozen=True)
 class RunsTable:
     """A table with a line for each trace file."""

@@ -165,7 +165,7 @@ def _keys(said: Mapping[str, dict], columns: Collection[str]) -> Counter:
 
 def _unaged_apart(names: Names, found: Found) -> Names:
     """Return the names with a specimen for each series, where files of unaged rubber are alike otherwise."""
-    series = [part for part in names.parts if part.ours in AGING_CONDITION and part.group]
+    series = [part for part in names.parts if part.ours in AGING_CONDITION]
     if "specimen_id" in names.given or "aging_days" not in names.given or len(series) < 2:
         return names
     alike = sorted(names.given - {*AGING_CONDITION, "started_at", "run_id"})

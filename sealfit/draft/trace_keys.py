@@ -240,8 +240,7 @@ def _clock_or_rate(found: Found, notes: Notes) -> str | None:
             evidence = f"column {i + 1} '{name}': times of day; seconds count from the first"
             notes.guess("trace.columns.time_s", name or i + 1, evidence)
             return name
-    rate = rate_in([one.header for one in found.sniffed], one.decimal)
-    if rate is None:
+    if (rate := rate_in([one.header for one in found.sniffed], one.decimal)) is None:
         return None
     per_second, line, pattern = rate
     evidence = f"no column of time; rows per second by the header of every file looked at: '{line}'"

@@ -118,7 +118,6 @@ def _apply(pickled: bytes) -> list:
 
 
 # ---------------------------------------------------------------- processes
-# Chunks of work in processes of this computer, with results in order.
 
 WAITING_PER_WORKER = 2  # chunks submitted ahead; bounds the memory of waiting results
 # Not fork: it copies the locks of pyarrow's and BLAS's threads without the threads that free them. A fork
@@ -206,7 +205,6 @@ def _end_with_parent() -> None:
 
 
 # ---------------------------------------------------------------- cluster
-# Chunks of work on a Dask cluster, with results in order; Dask is loaded where one is used.
 
 WAITING_PER_THREAD = 2  # chunks submitted per thread of the cluster; bounds the memory of the scheduler
 CONNECT_S = 15.0

@@ -93,8 +93,6 @@ def truth_document(spec: Spec, files: pd.DataFrame, effect_rms_N: np.ndarray) ->
     }
 
 
-# ---------------------------------------------------------------- campaign
-
 DISPLACEMENT_DECIMALS = 5  # of mm: 10 nm, the resolution of a linear encoder
 NOT_IN_RUNS = ["condition", "direction", "run_order", "elapsed_h"]  # computed by ingest
 CRAWL = 1e-3  # of the set speed, at least, where effects are evaluated: a law in log speed has no value at 0
@@ -104,10 +102,9 @@ RMS_ROWS = 64  # per file for the RMS of an effect: it gives two digits
 def simulate(spec: Spec, out: Path) -> None:
     """Write the campaign folder `out` and, beside it, `<out>.truth.json`.
 
-    The same SPEC gives the same bytes. The folder is written completely or not at all.
-
-    ConfigError if an effect is not in the catalogue or is not finite somewhere on this design. OutError if
-    `out` holds files that `simulate` did not write, or cannot be written.
+    The same SPEC gives the same bytes. The folder is written completely or not at all. ConfigError if an
+    effect is not in the catalogue or is not finite somewhere on this design. OutError if `out` holds files
+    that `simulate` did not write, or cannot be written.
     """
     out = Path(os.path.abspath(out))
     _refuse_foreign(out)

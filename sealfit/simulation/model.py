@@ -94,8 +94,6 @@ def declared_parameters(physics: Physics, conditions: Mapping[str, np.ndarray]) 
     return values
 
 
-# ---------------------------------------------------------------- effects
-
 EXPRESSION = "expression"
 
 
