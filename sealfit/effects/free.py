@@ -17,9 +17,8 @@ from sealfit.effects.contract import CHANNEL, SECOND, Effect, amplitude, closed_
 from sealfit.errors import ParameterError
 
 LEVELS, SLOPES, SMOOTH, SURFACE = "levels", "slopes", "smooth", "surface"
-WIDE = (
-    20.0  # ratio of the largest to the smallest value of a positive channel from which its logarithm is used
-)
+# Ratio of the largest to the smallest value of a positive channel from which its logarithm is used.
+WIDE = 20.0
 
 
 def _free(function: Callable, means: Sequence[float] | None, **description) -> Effect:
@@ -35,7 +34,7 @@ def _free(function: Callable, means: Sequence[float] | None, **description) -> E
         channels = "{x} and {z}" if "reads" in description else "{x}"
         description["equation"] += "; less its mean over the campaign"
         description["reference"] = f"mean over {channels} in the campaign"
-    shape = partial(_shape, function, None if means is None else np.array(means[1:], float), names)
+    shape = partial(_shape, function, None if means is None else np.array(means, float)[1:], names)
     return closed_form(shape=shape, **description)
 
 
