@@ -19,17 +19,14 @@ from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import estimate_components, estimate_scatter, with_curves
 from sealfit.fit.joint.whitening import GAIN, LEVELS_OF_FORCE, Scatter, Whitening
 
-# Fall of the whitened sum of squares at which a descent ends when fits are only compared. Rivals differ by
-# several units.
+# Fall of the whitened sum of squares at which a descent ends when fits are only compared: rivals differ more.
 COMPARED = 1e-2
 # The same for the first fit, before the scatter is estimated.
 ROUGH = 1.0
-# Number of alternating fits of model and scatter. The third changes no estimate by a tenth of its standard
-# error.
+# Number of alternating fits of model and scatter; the third changes no estimate by 0.1 standard errors.
 TURNS = 3
-# Ratio of errors from which the scatter of specimens that differ in their curves counts as wrong. Least
-# squares explain some of a true scatter by the aging law: the ratio is below 1.3 in 115 of 120 simulated
-# campaigns of 5 to 13 specimens with 3 % of scatter and v_s that differ by 10 or 20 %.
+# Ratio of errors from which the scatter of specimens that differ in their curves counts as wrong. It is below
+# this in 115 of 120 simulated campaigns with 3 % of scatter and v_s that differ by 10 or 20 %.
 WRONG_SCATTER = 1.3
 # Deviance per row by which a model is far better than that which the search on few rows has found.
 WRONG_SEARCH = 1.0
@@ -84,14 +81,11 @@ class Fitted:
     def at_limit(self) -> np.ndarray:
         """Whether each fitted number is a sigma_2 of 0 that the data would make negative, shape (p,).
 
-        The fit cannot follow the residual along it, so it does not count as one of the model's directions.
+        It does not count as a direction of the model, as the fit cannot follow the residual along it.
         """
         found = np.zeros(self.model.size, dtype=bool)
-        zero = [
-            number
-            for number, parameter in enumerate(self.model.declared.parameters)
-            if parameter.quantity == "sigma_2" and self.model.theta[number] == 0.0
-        ]
+        quantities = [parameter.quantity for parameter in self.model.declared.parameters]
+        zero = np.flatnonzero((np.array(quantities) == "sigma_2") & (self.model.theta == 0.0))
         found[zero] = self.white_jacobian.against(self.white_residual)[zero] < 0
         return found
 
@@ -106,10 +100,9 @@ class Fitted:
 
     @cached
     def unit_shares(self, level: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return eigenvalues and eigenvectors of each group's block of the hat matrix.
+        """Return eigenvalues, (g, k), and eigenvectors, (g, k, k), of each group's block of the hat matrix.
 
-        Their shapes are (g, k) and (g, k, k). The eigenvectors are in the coordinates of the basis columns
-        of the group's block.
+        The eigenvectors are in the coordinates of the basis columns of the group's block.
         """
         groups = np.split(self.basis.values, self.rows.groups.starts[level][1:])
         return np.linalg.eigh(np.stack([basis.T @ basis for basis in groups]))
@@ -118,8 +111,7 @@ class Fitted:
     def unit_residual(self, level: str) -> np.ndarray:
         """Return the whitened residual times (I - H_gg)^(-1/2) in each group of a level, shape (n,).
 
-        H_gg is the group's block of the hat matrix. This is the CR2 correction (Bell & McCaffrey 2002, Survey
-        Methodology 28(2), 169-181).
+        H_gg is its block of the hat matrix (CR2: Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181).
         """
         size, axes = self.unit_shares(level)
         size = np.clip(size, 0.0, 0.98)  # a leverage of 1 leaves no residual to correct
@@ -153,10 +145,9 @@ def fit(
 ) -> Fitted:
     """Return the model fitted to `rows`, physics and effects together.
 
-    `model` is the start, with v_s and b from a global search, and `scatter` a starting value. `turns` is how
-    often the scatter is re-estimated and the model refitted; specimens get no component of their own if the
-    error is much smaller without one. If it is 0, the scatter is fixed, and so are the loads of its
-    components, shape (n, kinds); fits to be compared must share them.
+    `model` is the start, with v_s and b from a global search. The scatter is re-estimated and the model
+    refitted `turns` times; specimens get no component of their own if the error is much smaller without one.
+    With 0 the scatter is fixed, and so are the loads, shape (n, kinds), which fits to be compared must share.
     """
     centre = prior.centre_of(model)
     if scatter is None:
@@ -190,9 +181,7 @@ def _alternately(model: Model, rows: Rows, scatter: Scatter | None, centre: np.n
 def _misses_levels(fitted: Fitted) -> bool:
     """Whether least squares without the scatter of specimens would leave a much smaller error.
 
-    Where an effect changes the curves of specimens, these may count for more than their levels, and all of
-    the error of the levels is taken for scatter. Without such curves least squares explain the scatter of
-    levels by the aging law, where there are few specimens.
+    If an effect changes the curves of specimens, all of the error of their levels may be taken for scatter.
     """
     parts = [part for part in fitted.scatter.components if part.level == "specimen"]
     if not any(part.variance > 0 and part.kind not in LEVELS_OF_FORCE for part in parts):
@@ -204,10 +193,7 @@ def _misses_levels(fitted: Fitted) -> bool:
 
 
 def _searched(model: Model, rows: Rows, scatter: Scatter) -> Model:
-    """Return the model from a search of v_s and b, or the model itself if that is far better on all rows.
-
-    The search has few rows of a stroke, which may not determine an effect at its start.
-    """
+    """Return the model from a search on few rows, or the model itself if that is far better on all rows."""
     found = search_nonlinear(model, rows, scatter)
     kept, own = (fitted_at(m, rows, scatter) for m in (model, found))
     return model if kept.deviance + WRONG_SEARCH * rows.force.size < own.deviance else found
@@ -226,9 +212,8 @@ def fitted_at(model: Model, rows: Rows, scatter: Scatter, loads: np.ndarray | No
 def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
     """Return a fit with variance components, and row noise if wanted, re-estimated from its own residual.
 
-    An effect that a model lacks inflates its variance components. Deviances distinguish models only if each
-    model has its own components; under inflated ones all models fit about equally well. Fits to be compared
-    share the friction, which is kept, and the row noise of the best fit.
+    An effect that a model lacks inflates its components, under which all models fit about equally well. Fits
+    to be compared share the friction, which is kept, and the row noise of the best fit.
     """
     rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
     scatter = estimate(rows, fitted.residual, fitted.loads, fitted.jacobian, fitted.scatter)

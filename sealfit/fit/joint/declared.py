@@ -14,11 +14,9 @@ from sealfit.fit.joint.rows import Rows
 from sealfit.ingest.strokes import speed_clusters
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
-# Number of tested speeds that a Stribeck curve needs. With sigma_2 >= 0 three speeds determine it at these
-# speeds.
+# Number of tested speeds that determine a Stribeck curve at these speeds, as sigma_2 >= 0.
 SPEEDS_FOR_STRIBECK = 3
-# Number of tested speeds that determine the curve between them as well: mu_s, mu_c, v_s and sigma_2 are four
-# numbers.
+# Number of tested speeds that determine the curve, four numbers, between them as well.
 SPEEDS_BETWEEN = 4
 # Forms of the speed dependence with mu_s and v_s.
 CURVED = ("full", "interpolated")
@@ -26,9 +24,8 @@ CURVED = ("full", "interpolated")
 SPEEDS_FOR_VISCOUS = 2
 # Number of aging days that Eq. 15 needs: mu_0, a and b are three numbers.
 DAYS_FOR_LAW = 3
-# Standard deviation of the prior of the Stribeck drop mu_s - mu_c, as a share of friction. Four speeds, or
-# fewer, may hardly distinguish mu_c from a viscous force. Without a prior mu_c = 0 then fits as well as any
-# other value, and the force between the speeds is far off.
+# Standard deviation of the prior of the Stribeck drop mu_s - mu_c, as a share of friction. Without a prior
+# mu_c = 0 may fit four speeds as well as any other value, and the force between the speeds is far off.
 DROP_SHARE = 0.5
 # P-value below which a line through three speeds is rejected. Few files give the test little power. In 59
 # campaigns drawn at random with at most 27 files, 0.5 in place of 0.15 lowered the error against the truth in
@@ -63,13 +60,12 @@ class Declared:
 
 
 def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
-    """Return the declared model that these conditions and speeds determine.
+    """Return the declared model that these conditions and speeds determine; the result is cached.
 
     A series needs four speeds in one direction for Eq. 14, or three at which friction is not a straight line
     ("interpolated"), and two for the viscous term. Two will do if another series of its rubber has a curve.
-    Eq. 15 needs three days, the unaged day included. Parameters that are not determined are left out. Speeds
-    are counted within one direction: an offset between directions could be taken for a Stribeck curve. The
-    result is cached. A part of a campaign with the same conditions takes the model of the campaign, `as_in`.
+    Eq. 15 needs three days, the unaged day included. Speeds are counted within one direction: an offset
+    between directions could be taken for a Stribeck curve. A part of a campaign takes its model, `as_in`.
     """
     return rows.cache.once(("declared",), lambda: _declare(rows) if as_in is None else declare(as_in))
 
@@ -108,10 +104,7 @@ def _declare(rows: Rows) -> Declared:
 
 
 def has_law(conditions: pd.DataFrame, aging: bool) -> np.ndarray:
-    """Return whether Eq. 15 is fitted to the series of each condition, shape (conditions,).
-
-    Its days, with those of unaged rubber, must be enough. `conditions` as for `series_of_curve`.
-    """
+    """Return whether the series of each condition has enough days, unaged ones included, for Eq. 15."""
     series = series_of_curve(conditions, aging)
     rubbers, days = (conditions[name].tolist() for name in ("rubber", "aging_days"))
     unaged_rubbers = {rubber for rubber, day in zip(rubbers, days, strict=True) if day == 0}
@@ -122,10 +115,7 @@ def has_law(conditions: pd.DataFrame, aging: bool) -> np.ndarray:
 
 
 def _drops(number_s: np.ndarray, number_c: np.ndarray, rows: Rows) -> dict[tuple[int, int], float]:
-    """Return the prior's standard deviation of mu_s - mu_c for each pair of fitted numbers.
-
-    The arrays have the numbers of mu_s and mu_c of each condition, -1 without a Stribeck curve.
-    """
+    """Return the prior's standard deviation of mu_s - mu_c for pairs of numbers, -1 without a curve."""
     mu, found = np.abs(rows.force) / rows.load, {}
     both = np.column_stack([number_s, number_c])
     for pair in np.unique(both[number_s >= 0], axis=0):
@@ -138,8 +128,7 @@ def _drops(number_s: np.ndarray, number_c: np.ndarray, rows: Rows) -> dict[tuple
 def series_of_curve(conditions, aging: bool) -> np.ndarray:
     """Return the series whose v_s and sigma_2 each condition uses, shape (conditions,).
 
-    Unaged rubber belongs to the series of its rubber if there is exactly one. `conditions` has the columns
-    `series`, `rubber` and, where rubber is aged, `aging_days`.
+    Unaged rubber belongs to the series of its rubber if there is exactly one.
     """
     series = conditions["series"].to_numpy(dtype=object).copy()
     if aging:
@@ -154,8 +143,7 @@ def series_of_curve(conditions, aging: bool) -> np.ndarray:
 def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
     """Return the form of the speed dependence that the speeds of each series determine.
 
-    With three speeds it is a line, unless a line is rejected. It is a curve, too, if another series of the
-    rubber has one: an effect such as warming may hide the curve in one series.
+    It is a curve, too, if another series of the rubber has one, as an effect may hide it in one series.
     """
     number, names = pd.factorize(series_of)
     key = 2 * number[rows.condition] + (rows.speed > 0)
@@ -183,26 +171,19 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
 def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
     """Return the p-value of F tests on file means that friction at three speeds is a line that rises.
 
-    A curve through three speeds leaves few degrees of freedom for other effects, so a line is kept if it is
-    not rejected. As in the declared model its slope is not negative and shared by all conditions, each of
-    which has its own level. The curve adds curvature that all share, and may add a slope of each condition
-    (mu_s less mu_c). Repeats may differ, each by the same in all runs: seals run in. So may the directions.
-    Without a degree of freedom there is no test; it is 0 then, and the curve is taken.
+    A curve through three speeds leaves few degrees of freedom for other effects. As in the declared model the
+    slope is not negative and shared by all conditions, each of which has its own level. The curve adds
+    curvature that all share, and may add a slope of each condition (mu_s less mu_c). Repeats and directions
+    may differ by the same in all runs. The result is 0, and the curve is taken, without a degree of freedom.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     nearest = np.abs(speed[:, None] - tested_speeds(rows, chosen)).argmin(axis=1)
-    table = pd.DataFrame(
-        {
-            "file": rows.codes("file")[chosen],
-            "direction": np.sign(rows.speed[chosen]),
-            "condition": rows.condition[chosen],
-            "repeat": rows.table["repeat"].to_numpy()[chosen],
-            "slow": nearest == 0,
-            "middle": nearest == 1,
-            "slope": speed / load,
-            "mu": np.abs(rows.force[chosen]) / load,
-        }
-    )
+    repeat = rows.table["repeat"].to_numpy()[chosen]
+    table = pd.DataFrame({
+        "file": rows.codes("file")[chosen], "direction": np.sign(rows.speed[chosen]),
+        "condition": rows.condition[chosen], "repeat": repeat, "slow": nearest == 0, "middle": nearest == 1,
+        "slope": speed / load, "mu": np.abs(rows.force[chosen]) / load,
+    })  # fmt: skip
     files = table.groupby(["file", "direction", "condition", "slow", "middle"], as_index=False).mean()
     of_level = ("condition", "repeat", "direction")
     levels = np.hstack([pd.get_dummies(files[name], dtype=float) for name in of_level])
@@ -218,7 +199,7 @@ def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
 
 
 def _p_of_line(line: np.ndarray, curve: np.ndarray, values: np.ndarray) -> float | None:
-    """Return the p-value of the F test of a line within a curve, from their columns, shape (n, k) each.
+    """Return the p-value of a line within a curve, both columns of shape (n, k), by an F test.
 
     None where the curve leaves no degree of freedom and the line does not fit exactly.
     """

@@ -25,9 +25,9 @@ TWO_NODES, FOUR_NODES = (
 class Term:
     """An effect bound to the channels it reads and the quantity it acts on, with fixed reference values.
 
-    In `fixed`, `shift` is the origin of the channel in each pass. `held` are the parameters that were
-    estimated from the raw samples, with their 95 % intervals; fits to bins do not change them. `smoothness`
-    is the weight of the roughness penalty of a free shape (`prior.py`), None without a penalty.
+    In `fixed`, `shift` is the origin of the channel in each pass; `held` are the parameters, with their 95 %
+    intervals, that were estimated from the raw samples and are not fitted to bins. `smoothness` is the weight
+    of the roughness penalty of a free shape (`prior.py`), None without a penalty.
     """
 
     effect: Effect
@@ -64,8 +64,7 @@ class Term:
 
         A row is the mean over the samples of a bin. The mean of a sine has a closed form. Another nonlinear
         shape along the stroke is averaged by Gauss-Legendre quadrature, over a uniform distribution with the
-        variance of the n samples; shapes that may be as narrow as a bin get more nodes. All other shapes are
-        evaluated at the bin mean.
+        variance of the n samples. All other shapes are evaluated at the bin mean.
         """
         return rows.cache.once(("nodes", self.shape_key), lambda: self._nodes(rows))
 
@@ -150,10 +149,7 @@ def shape_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
 
 
 def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.ndarray:
-    """Return a shape's derivatives with respect to its parameters, (parameters, n); the last are cached.
-
-    Those of a linear effect are constant.
-    """
+    """Return a shape's derivatives with respect to its parameters, (parameters, n); the last are cached."""
     linear = not term.effect.nonlinear
     return rows.cache.once(
         ("derivatives", term.shape_key),
@@ -163,17 +159,14 @@ def derivatives_of(term: Term, values: Mapping[str, float], rows: Rows) -> np.nd
 
 
 # ---------------------------------------------------------------- joint
-# The declared model, Eq. 14 with Eq. 15 in one joint fit, and the effects added to it.
-#
 # .. math::
 #     F = \Big[N (\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2})(1 + h_\mu)\,\mathrm{sgn}\,v
 #     + \sigma_2 v\Big](1 + h_F) + f, \quad \mu = \mu_0 - a \ln(1 + t/b)
 #
 # for both mu_s and mu_c. mu_0 is shared by the series of a rubber, v_s and sigma_2 by the days of a series.
 # Effects on a parameter are applied first, then factors on mu, then factors on the force, then added forces.
-#
-# Every quantity of a row depends on at most one fitted number, so that each row derivative has one place in
-# the tangent. Wu et al. 2020, Polymers 12(1) 102, doi:10.3390/polym12010102, Eqs. 14 and 15.
+# Every quantity of a row depends on at most one fitted number. Wu et al. 2020, Polymers 12(1) 102,
+# doi:10.3390/polym12010102, Eqs. 14 and 15.
 
 # Quantities whose logarithm is fitted.
 LOGARITHMIC = ("b_s", "b_c", "v_s")
@@ -241,7 +234,7 @@ class Model:
 
 def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.ndarray, Tangent | None]:
     """Return the model's force, shape (n,), and its tangent, of shape (n, model.size), at every row."""
-    state = _ForceParts.of(model, rows)
+    state = _ForceParts(model, rows)
     if not jacobian:
         return state.force, None
     slopes, layout = state.slopes(), _layout(model, rows)
@@ -263,10 +256,7 @@ def evaluate(model: Model, rows: Rows, *, jacobian: bool = True) -> tuple[np.nda
 
 
 def _layout(model: Model, rows: Rows) -> BlockLayout:
-    """Return the layout of the model's tangent.
-
-    A block has the declared numbers of a specimen's conditions, then the parameters of all terms.
-    """
+    """Return the layout of the tangent: declared numbers of a specimen's conditions, then all terms'."""
     declared = model.declared
 
     def make() -> BlockLayout:
@@ -298,7 +288,7 @@ def loads_of(model: Model, rows: Rows, friction: np.ndarray | None = None) -> np
     That of a gain is friction, the force without added forces; where the model may be far off, another
     `friction` can be given, shape (n,). That of v_s is per unit of its logarithm.
     """
-    state = _ForceParts.of(model, rows)
+    state = _ForceParts(model, rows)
     slopes, friction = state.slopes(), state.friction if friction is None else friction
     has = {name: (model.declared.index[name] >= 0)[rows.condition] for name in ("v_s", "sigma_2")}
     v_s, sigma_2 = slopes["v_s"] * state.now["v_s"] * has["v_s"], slopes["sigma_2"] * has["sigma_2"]
@@ -307,34 +297,20 @@ def loads_of(model: Model, rows: Rows, friction: np.ndarray | None = None) -> np
 
 def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.ndarray:
     """Return the force's derivative with respect to the shape of a term not yet in the model, shape (n,)."""
-    state = _ForceParts.of(model, rows)
+    state = _ForceParts(model, rows)
     return state.term_slope(state.slopes(), acts_on, operation)
 
 
-@dataclass(frozen=True)
 class _ForceParts:
     """The parts of a model's force at the rows; each array has shape (n,)."""
 
-    rows: Rows
-    shapes: list[np.ndarray]  # of the effects
-    base: dict[str, np.ndarray]  # quantities of the declared model
-    now: dict[str, np.ndarray]  # the same, changed by the effects on them
-    through: dict[str, np.ndarray]  # product of the factors of these effects
-    ratio: np.ndarray  # speed over v_s
-    decay: np.ndarray  # share of mu_s in mu
-    mu: np.ndarray  # of Eq. 14, without the effects on mu
-    on_mu: np.ndarray  # product of the factors on mu
-    on_force: np.ndarray  # product of the factors on the force
-    friction: np.ndarray  # force without added forces
-    force: np.ndarray
-
-    @classmethod
-    def of(cls, model: Model, rows: Rows) -> _ForceParts:
-        """Return the state of a model at some rows."""
-        shapes = [shape_of(t, v, rows) for t, v in zip(model.terms, model.values, strict=True)]
-        effects = [(t.acts_on, t.operation, shape) for t, shape in zip(model.terms, shapes, strict=True)]
-        base = _declared_values(model, rows)
-        now, through = dict(base), {}
+    def __init__(self, model: Model, rows: Rows) -> None:
+        self.rows = rows
+        self.shapes = [shape_of(t, v, rows) for t, v in zip(model.terms, model.values, strict=True)]
+        effects = [(t.acts_on, t.operation, own) for t, own in zip(model.terms, self.shapes, strict=True)]
+        self.base = base = _declared_values(model, rows)
+        # Quantities changed by the effects on them, and the products of the factors of these effects.
+        self.now, self.through = now, through = dict(base), {}
         for target, quantities in QUANTITIES_OF.items():
             for quantity in quantities:
                 _change(quantity, [(o, shape) for t, o, shape in effects if t == target], now, through)
@@ -344,22 +320,21 @@ class _ForceParts:
             mu = f"mu_{end}"
             now[mu] = now[f"mu_0{end}"] - now[f"a_{end}"] * np.log1p(rows.days / now[f"b_{end}"])
             _change(mu, [(o, shape) for t, o, shape in effects if t == mu], now, through)
-        speed, sign = rows.pace, np.sign(rows.pace)
-        ratio = speed / now["v_s"]
+        speed = rows.pace
+        self.ratio = speed / now["v_s"]
         has_stribeck = (model.declared.index["v_s"] >= 0)[rows.condition]
-        decay = np.where(has_stribeck, np.exp(-(ratio**2)), 0.0)
-        mu = now["mu_c"] + (now["mu_s"] - now["mu_c"]) * decay
-        on_mu, mu_added = _factor_and_sum(effects, "mu", speed)
-        on_force, added = _factor_and_sum(effects, "force", speed)
-        friction = (rows.load * (mu * on_mu + mu_added) * sign + now["sigma_2"] * speed) * on_force
-        force = friction + added
-        return cls(rows, shapes, base, now, through, ratio, decay, mu, on_mu, on_force, friction, force)
+        self.decay = np.where(has_stribeck, np.exp(-(self.ratio**2)), 0.0)  # share of mu_s in mu
+        self.mu = now["mu_c"] + (now["mu_s"] - now["mu_c"]) * self.decay  # without the effects on mu
+        self.on_mu, mu_added = _factor_and_sum(effects, "mu", speed)
+        self.on_force, added = _factor_and_sum(effects, "force", speed)
+        dry = rows.load * (self.mu * self.on_mu + mu_added) * np.sign(speed)
+        self.friction = (dry + now["sigma_2"] * speed) * self.on_force  # force without added forces
+        self.force = self.friction + added
 
     def slopes(self) -> dict[str, np.ndarray]:
         """Return the force's derivative with respect to every quantity."""
         now, speed, days = self.now, self.rows.pace, self.rows.days
-        # With respect to mu before its factor.
-        drive = self.rows.load * np.sign(speed) * self.on_mu * self.on_force
+        drive = self.rows.load * np.sign(speed) * self.on_mu * self.on_force  # of mu before its factor
         found = {
             "mu_s": drive * self.decay,
             "mu_c": drive * (1 - self.decay),

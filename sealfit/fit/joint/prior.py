@@ -2,12 +2,12 @@ r"""Priors of fitted numbers: weak ones of v_s, b and mu_s - mu_c, and the rough
 
 log v_s and log b have a Gaussian prior with standard deviation 3, a factor of 20, centred at the value of the
 global search. mu_s - mu_c has one centred at 0, with a standard deviation of half of the friction. Both
-determine a parameter that the data do not, and move others by hundredths of their standard errors.
+determine a parameter that the data do not.
 
 A free shape is a smoothing spline with many knots. Its amplitudes c have the prior precision :math:`\lambda
-S`, where :math:`c^T S c` is the integral of the squared second derivative; a straight line, or a plane for a
-surface of two channels, is not penalised.
-:math:`\lambda` maximises the restricted likelihood,
+S`, where :math:`c^T S c` is the integral of the squared second derivative, so that a straight line, or a
+plane for a surface of two channels, is not penalised. :math:`\lambda` maximises the restricted
+likelihood,
 
 .. math::
     -2 \log L(\lambda) = - g^T (G + \lambda S)^{-1} g + \log |G + \lambda S| - \mathrm{rank}(S) \log \lambda,
@@ -31,8 +31,8 @@ from sealfit.fit.joint.model import LOGARITHMIC, Model, Term
 PRIOR_SD = 3.0
 # Decimal logarithms of the smoothness tried, relative to the one whose penalty weighs as much as the data.
 DECADES = np.linspace(-8.0, 6.0, 57)
-# Ridge added to the normal matrix, as a share of its diagonal and of the mean of that. The declared model may
-# contain the straight line, and no row may lie near a knot of a surface, which makes the matrix singular.
+# Ridge of the normal matrix, as a share of its diagonal and of the mean of that. It is singular if the
+# declared model contains the straight line, or no row lies near a knot of a surface.
 RIDGE = 1e-10
 
 
@@ -44,11 +44,7 @@ def roughness_of(term: Term) -> np.ndarray:
 
 
 def precision_of(model: Model) -> np.ndarray:
-    """Return the prior's precision of the fitted numbers, shape (model.size, model.size).
-
-    It is 1/3^2 for log v_s and log b, that of mu_s - mu_c, the smoothness times S for amplitudes of free
-    shapes, and 0 elsewhere.
-    """
+    """Return the prior's precision of the fitted numbers, shape (model.size, model.size)."""
     own = [1.0 / PRIOR_SD**2 if p.quantity in LOGARITHMIC else 0.0 for p in model.declared.parameters]
     precision = np.zeros((model.size, model.size))
     precision[range(len(own)), range(len(own))] = own
@@ -62,10 +58,9 @@ def precision_of(model: Model) -> np.ndarray:
 
 
 def centre_of(model: Model) -> np.ndarray:
-    """Return the prior's mean, shape (model.size,).
+    """Return the prior's mean, shape (model.size,): 0 for amplitudes of free shapes, mu_s and mu_c.
 
-    It is 0 for each mu_s and mu_c, of which only the difference has a prior, and for amplitudes of free
-    shapes; elsewhere it is the present value.
+    Of mu_s and mu_c only the difference has a prior. Elsewhere it is the present value.
     """
     centre = model.vector()
     centre[[number for pair in model.declared.drops for number in pair]] = 0.0
@@ -85,10 +80,9 @@ def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
 
 
 def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray, channels: int) -> float:
-    """Return the smoothness lambda that maximises the restricted likelihood.
+    """Return the smoothness lambda that maximises the restricted likelihood, from G and g at zero amplitudes.
 
-    G and g are those of the amplitudes, all other parameters eliminated, g at zero amplitudes. The null
-    space of S, `rough`, shape (p, p), are straight lines of one channel, or planes of two.
+    The null space of S, `rough`, shape (p, p), are straight lines of one channel, or planes of two.
     """
     unit = np.trace(normal) / np.trace(rough)
     if not unit > 0:
@@ -109,10 +103,7 @@ def _ridged(normal: np.ndarray) -> np.ndarray:
 
 
 def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return a free shape's amplitudes, shape (p,), and its effective degrees of freedom, tr (G + P)^-1 G.
-
-    G and g are as above, and P, shape (p, p), is the prior's precision.
-    """
+    """Return a free shape's amplitudes, (p,), and effective degrees of freedom tr (G + P)^-1 G."""
     covariance = covariance_of(_ridged(normal), penalty)
     return covariance @ gradient, float(np.trace(covariance @ normal))
 
@@ -120,8 +111,7 @@ def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> 
 def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
     """Return the model with the smoothness of its free shapes estimated by REML, one after the other.
 
-    `normal` is the normal matrix of the whitened tangent, without prior, and `gradient` the whitened tangent
-    times the whitened residual.
+    `normal` and `gradient` are those of the whitened tangent and residual, without prior.
     """
     for number, term in enumerate(model.terms):
         if term.smoothness is None:

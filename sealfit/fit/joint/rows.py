@@ -21,7 +21,6 @@ class Groups:
 
     starts: dict[str, np.ndarray]
     codes: dict[str, np.ndarray]
-    # By level; making one takes ten times as long as a sum.
     _summing: dict[str, csr_array] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     @classmethod
@@ -36,14 +35,11 @@ class Groups:
 
     def sums(self, values: np.ndarray, level: str) -> np.ndarray:
         """Return the sum of `values`, shape (n,) or (n, k), over each group of a level."""
-        start = self.starts[level]
-        if values.ndim == 1:
-            return np.add.reduceat(values, start)
-        if level not in self._summing:
-            n = values.shape[0]
+        if level not in self._summing:  # making one takes ten times as long as a sum, and reduceat as well
+            n, start = values.shape[0], self.starts[level]
             entries = (np.ones(n), np.arange(n), np.r_[start, n])
             self._summing[level] = csr_array(entries, shape=(start.size, n))
-        return self._summing[level] @ values  # ten times as fast as reduceat
+        return self._summing[level] @ values
 
     def means(self, values: np.ndarray, level: str) -> np.ndarray:
         """Return the mean of `values`, shape (n,) or (n, k), in each group of a level."""
@@ -66,9 +62,6 @@ class Groups:
 
 
 # ---------------------------------------------------------------- both directions
-# Strokes of one file in both directions share set-up and repeat: they are one unit of evidence of the
-# friction.
-
 # `direction` of a row that is the mean of both directions.
 BOTH_DIRECTIONS = 0
 
@@ -80,10 +73,8 @@ SPEED_AND_SIGN = r"( at \d[\d.e+-]*?)?[+-]?$"
 def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
     """Return used rows of table `steady` with one row per record for runs with both directions at one speed.
 
-    Other rows are unchanged. The magnitude of the force is averaged over the two directions, so that an
-    offset between them cancels. Gain and set-up of a file are common to both directions, which are therefore
-    not independent. In a merged row `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id`
-    has no sign.
+    Both directions are one unit of evidence; an offset between them cancels in their mean. In a merged row
+    `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
     """
     record = records(steady)
     rows = steady.assign(file=record)
@@ -154,11 +145,9 @@ def cached(method: Callable) -> Callable:
 
 @dataclass(frozen=True)
 class Rows:
-    """Sorted rows of `bins` as arrays.
+    """Sorted rows of `bins` as arrays; `order` gives each row's place in the original table.
 
-    `table` holds them with a new index; `order` gives each row's place in the original table. A file with
-    strokes in both directions belongs to two runs; its group is the run without sign, so that groups are
-    nested.
+    A file with strokes in both directions belongs to two runs; its group is the run without sign.
     """
 
     table: pd.DataFrame
@@ -174,9 +163,7 @@ class Rows:
     has_load: bool
     has_aging: bool
     weight: np.ndarray  # (n,) sums to 1; all files have equal weight
-    # Channels that some files lack: `fill_missing`.
-    filled: dict[str, np.ndarray] = field(default_factory=dict)
-    # Keys name all that the values depend on besides the rows.
+    filled: dict[str, np.ndarray] = field(default_factory=dict)  # channels that some files lack
     cache: Cache = field(default_factory=Cache, init=False, compare=False, repr=False)
 
     @property
@@ -201,10 +188,9 @@ class Rows:
 
     @cached
     def bin_width(self, channel: str) -> np.ndarray:
-        """Return the width of each row's bin in a channel, shape (n,).
+        """Return the width of each row's bin in a channel, shape (n,): samples times the step between them.
 
-        It is the number of samples times the step between them. The step is the difference of neighbouring
-        bin means over half the sum of their numbers of samples.
+        The step is the difference of neighbouring bin means over half the sum of their numbers of samples.
         """
         samples, inside = self.samples, np.diff(self.codes("stroke")) == 0
         step = np.where(inside, np.diff(self.values(channel)) / ((samples[1:] + samples[:-1]) / 2), 0.0)
@@ -232,8 +218,8 @@ class Rows:
 
     def points(self, table: pd.DataFrame, condition: np.ndarray) -> Rows:
         """Return points at the conditions of these rows, for a prediction; arguments as `point_rows`."""
-        known = {"has_load": self.has_load, "has_aging": self.has_aging}
-        return point_rows(table.reset_index(drop=True), condition, self.conditions, **known)
+        table = table.reset_index(drop=True)
+        return point_rows(table, condition, self.conditions, has_load=self.has_load, has_aging=self.has_aging)
 
     def subset(self, mask: np.ndarray) -> Rows:
         """Return the rows where `mask`, shape (n,), is true; conditions keep the numbers that models need."""
@@ -256,7 +242,7 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     """Return table `bins` as sorted arrays with nested groups.
 
     `has_aging` is whether the config's condition has `aging_days`. `conditions` are those of the campaign of
-    which these bins are a part, so that its model applies to them.
+    which these bins are a part.
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
     run = nesting_run(table, table["record"])
@@ -284,31 +270,20 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     measured = table["speed_mm_s"].to_numpy(dtype=float)
     speed = set_speeds(measured, groups.codes["run"])
     pace = table["speed_bin_mm_s"].to_numpy(dtype=float) if "speed_bin_mm_s" in table else measured
+    load = table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table))
     return Rows(
-        table=table,
-        order=order,
-        groups=groups,
-        force=table["force_N"].to_numpy(dtype=float),
-        speed=speed,
-        pace=pace * speed / measured,
-        load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table)),
-        days=days,
-        condition=condition,
-        conditions=conditions,
-        has_load=has_load,
-        has_aging=has_aging,
-        weight=1.0 / per_file / (files.max() + 1),
-        filled=fill_missing(table, groups),
-    )
+        table=table, order=order, groups=groups, force=table["force_N"].to_numpy(dtype=float),
+        speed=speed, pace=pace * speed / measured, load=load, days=days, condition=condition,
+        conditions=conditions, has_load=has_load, has_aging=has_aging,
+        weight=1.0 / per_file / (files.max() + 1), filled=fill_missing(table, groups),
+    )  # fmt: skip
 
 
 def set_speeds(speed: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Return signed speeds of rows, shape (n,), with all strokes of one setting of a run at their mean.
 
-    `run`, shape (n,), is the number of each row's run. Measured speeds of one setting differ by the noise of
-    the position, and the force does not follow it. If the forces of these strokes are more alike than the
-    runs, the slope of the Stribeck curve would be fitted to that noise and be too small (regression dilution:
-    Fuller 1987, *Measurement Error Models*, section 1.1, doi:10.1002/9780470316665).
+    To the noise of measured speeds a slope would be fitted that is too small (regression dilution: Fuller
+    1987, *Measurement Error Models*, section 1.1, doi:10.1002/9780470316665). `run` numbers each row's run.
     """
     size = np.abs(speed)
     order = np.lexsort((size, run))
@@ -325,8 +300,7 @@ def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
     """Return the campaign's own numeric channels that a few files lack, with missing values filled in.
 
     A missing value becomes the mean of its stroke, file, run or specimen, the first of these that has values,
-    else the mean of all files. A channel that was constant in a group remains so, and files without a value
-    have little leverage on a slope along it. Channels that too many files lack are left out.
+    else of all files. Channels that too many files lack are left out.
     """
     found, files = {}, groups.starts["file"].size
     for name in open_columns(table):
@@ -346,10 +320,7 @@ def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
 
 
 def one_load(load_N: np.ndarray | pd.Series) -> bool:
-    """Return whether loads, shape (n,), are one setting but for the noise of its sensor.
-
-    The force does not follow that noise, and friction as a share of the load then seems to depend on it.
-    """
+    """Return whether loads, shape (n,), are one setting but for the noise of its sensor."""
     return bool(np.abs(load_N).max() <= SAME_LOAD * np.abs(load_N).min())
 
 
@@ -367,7 +338,6 @@ def thin(bins: pd.DataFrame, most: int) -> pd.DataFrame:
 def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
     """Return table `bins` with neighbouring bins of a stroke merged into means over all their samples.
 
-    This loses nothing for shapes that are smooth over a few bins. A ripple needs the original bins.
     `together`, the number of bins per row, may have the shape (n,) and then is constant within a stroke.
     """
     place = bins.groupby(["file", "stroke"], sort=False).cumcount() // together
@@ -382,11 +352,7 @@ def merge(bins: pd.DataFrame, together: int | np.ndarray) -> pd.DataFrame:
 
 
 def records(table: pd.DataFrame) -> pd.Series:
-    """Return each row's record, named by its first file.
-
-    A file is a record. Files of one repeat of a run that contain different strokes (column `stroke` of
-    runs.csv) are one record.
-    """
+    """Return each row's record: its file, or the first of the files of one repeat with different strokes."""
     strokes = table.drop_duplicates(["file", "stroke"])
     repeat = [strokes["specimen_id"], _unsigned(strokes["run_id"]), strokes["repeat"]]
     again = pd.concat([*repeat, strokes["stroke"]], axis=1).duplicated(keep=False)
@@ -418,23 +384,15 @@ def point_rows(
     """Return the points of a prediction as `Rows`, one group per point.
 
     `table`, shape (n, ...), has `speed_mm_s` and all channels that the model reads; `condition`, shape (n,),
-    is the number of each point's condition in `conditions`; the others are as in the rows of the fit.
+    are places in `conditions`.
     """
     n = len(table)
     every = np.arange(n)
     days = conditions["aging_days"].to_numpy(dtype=float)[condition] if has_aging else np.zeros(n)
+    speed = table["speed_mm_s"].to_numpy(dtype=float)
     return Rows(
-        table=table,
-        order=every,
-        groups=Groups.of({level: every for level in LEVELS}),
-        force=np.zeros(n),
-        speed=table["speed_mm_s"].to_numpy(dtype=float),
-        pace=table["speed_mm_s"].to_numpy(dtype=float),
-        load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(n),
-        days=days,
-        condition=np.asarray(condition),
-        conditions=conditions,
-        has_load=has_load,
-        has_aging=has_aging,
-        weight=np.full(n, 1.0 / max(n, 1)),
-    )
+        table=table, order=every, groups=Groups.of({level: every for level in LEVELS}), force=np.zeros(n),
+        speed=speed, pace=speed, load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(n),
+        days=days, condition=np.asarray(condition), conditions=conditions, has_load=has_load,
+        has_aging=has_aging, weight=np.full(n, 1.0 / max(n, 1)),
+    )  # fmt: skip

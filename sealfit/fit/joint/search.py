@@ -14,8 +14,7 @@ from sealfit.ingest.strokes import SPEEDS_APART
 
 # Number of grid values of v_s.
 GRID = 80
-# Values of v_s whose sums of squares differ by less than this share of the sum of squared forces fit equally
-# well. The middle one is taken.
+# Values of v_s fit equally well within this share of the sum of squared forces; the middle one is taken.
 EQUAL = 1e-10
 # Singular values below this share of the largest one count as zero.
 RANK = 1e-10
@@ -26,23 +25,17 @@ MAX_STEPS = 60
 GRID_POINTS = 12
 # Number of rows of each stroke that the grid search uses. v_s and b act on a stroke as a whole.
 ROWS_FOR_START = 4
-# Fall of the whitened sum of squares below which a step counts as slow. The descent ends after four slow
-# steps in a row: the data then determine nothing along its direction.
+# Fall of the whitened sum of squares below which a step is slow. The descent ends after four in a row: the
+# data then determine nothing along its direction.
 SLOW = 1e-2
-# Fall of the whitened sum of squares below which the descent has converged. The estimates then lie within a
-# hundredth of a standard error of the optimum.
+# Fall below which the descent has converged: estimates are then within 0.01 standard errors of the optimum.
 CONVERGED = 1e-4
-
-
-# ---------------------------------------------------------------- start
-# A global search of v_s and b, with the linear parameters solved for.
 
 
 def start_model(rows: Rows, *, together: bool = False) -> Model:
     """Return the declared model with v_s and b from a global search and the rest from exact least squares.
 
-    With `together`, all series start from one v_s and one sigma_2, which a few noisy runs cannot make far
-    wrong.
+    With `together`, all series start from one v_s and one sigma_2, against a few noisy runs.
     """
     declared = declare(rows)
     theta = np.zeros(len(declared.parameters))
@@ -64,9 +57,8 @@ def start_model(rows: Rows, *, together: bool = False) -> Model:
             mine = uses[condition]
             strokes = speeds[mine], load[mine], size[mine], condition[mine]
             solved[uses.tobytes()] = _per_condition(*strokes, full)
-        values, theta[k], v_s = solved[uses.tobytes()]
-        for c, pair in values.items():
-            level[c], chosen[c] = pair, True
+        own, pairs, theta[k], v_s = solved[uses.tobytes()]
+        level[own], chosen[own] = pairs, True
         if full:
             theta[of_v_s] = np.log(v_s)
     present = np.bincount(condition, minlength=chosen.size) > 0  # its files may have been left out
@@ -100,10 +92,7 @@ def _known(mine: np.ndarray, present: np.ndarray) -> np.ndarray:
 
 
 def _per_condition(speed, load, size, condition, full: bool):
-    """Return {condition: (mu_s, mu_c)}, sigma_2 and v_s of a series by a grid over v_s, others solved for.
-
-    Through few speeds a wrong v_s fits exactly, with a negative coefficient. Its cost is that with 0 instead.
-    """
+    """Return the conditions of a series, their mu_s and mu_c, sigma_2 and v_s, by a grid over v_s."""
     own, code = np.unique(condition, return_inverse=True)
     grid = np.geomspace(*stribeck_range(speed), GRID) if full else np.array([1.0])
     solved, costs = [], []
@@ -111,14 +100,13 @@ def _per_condition(speed, load, size, condition, full: bool):
         decay = np.exp(-((speed / v_s) ** 2)) if full else np.zeros_like(speed)
         columns = load * np.stack([decay, 1 - decay])
         pairs, sigma_2, _ = pairs_and_shared(columns, code, speed, size)
-        pairs = np.maximum(pairs, 0.0)
+        pairs = np.maximum(pairs, 0.0)  # a wrong v_s may fit few speeds exactly, with a negative coefficient
         residual = size - (pairs[code].T * columns).sum(axis=0) - sigma_2 * speed
         costs.append(float(residual @ residual))
         solved.append((pairs, sigma_2, v_s))
     equal = np.flatnonzero(np.array(costs) <= min(costs) + EQUAL * float(size @ size))
     pairs, sigma_2, v_s = solved[equal[equal.size // 2]]
-    mu_s, mu_c = pairs.T if full else (pairs[:, 1], pairs[:, 1])
-    return {int(c): (s, k) for c, s, k in zip(own, mu_s, mu_c, strict=True)}, float(sigma_2), float(v_s)
+    return own, pairs if full else pairs[:, [1, 1]], float(sigma_2), float(v_s)
 
 
 def pairs_and_shared(
@@ -126,13 +114,9 @@ def pairs_and_shared(
 ) -> tuple[np.ndarray, float, int]:
     """Return the least squares solution of two numbers per group and one, not below 0, that all groups share.
 
-    Each group's two columns are orthonormalised and projected out, which leaves one equation for the shared
-    number. Among several solutions it is the one of least norm.
-
-    `columns`, shape (2, n), are those of the two numbers of each group, `code`, shape (n,), is the number of
-    each value's group, and `shared`, shape (n,), the column of the shared number. Returns the pairs, shape
-    (groups, 2), the shared number, and the rank of the pairs' columns; with one value of both columns a pair
-    is not distinguishable.
+    Each group's two columns, (2, n), are projected out, which leaves one equation for the number of `shared`,
+    (n,). Among several solutions it is the one of least norm. `code`, shape (n,), is each value's group.
+    Returns the pairs, shape (groups, 2), the shared number, and the rank of the pairs' columns.
     """
     one, length = _unit(columns[0], code)
     along = np.bincount(code, one * columns[1])
@@ -169,17 +153,12 @@ def _unit(column: np.ndarray, code: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def stribeck_range(speeds: np.ndarray) -> tuple[float, float]:
     """Return the range in which v_s is searched: from half the second slowest speed to the fastest, in mm/s.
 
-    Below that range only the slowest speed would depend on mu_s, which would not be bounded. Above it the
-    exponential is close to a parabola, which sigma_2 and mu_c can imitate (v_s needs two speeds below about 2
-    v_s).
+    Below it mu_s is not bounded; above it sigma_2 and mu_c can imitate the exponential.
     """
     positive = np.sort(speeds[speeds > 0])
     above = positive[positive > SPEEDS_APART * positive[0]]
     second = above[0] if above.size else positive[0]
     return float(second / 2), float(positive[-1])
-
-
-# ---------------------------------------------------------------- search
 
 
 def descend(
@@ -194,8 +173,8 @@ def descend(
     """Return the model of least penalised whitened sum of squares at fixed scatter, by Levenberg-Marquardt.
 
     The start, `model`, is moved inside the bounds. `centre`, shape (model.size,), is the mean of the prior.
-    `loads` of the random effects, shape (n, kinds), are by default the model's at the start; they are fixed,
-    so that all steps minimise the same function. The descent ends when the sum of squares falls by less than
+    `loads` of the random effects, shape (n, kinds), by default the model's at the start, are fixed, so that
+    all steps minimise the same function. The descent ends when the sum of squares falls by less than
     `tolerance`.
     """
     precision = precision_of(model)
@@ -248,9 +227,8 @@ def descend(
 def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
     """Return the model with each v_s, and all b together, at the best of a grid.
 
-    Linear parameters are solved for. Without the effect that was added, v_s and b may have converged to
-    another local minimum. Series share mu_0, so that one v_s alone may not leave it: first all v_s get the
-    same value, then each is searched by itself.
+    Without the effect that was added they may have converged to another local minimum. As series share mu_0,
+    first all v_s get the same value, then each is searched by itself.
     """
     rows = rows.sparse(ROWS_FOR_START)
     quantities = [p.quantity for p in model.declared.parameters]
@@ -266,8 +244,8 @@ def search_nonlinear(model: Model, rows: Rows, scatter: Scatter) -> Model:
 def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) -> Model:
     """Return the model of least cost among itself and grid values of a group of parameters, all set equal.
 
-    The cost is the penalised whitened sum of squares, with the linear parameters at their optimum. Rows on
-    which the group does not act have the same normal equations at every grid value; these are computed once.
+    The cost is the penalised whitened sum of squares, with the linear parameters at their optimum. The normal
+    equations of rows on which the group does not act are computed once.
     """
     low, high = bounds_of(model, rows)
     precision = np.diag(precision_of(model))[group]  # of the prior, which is centred at the present values
@@ -293,10 +271,7 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
 
 
 def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, ...]:
-    """Return rows on which declared parameters act, and the others; all rows if one part is empty.
-
-    Rows of one specimen are correlated and stay together.
-    """
+    """Return rows of specimens on which declared parameters act, and the others, if both have rows."""
     conditions = np.any([np.isin(numbers, group) for numbers in model.declared.index.values()], axis=0)
     specimen = rows.codes("specimen")
     acts = (np.bincount(specimen, conditions[rows.condition]) > 0)[specimen]
@@ -308,8 +283,7 @@ def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, 
 def solve_linear(model: Model, rows: Rows, scatter: Scatter, loads: np.ndarray) -> Model:
     """Return the model with its linear parameters at their optimum, all nonlinear parameters fixed.
 
-    A new term explains part of what other terms explained before. This solve redistributes it before the
-    descent, which would otherwise start far from the optimum and may diverge.
+    A new term explains part of what others did; from there a descent would start far off and might diverge.
     """
     bounds = bounds_of(model, rows)
     equations = _equations(model, rows, Whitening(scatter, loads, rows.groups))
@@ -331,10 +305,7 @@ def _equations(model: Model, rows: Rows, whitening: Whitening) -> Equations:
 def _linear_optimum(
     model: Model, equations: Equations, bounds: tuple[np.ndarray, np.ndarray]
 ) -> tuple[float, Model]:
-    """Return the penalised sum of squares and the model, its linear parameters optimal within the bounds.
-
-    Without bounds, a wrong v_s could fit best with negative friction.
-    """
+    """Return the penalised sum of squares and the model, its linear parameters optimal within the bounds."""
     linear, vector = ~model.nonlinear, model.vector()
     precision = precision_of(model)[np.ix_(linear, linear)]
     away = (vector - centre_of(model))[linear]
@@ -350,10 +321,7 @@ def _linear_optimum(
 def least_squares_within(
     normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Return the x within bounds that minimises x' normal x / 2 - gradient' x, shape (k,).
-
-    Inside the bounds it is the solution of least norm.
-    """
+    """Return x within bounds, of least norm inside, that minimises x' normal x / 2 - gradient' x, (k,)."""
     free = np.linalg.lstsq(normal, gradient, rcond=1e-10)[0]
     inside = np.clip(free, low, high)  # stays for columns of zeros
     if np.all(inside == free):
@@ -375,14 +343,9 @@ def bounds_of(model: Model, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     slowest, fastest = stribeck_range(np.abs(rows.groups.means(rows.speed, "stroke")))
     days = rows.days[rows.days > 0]
     first, last = (days.min(), days.max()) if days.size else (1.0, 1.0)
-    limits = {
-        "mu_0s": (0.0, np.inf),
-        "mu_0c": (0.0, np.inf),
-        "sigma_2": (0.0, np.inf),
-        "v_s": (np.log(slowest), np.log(fastest)),
-        "b_s": (np.log(first / 1000), np.log(last * 30)),
-        "b_c": (np.log(first / 1000), np.log(last * 30)),
-    }
+    of_b = np.log(first / 1000), np.log(last * 30)
+    limits = dict.fromkeys(("mu_0s", "mu_0c", "sigma_2"), (0.0, np.inf))
+    limits |= {"v_s": (np.log(slowest), np.log(fastest)), "b_s": of_b, "b_c": of_b}
     declared = [limits.get(p.quantity, (-np.inf, np.inf)) for p in model.declared.parameters]
     added = [p.bounds for term in model.terms for p in term.effect.parameters]
     low, high = np.array([*declared, *added], dtype=float).T

@@ -3,8 +3,7 @@ r"""The tangent of the joint model, the derivatives of all rows, stored by block
 A row depends only on the parameters of its series and on a few that series share. Rows of a specimen share a
 *block*: the columns on which any of them depends. Whitening combines rows of one specimen only and keeps the
 blocks. Normal matrices are sums over blocks. A bordered block-diagonal factorisation orthonormalises the
-columns of each block first, then those that blocks share (as Golub and Pereyra 1973, doi:10.1137/0710036,
-eliminate linear parameters). Time and memory are linear in the number of rows.
+columns of each block first, then those that blocks share. Time and memory are linear in the number of rows.
 """
 
 from __future__ import annotations
@@ -39,10 +38,8 @@ class BlockLayout:
             return [slice(None)]
         order = np.argsort(self.block, kind="stable")
         parts = np.split(order, np.cumsum(np.bincount(self.block, minlength=len(self.index)))[:-1])
-        return [
-            slice(part[0], part[-1] + 1) if part.size and part[-1] - part[0] == part.size - 1 else part
-            for part in parts
-        ]
+        whole = [part.size and part[-1] - part[0] == part.size - 1 for part in parts]
+        return [slice(p[0], p[-1] + 1) if one else p for p, one in zip(parts, whole, strict=True)]
 
     @cached_property
     def places(self) -> np.ndarray:
@@ -138,9 +135,8 @@ class Tangent:
         """Return t' M t of each row t for a matrix M, shape (p, p) -> (n,)."""
         padded, found = np.pad(matrix, (0, 1)), np.empty(self.values.shape[0])
         for index, rows in zip(self.layout.index, self.layout.rows, strict=True):
-            found[rows] = np.einsum(
-                "ij,ij->i", self.values[rows] @ padded[np.ix_(index, index)], self.values[rows]
-            )
+            own = self.values[rows]
+            found[rows] = np.einsum("ij,ij->i", own @ padded[np.ix_(index, index)], own)
         return found
 
     def norms(self) -> np.ndarray:
@@ -176,8 +172,8 @@ class Tangent:
     ) -> Tangent:
         """Return an orthonormal basis of the span of the columns, scaled to length 1 first, shape (n, rank).
 
-        Singular values below `tolerance` times the largest one count as zero. `project_out`, (n, m) ->
-        (n, m), is a projection of the scaled columns that combines rows of one specimen only.
+        Singular values below `tolerance` times the largest count as zero. `project_out`, (n, m) -> (n, m), is
+        a projection of the scaled columns that combines rows of one specimen only.
         """
         unit = self.scaled(1 / np.maximum(self.norms(), 1e-300))
         unit = unit.with_values(project_out(unit.values))
@@ -210,16 +206,15 @@ class Tangent:
     def _column(self, number: int) -> np.ndarray:
         """Return one column, shape (n,)."""
         place = self.layout.places[self.layout.block, number]
-        return np.where(
-            place >= 0, np.take_along_axis(self.values, np.maximum(place, 0)[:, None], axis=1)[:, 0], 0.0
-        )
+        values = np.take_along_axis(self.values, np.maximum(place, 0)[:, None], axis=1)[:, 0]
+        return np.where(place >= 0, values, 0.0)
 
 
 class OwnColumns:
     """A few columns per specimen, zero outside its rows: those of different specimens are orthogonal.
 
-    `code`, shape (n,), is the specimen of each row, and `loads`, shape (n,) or (n, k), the values of its
-    columns there. Columns of zeros, and those that others of the specimen contain, do not count.
+    `code`, shape (n,), is the specimen of each row, and `loads`, shape (n,) or (n, k), are the values there.
+    Columns that others of the specimen contain do not count.
     """
 
     def __init__(self, code: np.ndarray, loads: np.ndarray) -> None:
@@ -242,8 +237,7 @@ class OwnColumns:
 def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return blocks that contain sets of columns, and each set's block; one block if a set has most columns.
 
-    The blocks have the column at each place, shape (blocks, k), or `size`, the number of columns, if the
-    place is empty. The number of each set's block has the shape (sets,).
+    The blocks have the column at each place, shape (blocks, k), or `size`, all columns, if it is empty.
     """
     kept: list[frozenset[int]] = []
     home: dict[frozenset[int], int] = {}

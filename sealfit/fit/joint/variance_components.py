@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
 from sealfit.fit.joint.declared import declare, tested_speeds
-from sealfit.fit.joint.rows import LEVELS, Groups, Rows
+from sealfit.fit.joint.rows import LEVELS, Groups, Rows, cached
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.whitening import GAIN, KINDS, LEVELS_OF_FORCE, Component, Scatter
 from sealfit.ingest.scatter import two_nonnegative
@@ -25,25 +25,19 @@ from sealfit.ingest.scatter import two_nonnegative
 # .. math:: B^T V_l^{-1} B = Q - Q M Q, \quad M = K^{1/2} (1 + K^{1/2} Q K^{1/2})^{-1} K^{1/2},
 #           \quad Q = \sum_\mathrm{inside} B^T V_{l-1}^{-1} B
 #
-# Only k x k matrices are inverted: from the finest level to the coarsest for the likelihood, and back for its
-# gradient.
-#
-# Searle, Casella & McCulloch 1992, *Variance Components*, doi:10.1002/9780470316856, chapter 6.
+# The likelihood goes from the finest level up, its gradient back. Searle, Casella & McCulloch 1992,
+# *Variance Components*, doi:10.1002/9780470316856, chapter 6.
 
-# Smallest start of a component, as a share of the residual variance. The gradient is 0 at a component of 0,
-# which could not grow again.
+# Smallest start of a component, as a share of the residual variance; the gradient is 0 at 0.
 LEAST_START = 0.03
-# Largest relative standard deviation of a gain; no rig's is larger. Without a limit a force of nearly 0 with
-# a large gain would fit any data.
+# Largest relative standard deviation of a gain. With a larger one a force near 0 would fit any data.
 MOST_GAIN = 0.5
 # A component below this share of the residual variance counts as zero.
 LEAST = 1e-5
-# Largest component, as a multiple of the residual variance. It exceeds 1 as a model with nearly as many
-# parameters as groups leaves small residuals.
+# Largest component, as a multiple of the residual variance, which may be small with many parameters.
 MOST_SHARE = 30.0
 
-# Least share of a parameter's derivatives that lies in the means of strokes. The length of a ripple has less:
-# it is determined within strokes and explains no difference between them.
+# Least share of a parameter's derivatives that lies in the means of strokes; the length of a ripple has less.
 LEAST_BETWEEN = 0.1
 
 
@@ -79,21 +73,16 @@ def reml(
         value, gradient = likelihood(unit * sd**2)
         return value, 2.0 * gradient * unit * sd
 
-    most = [
-        MOST_GAIN**2 / u if kind in ("gain", "v_s") else np.inf
-        for u, (_, kind) in zip(unit, kinds, strict=True)
-    ]
+    limited = [kind in ("gain", "v_s") for _, kind in kinds]
+    most = np.where(limited, MOST_GAIN**2 / unit, np.inf)
     high = np.sqrt(np.clip(most, LEAST, MOST_SHARE))
     first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, LEAST_START)
     # The parameters are standard deviations: a zero component has its minimum at 0, in logarithms at -inf.
     best = minimize(
-        objective,
-        np.minimum(np.sqrt(first), 0.6 * high),
-        jac=True,
-        method="L-BFGS-B",
+        objective, np.minimum(np.sqrt(first), 0.6 * high), jac=True, method="L-BFGS-B",
         bounds=[(0.0, most) for most in high],
         options={"maxiter": 200, "ftol": 1e-10},  # so that rounding in the residual changes no estimate
-    )
+    )  # fmt: skip
     share = best.x**2
     variances = np.where(share > LEAST, unit * share, 0.0)
     parts = zip(kinds, variances.tolist(), strict=True)
@@ -103,7 +92,7 @@ def reml(
 class RestrictedLikelihood:
     """Half the restricted deviance of group means, and its gradient, as functions of the variances.
 
-    `basis`, shape (m, p), has orthonormal columns that span the model's tangent; `kinds` are as in `reml`.
+    `basis`, shape (m, p), has orthonormal columns that span the model's tangent.
     """
 
     def __init__(self, means: GroupMeans, basis: Tangent, kinds: Sequence[tuple[str, str]]) -> None:
@@ -204,13 +193,11 @@ def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- scatter
-# Smallest row noise, as a share of the force. It is below the resolution of any sensor, and keeps the weights
-# of noise-free data finite.
+# Smallest row noise, as a share of the force, below the resolution of any sensor.
 LEAST_NOISE = 1e-6
-# Fall of half the restricted deviance from which specimens differ in v_s or sigma_2. Where they scatter by
-# 3 % in dry friction but not in the viscous force, a gain does not describe them: in 34 of 40 campaigns
-# without an effect the number of the run was significant, as it distinguishes specimens; with these
-# components in none.
+# Fall of half the restricted deviance from which specimens differ in v_s or sigma_2. Without these components
+# the number of the run was significant in 34 of 40 campaigns in which specimens scatter by 3 % in dry
+# friction alone; with them in none.
 CURVES_DIFFER = 2.0
 # Number of speeds at which a specimen shows that.
 SPEEDS_OF_A_SPECIMEN = {"v_s": 3, "sigma_2": 2}
@@ -223,9 +210,8 @@ def estimate_scatter(
 ) -> Scatter:
     """Return row noise and variance components of the residual of a model, by REML.
 
-    `residual`, measured minus model, has the shape (n,) and is in N; `loads`, shape (n, kinds), are the
-    changes of the force per unit of each kind. `jacobian`, shape (n, p), is the tangent of the model. `start`
-    has starting values, and the components to be estimated.
+    `residual`, measured minus model, has the shape (n,) and is in N; `loads`, shape (n, kinds), are changes
+    of the force per unit of each kind. `start` has starting values, and the components to be estimated.
     """
     friction = loads[:, GAIN]
     s0, g, design_effect = row_noise(rows, residual, friction)
@@ -247,10 +233,7 @@ def estimate_components(
 def with_curves(
     rows: Rows, residual: np.ndarray, loads: np.ndarray, jacobian: Tangent, scatter: Scatter
 ) -> Scatter | None:
-    """Return a scatter with components of the specimens' curves; None if these do not differ.
-
-    The arguments are as for `estimate_components`.
-    """
+    """Return a scatter with components of the specimens' curves; None if these do not differ."""
     if not (curves := curve_components(rows)):
         return None
     kinds = [(part.level, part.kind) for part in scatter.components]
@@ -276,12 +259,10 @@ def _estimated(
     between = jacobian.means(groups, level)
     inside = between.with_values(between.values * np.sqrt(count)[:, None]).norms() ** 2
     share = inside / np.maximum(jacobian.norms() ** 2, 1e-300)
-    value, components = reml(
-        GroupMeans(means[:, 0], noise * scatter.design_effect / count, means[:, 1:], groups.at(level)),
-        between.columns(share >= LEAST_BETWEEN),
-        kinds,
-        [known.get(kind, 0.0) for kind in kinds] if known else None,
-    )
+    own_noise = noise * scatter.design_effect / count
+    given = GroupMeans(means[:, 0], own_noise, means[:, 1:], groups.at(level))
+    start = [known.get(kind, 0.0) for kind in kinds] if known else None
+    value, components = reml(given, between.columns(share >= LEAST_BETWEEN), kinds, start)
     return value, replace(scatter, components=tuple(replace(c, df=_df(rows, c)) for c in components))
 
 
@@ -303,12 +284,9 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     return [pair for pair in pairs if pair != ("specimen", "offset")]
 
 
+@cached
 def curve_components(rows: Rows) -> list[tuple[str, str]]:
     """Return (level, kind) of the numbers of the Stribeck curve that specimens may show to differ."""
-    return rows.cache.once(("curve components",), lambda: _curve_components(rows))
-
-
-def _curve_components(rows: Rows) -> list[tuple[str, str]]:
     if "specimen" not in {level for level, _ in usable_components(rows)}:
         return []  # curves would stand in for levels
     starts = rows.groups.starts["specimen"]
@@ -331,8 +309,7 @@ def _df(rows: Rows, component: Component) -> float:
 def row_noise(rows: Rows, residual: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
     """Return (s0, g, design effect) of the row noise, sqrt(s0^2 + (gF)^2) within strokes.
 
-    The design effect is the effect of its correlation. The mean pattern of all strokes along the bins is not
-    noise and is subtracted first.
+    The mean pattern of all strokes along the bins is not noise and is subtracted first.
     """
     groups = rows.groups
     code, start = groups.codes["stroke"], groups.starts["stroke"]
@@ -377,8 +354,7 @@ def shape_scatter(rows: Rows, residual: np.ndarray, sd: np.ndarray) -> float:
     """Return the variance of shapes along strokes between files over that expected of row noise, at least 1.
 
     Slope and curvature of each pass along displacement are compared with their mean over all passes of that
-    direction. Without this factor hundreds of rows would outweigh the few files they come from. `residual`
-    and `sd`, the standard deviation of row noise, have the shape (n,) and are in N.
+    direction. Without this factor hundreds of rows would outweigh the few files they come from.
     """
     groups = rows.groups
     code, start = groups.codes["stroke"], groups.starts["stroke"]

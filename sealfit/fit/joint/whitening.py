@@ -79,32 +79,21 @@ class Scatter:
 class Between:
     """Whitening of a few numbers per stroke with independent noise, under the variance components.
 
-    `variance`, shape (m,), is that of each number's own noise; `loads`, shape (m, kinds), are the changes of
-    the numbers per unit of each kind; `components` are finest level first. `logdet` is the log
-    determinant of the covariance.
+    `variance`, shape (m,), is each number's own noise; `loads`, shape (m, kinds), are their changes per unit
+    of each kind.
     """
 
     def __init__(
-        self,
-        variance: np.ndarray,
-        loads: np.ndarray,
-        groups: Groups,
-        components: Sequence[Component],
+        self, variance: np.ndarray, loads: np.ndarray, groups: Groups, components: Sequence[Component]
     ) -> None:
-        above = [
-            (
-                groups.starts[part.level],
-                groups.codes[part.level],
-                np.sqrt(part.variance) * loads[:, KINDS.index(part.kind)],
-            )
-            for part in components
-            if part.variance > 0
-        ]
+        above = [part for part in components if part.variance > 0]
+        columns = [np.sqrt(part.variance) * loads[:, KINDS.index(part.kind)] for part in above]
         self.scale = 1 / np.sqrt(variance)
         self.logdet = float(np.log(variance).sum())
         self.steps: list[tuple] = []
-        left = np.column_stack([load for *_, load in above]) * self.scale[:, None] if above else None
-        for k, (start, code, _) in enumerate(above):
+        left = np.column_stack(columns) * self.scale[:, None] if above else None
+        for k, part in enumerate(above):
+            start, code = groups.starts[part.level], groups.codes[part.level]
             load = left[:, k].copy()
             square = np.add.reduceat(load**2, start)
             self.logdet += float(np.log1p(square).sum())
@@ -127,9 +116,8 @@ class Between:
 
 
 class Whitening:
-    """A root of the inverse covariance of rows, computed once and applied to many columns.
+    """A root of the inverse covariance of rows with loads, (n, kinds), applied to many columns.
 
-    `loads` are those of the rows, shape (n, kinds); noise is proportional to friction, the load of a gain.
     The groups are nested, strokes first. `logdet` is the log determinant of the covariance.
     """
 
@@ -181,7 +169,6 @@ class Whitening:
         return white
 
 
-# ---------------------------------------------------------------- covariances of independent blocks
 def members(links: csr_array) -> list[np.ndarray]:
     """Return the connected groups of a symmetric matrix, those of one size together, (groups, size) each."""
     _, label = connected_components(links, directed=False)
