@@ -221,7 +221,7 @@ class _LawAfter:
         most = float(np.exp(min(high, WIDEST))) if high < last else np.inf
         c, half = -found.x[1] * found.x[2], t * found.error_of_c()
         a = found.x[1] - t * error[1], found.x[1] + t * error[1]
-        return CurveInterval(a, (least, most), (c - half, c + half))
+        return {"a": a, "b": (least, most), "c": (c - half, c + half)}
 
     def _statistics(self, steady_fit: pd.DataFrame) -> Iterator[dict]:
         """Yield the errors of the law at single conditions, and the statistics behind its intervals."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -15,11 +15,11 @@ from sealfit.errors import FitError
 STEPS = 2000
 # Relative change of the sum of squares that counts as rounding.
 SAME = 1e-13
-# Steps that shrink at least by this factor still converge, though the sum of squares no longer changes.
+# Steps that shrink at least by this factor still converge, though the sum of squares stays the same.
 SHRINKS = 0.9
-# Relative change of all parameters that is rounding. Such steps could repeat one another without end.
+# Relative change of all parameters that is rounding; such steps could repeat without end.
 ROUNDING = 4 * np.finfo(float).eps
-# Damping of the first step. Below it a step is close to a Gauss-Newton step.
+# Damping of the first step, which is close to a Gauss-Newton step.
 DAMPING = 1e-3
 # Damping at which the search ends without a further decrease.
 LARGEST_DAMPING = 1e12
@@ -39,12 +39,11 @@ def levenberg_marquardt(
     `evaluate(x, rows)` returns weighted residuals, shape (r, n), and their derivatives, shape (r, p, n), of
     the problems `rows`, shape (r,), at x, shape (r, p). Starts are moved inside the closed bounds, shape (p,)
     or (problems, p), which are infinite for none and equal for a fixed parameter. `linear` has the products
-    of the derivatives, if they are not arrays. A sum of squares is infinite if the residual is not finite at
-    the start.
+    of derivatives that are not arrays. A sum of squares is infinite if the residual is not finite at the
+    start.
 
     The scale of each parameter is the largest norm of its column so far (More 1978, Lecture Notes in
-    Mathematics 630, 105-116). The damped step is computed by singular values, more accurately than by normal
-    equations.
+    Mathematics 630, 105-116).
     """
     linear = linear or Linear()
     low, high = np.broadcast_to(low, start.shape), np.broadcast_to(high, start.shape)
@@ -112,9 +111,8 @@ def _squares(rest: np.ndarray) -> np.ndarray:
 def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
     """Return the derivative of `residual`, (p,) -> (n,), at `x`, shape (n, p), by fourth-order differences.
 
-    The step is 1e-4 of each parameter. Rounding errors are near 1e-12 of the derivative, and a location
-    parameter a hundred widths from the origin (a peak at 450 nm, 4 nm wide) changes by a hundredth of its
-    width.
+    The step is 1e-4 of each parameter. It is small for a peak a hundred of its widths from the origin, and
+    rounding errors are near 1e-12 of the derivative.
     """
     h = 1e-4 * np.where(x == 0, 1.0, np.abs(x))
     points = x + np.array([-2, -1, 1, 2])[:, None, None] * np.diag(h)
@@ -125,40 +123,35 @@ def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray
 def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return (J'J)^-1, shape (..., p, p), and its rank; undetermined parameters have infinite variance.
 
-    J, shape (..., n, p), is the derivative of the weighted residual, of one or many problems. Parameters not
-    in `free`, shape (..., p), are fixed: their variance is 0.
+    J, shape (..., n, p), is the derivative of the weighted residual. Parameters not in `free`, shape
+    (..., p), are fixed: their variance is 0.
     """
     n, p = jacobian.shape[-2:]
     free = np.ones(p, bool) if free is None else free
     jacobian = jacobian * free[..., None, :]
     scale = np.linalg.norm(jacobian, axis=-2)
     scale = np.where(scale > 0, scale, 1.0)
-    # Only if it is wide the null space needs the full decomposition.
+    # The null space of a wide matrix needs the full decomposition.
     _, singular, rows = np.linalg.svd(jacobian / scale[..., None, :], full_matrices=n < p)
     singular = np.concatenate([singular, np.zeros((*singular.shape[:-1], p - singular.shape[-1]))], axis=-1)
     known = singular > RANK * np.maximum(singular.max(axis=-1, keepdims=True), 1e-300)
     half = rows * np.divide(1.0, singular, out=np.zeros(singular.shape), where=known)[..., None]
     covariance = np.swapaxes(half, -1, -2) @ half / (scale[..., :, None] * scale[..., None, :])
-    # Parameters that change along the null space.
-    unknown = free & np.any(~known[..., None] & (np.abs(rows) > 1e-6), axis=-2)
+    unknown = free & np.any(~known[..., None] & (np.abs(rows) > 1e-6), axis=-2)  # change in the null space
     covariance[unknown[..., :, None] | unknown[..., None, :]] = 0.0
     covariance[unknown[..., :, None] & np.eye(p, dtype=bool)] = np.inf
     return covariance, known.sum(axis=-1)
 
 
 # ---------------------------------------------------------------- variable projection
-# Least squares with one nonlinear parameter: the linear parameters are solved for exactly at each of its
-# values.
-#
-# Many problems are solved together as arrays: the conditions of a campaign.
-# Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036 (variable projection).
+# Many problems with one nonlinear parameter each, solved together. Golub and Pereyra 1973, SIAM J. Numer.
+# Anal. 10(2), 413-432, doi:10.1137/0710036.
 
 # A column is linearly dependent if the others explain all but this share of its variance.
 DEPENDENT = 1e-13
 # Number of values in a temporary array: 16 MB.
 CHUNK = 2_000_000
-# Absolute tolerance of the nonlinear parameter (usually a logarithm) in the search. The sum of squares is
-# constant in double precision within it.
+# Tolerance of the nonlinear parameter, usually a logarithm, within which the sum of squares is constant.
 CLOSE = 1e-9
 # Largest number of steps of this search.
 MOST_STEPS = 60
@@ -167,8 +160,7 @@ MOST_STEPS = 60
 def solve_kept(gram, moment, keep):
     """Return the coefficients of columns in `keep`, (..., p), others 0; gram (..., p, p) has unit diagonal.
 
-    Cholesky factorisation, written out over the columns so that all problems are solved together. A linearly
-    dependent column has coefficient 0.
+    Cholesky factorisation of all problems together. A linearly dependent column has coefficient 0.
     """
     p = moment.shape[-1]
     lower = [[None] * p for _ in range(p)]
@@ -192,7 +184,7 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
 
     `gram`, shape (..., p, p), is B'B of the columns, scaled to unit diagonal (0 for a column of zeros), and
     `moment`, shape (..., p), is B'y. Returns the coefficients and which columns are in the optimum, shape
-    (..., p) each. It is global, as the problem is convex.
+    (..., p) each. The optimum is global, as the problem is convex.
     """
     nonnegative = np.asarray(nonnegative, bool)
     keep = np.ones(moment.shape, bool)
@@ -218,7 +210,7 @@ def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
 def project(columns, y, nonnegative, refine: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """Return coefficients, (..., p), of weighted columns (..., n, p) and y (..., n), and the rss, (...).
 
-    `refine` steps of iterative refinement recover the digits that normal equations lose.
+    `refine` steps of iterative refinement recover digits that normal equations lose.
     """
     norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
     scaled = columns / np.where(norm > 0, norm, 1.0)[..., None, :]
@@ -245,10 +237,9 @@ class BatchFit:
 
 @dataclass(frozen=True)
 class Separable:
-    """Least-squares problems with one nonlinear parameter each.
+    """Least-squares problems with one nonlinear parameter each; `basis(u, rows)` returns the columns of some.
 
-    `basis(u, rows)` returns the columns, shape (r, g, n, p), of the problems `rows`, shape (r,), at u, shape
-    (r, g).
+    They have the shape (r, g, n, p) for the problems `rows`, shape (r,), at u, shape (r, g).
     """
 
     basis: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -256,31 +247,24 @@ class Separable:
     weight: np.ndarray  # (problems, n) 1/variance; 0 for padding
     nonnegative: Sequence[bool]  # (p,) which coefficients are nonnegative
 
-    def some(self, own: np.ndarray) -> Separable:
-        """Return the problems with some numbers, shape (r,)."""
-        return replace(
-            self, basis=lambda u, rows: self.basis(u, own[rows]), y=self.y[own], weight=self.weight[own]
-        )
 
+def profile(
+    problems: Separable, u: np.ndarray, rows: np.ndarray | None = None, *, refine: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least weighted sums of squares, (r, g), and coefficients, (r, g, p), of the problems `rows`.
 
-def profile(problems: Separable, u: np.ndarray, *, refine: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least weighted sums of squares, (problems, g), and coefficients, (problems, g, p).
-
-    `u`, shape (problems, g), are the nonlinear parameters. `refine` is as in `project`: 0 is for a search.
+    `u`, shape (r, g), are the nonlinear parameters. `refine` is as in `project`: 0 is for a search.
     """
-    y, weight, nonnegative = problems.y, problems.weight, problems.nonnegative
-    root, rows = np.sqrt(weight), np.arange(len(y))
-    p = len(nonnegative)
-    rss = np.empty(u.shape)
-    coefficients = np.empty((*u.shape, p))
+    rows = np.arange(len(problems.y)) if rows is None else rows
+    y, root, p = problems.y[rows], np.sqrt(problems.weight[rows]), len(problems.nonnegative)
+    rss, coefficients = np.empty(u.shape), np.empty((*u.shape, p))
     step = max(1, CHUNK // max(1, u.shape[1] * y.shape[1] * p))
     for start in range(0, len(u), step):
         part = slice(start, start + step)
-        chosen = rows[part]
-        weights = root[chosen][:, None, :, None]
-        columns = problems.basis(u[part], chosen)
-        measured = np.broadcast_to((y[chosen] * root[chosen])[:, None, :], columns.shape[:-1])
-        coefficients[part], rss[part] = project(columns * weights, measured, nonnegative, refine)
+        columns = problems.basis(u[part], rows[part])
+        measured = np.broadcast_to((y[part] * root[part])[:, None, :], columns.shape[:-1])
+        weighted = columns * root[part, None, :, None]
+        coefficients[part], rss[part] = project(weighted, measured, problems.nonnegative, refine)
     return rss, coefficients
 
 
@@ -301,7 +285,7 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     problem, k = np.nonzero((inner <= rss[:, :-2]) & (inner <= rss[:, 2:]))
 
     def solved(u, problem):
-        return profile(problems.some(problem.astype(int)), u[:, None], refine=2)
+        return profile(problems, u[:, None], problem.astype(int), refine=2)
 
     def rss_at(u, problem):
         return solved(u, problem)[0][:, 0]

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from sealfit.config import Config
 from sealfit.fit.aging import aging_curves, between_scatter, fit_series
 from sealfit.fit.aging.law import EqualGroups, Values, fit_law, solve_law
-from sealfit.fit.aging.law_table import CurveInterval, Estimate, _judge, curve_errors, curve_intervals
+from sealfit.fit.aging.law_table import Estimate, _judge, curve_errors, curve_intervals
 from sealfit.fit.steady import fit_conditions
 from sealfit.physics import aging_law
 from sealfit.tables import AGING_CURVES, AGING_FIT
@@ -175,7 +175,7 @@ def test_profile_of_b_is_that_of_the_whole_problem():
     values, _ = two_curves(seed=3)
     fit = fit_law(values)
     interval = curve_intervals(fit, np.array([3.84]))[0]
-    for end in interval.b:
+    for end in interval["b"]:
 
         def residual(x, end=end):
             a, u = np.where(values.curve == 1, x[2], x[1]), np.where(values.curve == 1, x[3], np.log(end))
@@ -291,7 +291,7 @@ def test_no_aging_is_said_only_where_no_loss_is_seen(error, says, identified):
     found = Estimate(np.array([0.9, 0.02, np.log(0.01)]), np.diag([0.0, error**2, 0.0]), np.zeros(3))
     assert found.loss(16.0) == pytest.approx((0.02 * np.log1p(1600.0), error * np.log1p(1600.0)))
     curve = SimpleNamespace(days=[1.0, 16.0], unaged=True)
-    ends = CurveInterval((-0.01, 0.05), (0.0, 1.0), (0.0, 1.0))
+    ends = {"a": (-0.01, 0.05), "b": (0.0, 1.0), "c": (0.0, 1.0)}
     assert says in _judge(curve, found, ends, 2.0)["a"][1]
     assert _judge(curve, found, ends, 2.0)["a"][0] == identified
 

@@ -98,7 +98,7 @@ def test_the_stribeck_speed_does_not_depend_on_the_unit_of_force():
     _, force = many(200)
     weight = np.ones_like(force)
     fit = solve_stribeck(SPEEDS, LOAD, force, weight)
-    inner = (fit.limits[0] < np.log(fit.values[:, 2])) & (np.log(fit.values[:, 2]) < fit.limits[1])
+    inner = (fit.grid[:, 0] < np.log(fit.values[:, 2])) & (np.log(fit.values[:, 2]) < fit.grid[:, -1])
     assert inner.mean() > 0.9
     fine = solve_stribeck(SPEEDS, LOAD, 10 * force, weight / 100)  # the same problems, other rounding
     # Half of the digits of a sum of squares, and fewer where its minimum is flat.

@@ -11,12 +11,11 @@ import pandas as pd
 from scipy.sparse import csr_array, diags_array
 
 from sealfit.config import Config
-from sealfit.fit import covariance_matrix
 from sealfit.fit.aging import law_table
 from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
 from sealfit.fit.aging.law_table import Estimate, OneQuantity, SeriesCurve
 from sealfit.fit.joint.declared import DAYS_FOR_LAW
-from sealfit.fit.steady import SteadyFit
+from sealfit.fit.steady import SteadyFit, covariance_matrix
 from sealfit.fit.steady.condition import FULL
 from sealfit.physics import aging_law
 from sealfit.tables import AGING_COVARIANCE, AGING_CURVES, AGING_FIT
@@ -29,36 +28,23 @@ SMALLEST = 1e-6
 # Number of points of a curve, which are denser near day 0.
 CURVE_POINTS = 61
 
-
 # Rows of tables `aging_fit` and `aging_covariance`.
 LawRows = tuple[list[dict], list[dict]]
 
 
 def fit_series(steady_fit: SteadyFit, config: Config) -> dict[str, pd.DataFrame]:
-    r"""Fit the aging law to every series, mu_0 shared by all series of a rubber.
+    r"""Return tables `aging_fit` and `aging_covariance` of the aging laws of series, mu_0 shared by a rubber.
 
     .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b), \quad c = -a \ln b
 
-    All series and both quantities of a rubber are fitted together by generalised least squares. The
-    covariance is that of mu_s and mu_c in the steady fits plus the scatter between specimens, estimated from
-    the residuals.
+    All series and both quantities of a rubber are fitted together by generalised least squares, to the
+    identified values of the steady fits, whose table has the column `aging_days`. The covariance is that of
+    mu_s and mu_c in the steady fits plus the scatter between specimens, estimated from the residuals.
 
-    Parameters
-    ----------
-    steady_fit : dict of DataFrame
-        The fits of the conditions, with the column `aging_days`; only identified values are used.
-    config : Config
-        Names the condition columns.
+    `aging_fit` has mu_0, a, b, c per series and quantity, and "statistics" rows, whose `parameter` starts
+    with the quantity ("mu_s:chi2"); `aging_covariance` is that of mu_0, a and ln b. They are empty without
+    `aging_days` in the condition or without aged rubber.
 
-    Returns
-    -------
-    dict of DataFrame
-        Table `aging_fit`: per series and quantity mu_0, a, b, c, and "statistics" rows, whose `parameter`
-        starts with the quantity ("mu_s:chi2"); and table `aging_covariance` of mu_0, a and ln b. Empty
-        without `aging_days` in the condition or without aged rubber.
-
-    Notes
-    -----
     Intervals of a, b and c are profile-likelihood intervals, that of mu_0 is from the curvature, with
     Student's t. The degrees of freedom are values minus parameters of the quantity, as specimens are the unit
     of evidence. `u_sys` is the change of the fit if the sensor's error changes all steady values together.
@@ -74,25 +60,20 @@ def fit_series(steady_fit: SteadyFit, config: Config) -> dict[str, pd.DataFrame]
 def law_fit(
     laws: Iterable[tuple[str, LawRows]], about: pd.DataFrame, config: Config
 ) -> dict[str, pd.DataFrame]:
-    """Return tables `aging_fit` and `aging_covariance` of laws, each with its rubber.
-
-    `about` has the columns of every series.
-    """
+    """Return tables `aging_fit` and `aging_covariance` of laws by rubber; `about` has columns of series."""
     rows = [[], []]
     for rubber, own in laws:
         for kept, new in zip(rows, own, strict=True):
             kept += [{"rubber": rubber, **row} for row in new]
     found = {}
     for schema, own in zip((AGING_FIT, AGING_COVARIANCE), rows, strict=True):
-        fixed = schema.names()
-        others = [name for name in config.series_columns if name in about and name not in fixed]
+        others = [name for name in config.series_columns if name in about and name not in schema.names()]
         keys = about.groupby("series", sort=True)[others].first().reset_index()
-        table = pd.DataFrame(own, columns=fixed)
+        table = pd.DataFrame(own, columns=schema.names())
         found[schema.name] = table.merge(keys, on="series", how="left", validate="many_to_one")
     return found
 
 
-# ---------------------------------------------------------------- one rubber
 def _fit_rubber(steady_fit: SteadyFit) -> LawRows:
     own, shift = steady_fit["steady_fit"], steady_fit["steady_shift"]
     found = own[(own["quantity"] == "steady") & own["identified"].to_numpy(bool) & own["value"].notna()]
@@ -110,10 +91,7 @@ def _fit_rubber(steady_fit: SteadyFit) -> LawRows:
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
-    """Return the values without mu_c of conditions with too few speeds, if others have a Stribeck curve.
-
-    The "mu_c" of two or three slow speeds includes mu_s: it is a different quantity.
-    """
+    """Return the values without mu_c of few speeds, which includes mu_s, if others have a Stribeck curve."""
     with_curve = set(found.loc[found["parameter"] == pair[0], "condition"])
     if not with_curve:
         return found
@@ -126,9 +104,8 @@ def _curves_of(found: pd.DataFrame, series: Sequence[str], quantities: Sequence[
     """Return the curves of some series and quantities; those with enough days are numbered."""
     unaged, unit = set(found.loc[found["aging_days"] == 0, "quantity"]), str(found["unit"].iloc[0])
     aged = found[found["aging_days"] > 0]
-    tested = dict(
-        aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False).unique()
-    )
+    days_of = aged["aging_days"].astype(float).groupby([aged["series"], aged["quantity"]], sort=False)
+    tested = dict(days_of.unique())
     curves, place = [], 0
     for name, quantity in product(series, quantities):
         days = np.sort(tested.get((name, quantity), np.zeros(0)))
@@ -150,8 +127,7 @@ def _numbers_of(found: pd.DataFrame, curves: list[SeriesCurve]) -> np.ndarray:
 def steady_covariance(used: pd.DataFrame, known: pd.DataFrame) -> csr_array:
     """Return the covariance of steady values, shape (n, n); it is 0 between conditions.
 
-    `used` has the values: `condition`, `quantity` (mu_s, ...) and `value`; `known` is table
-    `steady_covariance`.
+    `used` has their `condition`, `quantity` and `value`; `known` is table `steady_covariance`.
     """
     quantity, n = used["quantity"].to_numpy(object), len(used)
     value_of = known.set_index(["condition", "parameter", "other"])["value"].to_dict()
@@ -183,11 +159,7 @@ def _with_specimens(values: Values, taus: list[float], model: np.ndarray) -> Val
 
 
 def between_scatter(values: Values) -> tuple[float, LawFit]:
-    """Return the relative scatter of a quantity's values beyond their covariance, and the fit without it.
-
-    The variance of every value is increased by (scatter times the law or `size`)^2; the estimate is Paule and
-    Mandel's.
-    """
+    """Return a quantity's relative scatter beyond its covariance, and the fit without it (Paule, Mandel)."""
     plain = fit_law(values)
     if plain.df <= 0 or plain.chi2 <= plain.df:
         return 0.0, plain
@@ -202,7 +174,6 @@ def between_scatter(values: Values) -> tuple[float, LawFit]:
     return paule_mandel(chi2, plain.df, (plain.model - values.value) / scale), plain
 
 
-# ---------------------------------------------------------------- table
 def laws_of_series(
     found: pd.DataFrame, series: Sequence[str], quantities: Sequence[str], covariance, **replicates
 ) -> LawRows:
@@ -252,12 +223,10 @@ def _rows(values: Values, curves: list[SeriesCurve], fitted: list[str], moved: n
     return rows, covariances
 
 
-# ---------------------------------------------------------------- curves
 def aging_curves(laws: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Return table `aging_curves`: laws of series up to the last tested day, with 95 % bands.
+    """Return table `aging_curves`: laws of series up to the last tested day, with 95 % bands of their means.
 
-    `laws` are tables `aging_fit` and `aging_covariance`. A band is that of the population mean, from the
-    covariance of mu_0, a and ln b.
+    `laws` are tables `aging_fit` and `aging_covariance`.
     """
     tables, fit, covariance = [], laws["aging_fit"], laws["aging_covariance"]
     of_law = dict(iter(covariance.groupby(["series", "quantity"])))
@@ -274,10 +243,7 @@ def aging_curves(laws: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 def _curve(
     known: dict[tuple[str, str], float], quantity: str, of_law: pd.DataFrame | None
 ) -> dict[str, np.ndarray]:
-    """Return the curve of one quantity, empty without a law.
-
-    `known` are values by quantity and parameter, and `of_law` the rows of the law's covariance.
-    """
+    """Return the curve of one quantity from values by quantity and parameter, and the law's covariance."""
     mu_0, a, b = (known[quantity, name] for name in ("mu_0", "a", "b"))
     if np.isnan([mu_0, a, b]).any():
         return {}

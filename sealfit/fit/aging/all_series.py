@@ -5,11 +5,10 @@ For a given v_s the force is linear in all other parameters,
 
 .. math:: F\,\mathrm{sgn}\,v = N [\mu_c^{(i)} + (\mu_s^{(i)} - \mu_c^{(i)}) e^{-(v/v_s)^2}] + \sigma_2 |v|,
 
-so mu_s and mu_c of the conditions i, with their covariance, contain all information of the forces on an aging
-law: a law fitted to them by generalised least squares is fitted to the forces. Sharing v_s and sigma_2
-reduces the standard errors, and determines conditions with too few speeds for a separate fit. If an F test
-rejects that the days of a series share them, its conditions keep their separate fits; so do days with few
-speeds that disagree with the others.
+so a law fitted to mu_s and mu_c of the conditions i by generalised least squares is fitted to the forces.
+Sharing v_s and sigma_2 reduces the standard errors, and determines conditions with too few speeds for a
+separate fit. If an F test rejects that the days of a series share them, its conditions keep their separate
+fits; so do days with few speeds that disagree with the others.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from scipy.special import fdtrc
 
 from sealfit.config import Config
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.aging import PAIRS, steady_covariance
+from sealfit.fit.aging import steady_covariance
 from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw, fit_laws, left_out, rivals_of
 from sealfit.fit.aging.law import Values, fit_law, law_model
 from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.search import pairs_and_shared
 from sealfit.fit.joint.whitening import log_determinant
-from sealfit.fit.least_squares import covariance_of, even_grid
+from sealfit.fit.least_squares import covariance_of
 from sealfit.fit.steady import FORCES, SteadyFit, parameter_units, solve_conditions
 from sealfit.fit.steady.condition import FULL, Condition
-from sealfit.fit.steady.stribeck import search_limits
+from sealfit.fit.steady.stribeck import search_grid
 from sealfit.fit.steady.uncertainty import UnitVariance, shifts_of
 from sealfit.physics.aging_laws import LOSSES
 from sealfit.tables import AGING_LAWS, MASTER_CURVE, STEADY_FIT
@@ -56,17 +55,12 @@ CURVE_POINTS = 61
 START_POINTS = 20
 
 
-# ---------------------------------------------------------------- values
-# mu_s and mu_c of all conditions from the forces.
-
-
 def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataFrame, csr_array]:
     """Return mu_s and mu_c at every aged condition and the unaged rubber, and their covariance.
 
     The table has `condition`, `quantity` (mu_s, mu_c, F_s or F_c), `value`, and the condition's columns. The
-    covariance of measurement, shape (n, n), is 0 between series before the loop. `steady_fit` are the
-    separate fits, of which only identified values are used, with `aging_days`. FitError if there is no row to
-    fit.
+    covariance of measurement, shape (n, n), is 0 between series before the loop. Of the separate fits only
+    identified values are used. FitError if there is no row to fit.
     """
     fit = steady_fit["steady_fit"]
     rows = fit[(fit["quantity"] == "steady") & fit["aging_days"].notna()]
@@ -74,13 +68,14 @@ def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataF
     about = rows.drop(columns=of_parameters, errors="ignore").drop_duplicates("condition")
     known = rows[rows["identified"].to_numpy(bool) & rows["value"].notna()]
     curved = set(known.loc[known["parameter"] == "v_s", "condition"])
-    free = known[known["parameter"].isin([name for pair in PAIRS for name in pair])]
+    free = known[known["parameter"].isin([*FORCES, *FORCES.values()])]
     free = free.assign(quantity=free["parameter"])[["condition", "quantity", "value"]]
     conditions, _, variance = solve_conditions(steady)
     place = {c.name: k for k, c in enumerate(conditions)}
     series = series_of_curve(about.reset_index(drop=True), aging=True)
-    count, known_shifts = len(shifts_of(steady)), steady_fit["steady_shift"]
-    known_shifts = known_shifts.set_index(["condition", "parameter", "source"])["value"].to_dict()
+    count = len(shifts_of(steady))
+    known_shifts = steady_fit["steady_shift"].set_index(["condition", "parameter", "source"])
+    known_shifts = known_shifts["value"].to_dict()
     tables, covariances, shifts, covered = [], [], [], set()
     for places in about.groupby(series, sort=False).indices.values():
         of = [place[name] for name in about["condition"].to_numpy(object)[places]]
@@ -110,10 +105,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataF
 def _shared(
     own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
 ) -> _SharedCurve | None:
-    """Return the shared curve of the days of a series, or None if they do not share one.
-
-    `widened`, shape (conditions,), is the factor on variances.
-    """
+    """Return the shared curve of the days of a series, or None; `widened` are the factors on variances."""
     is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]
     usual = variance.df[np.isfinite(variance.value) & ~variance.own]
@@ -147,13 +139,12 @@ class _SharedCurve:
         self.speed, self.load, self.force, weight = (np.concatenate(parts) for parts in arrays)
         self.code = np.repeat(np.arange(len(own)), [len(c.runs) for c in own])
         self.root = np.sqrt(weight / widened[self.code])
-        grid = even_grid(*search_limits(self.speed[None], weight[None]), PER_DECADE)[0]
+        grid = search_grid(self.speed[None], weight[None], PER_DECADE)[0]
         rss = [self._solve(u)[0] for u in grid]
         best = int(np.argmin(rss))
         ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
-        found = minimize_scalar(
-            lambda u: self._solve(u)[0], bounds=ends, method="bounded", options={"xatol": 1e-9}
-        )
+        options = {"xatol": 1e-9}
+        found = minimize_scalar(lambda u: self._solve(u)[0], bounds=ends, method="bounded", options=options)
         self.log_v_s = float(found.x) if found.fun <= rss[best] else float(grid[best])
         self.rss, self.levels, self.sigma_2, rank = self._solve(self.log_v_s)
         self.df = self.code.size - rank - 2
@@ -171,10 +162,7 @@ class _SharedCurve:
         return float(residual @ residual), levels, sigma_2, rank
 
     def determined(self) -> tuple[pd.DataFrame, np.ndarray, np.ndarray]:
-        """Return mu_s and mu_c where they are determined, their covariance, and their shift, (values, k).
-
-        The shift is their change along the directions of the effects' uncertainty.
-        """
+        """Return mu_s and mu_c where they are determined, their covariance, and shift with the effects."""
         names = [(c.name, q if c.has_load else FORCES[q]) for c in self.own for q in ("mu_s", "mu_c")]
         tangent, value = self.tangent(), self.levels.ravel()
         covariance, _ = covariance_of(tangent)
@@ -193,13 +181,9 @@ class _SharedCurve:
         own[np.arange(runs), self.code] = self._columns(self.log_v_s).T
         square = (self.speed / np.exp(self.log_v_s)) ** 2
         rise = self.levels[self.code] @ [1.0, -1.0]
-        bend = rise * self.load * np.exp(-square) * 2 * square * self.root
-        shared = [bend] + ([self.speed * self.root] if self.sigma_2 > 0 else [])
+        shared = [rise * self.load * np.exp(-square) * 2 * square * self.root]
+        shared += [self.speed * self.root] if self.sigma_2 > 0 else []
         return np.column_stack([own.reshape(runs, -1), *shared])
-
-
-# ---------------------------------------------------------------- laws
-# Every law with its evidence as a table, compared with separate laws of the series.
 
 
 # Values of a law for all series, by rubber and quantity.
@@ -207,10 +191,7 @@ AgedValues = Mapping[tuple[str, str], Aged]
 
 
 def aged_values(steady: pd.DataFrame, steady_fit: SteadyFit) -> AgedValues:
-    """Return mu_s and mu_c (F_s and F_c) of every rubber at the conditions where the forces determine them.
-
-    The arguments are those of `shared_levels`.
-    """
+    """Return mu_s and mu_c (F_s and F_c) of every rubber where the forces determine them."""
     levels, covariance = shared_levels(steady, steady_fit)
     rubber, quantity = levels["rubber"], levels["quantity"]
     order, found = [*FORCES, *FORCES.values()], {}
@@ -223,20 +204,16 @@ def aged_values(steady: pd.DataFrame, steady_fit: SteadyFit) -> AgedValues:
 
 def aged_of(rows: pd.DataFrame, *scatter) -> Aged:
     """Return the values of table rows with the condition's columns; `scatter` is as in `Aged`."""
-    known = [
-        rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None
-        for name in (TEMPERATURE, COMPRESSION)
-    ]
+    known = []
+    for name in (TEMPERATURE, COMPRESSION):
+        known.append(rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None)
     return Aged(rows["aging_days"].to_numpy(float), rows["value"].to_numpy(float), *known, *scatter)
 
 
 def joint_laws(
     steady: pd.DataFrame, steady_fit: SteadyFit, config: Config
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions.
-
-    They are fitted to the forces in table `steady`, with `steady_fit` and its condition columns.
-    """
+    """Return tables `aging_laws` and `master_curve`; empty without aging or with too few conditions."""
     aging = config.aging and "aging_days" in steady_fit["steady_fit"].columns
     aged = aged_values(steady, steady_fit) if aging else {}
     return law_tables(aged, {q: parameter_units(config.units, q in FORCES)["mu_s"] for _, q in aged})
@@ -254,36 +231,26 @@ def law_tables(values: AgedValues, units: Mapping[str, str]) -> tuple[pd.DataFra
         rows += [{**at, **row} for row in _law_rows(laws, units[quantity])]
         curves.append(_master_curve(laws[0]).assign(**at))
     curves = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
-    return (
-        pd.DataFrame(rows).assign(model="before").reindex(columns=AGING_LAWS.names()),
-        curves.reindex(columns=MASTER_CURVE.names()),
-    )
+    laws = pd.DataFrame(rows).assign(model="before").reindex(columns=AGING_LAWS.names())
+    return laws, curves.reindex(columns=MASTER_CURVE.names())
 
 
 def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
-    best = laws[0]
-    rivals = rivals_of(laws)
+    best, rivals = laws[0], rivals_of(laws)
     for number, law in enumerate(laws):
         errors = left_out(law) if number < HELD_OUT_LAWS else {}
         head = {
-            "law": law.loss.name,
-            "way": law.acts_on if best.aged.drivers() else "",
-            "form": law.loss.form,
-            "rank": number + 1,
-            "rival": law in rivals,
-            "criterion": law.bic - best.bic,
-            "scatter_rel": law.scatter,
-            "lack_of_fit_p": law.lack_of_fit_p(),
+            "law": law.loss.name, "way": law.acts_on if best.aged.drivers() else "", "form": law.loss.form,
+            "rank": number + 1, "rival": law in rivals, "criterion": law.bic - best.bic,
+            "scatter_rel": law.scatter, "lack_of_fit_p": law.lack_of_fit_p(),
             "heldout_series": errors.get("series", np.nan),
             "heldout_last_day": errors.get("last_day", np.nan),
-        }
+        }  # fmt: skip
         units = {"mu_0": unit, "a": unit, "E": "kJ/mol", "kappa": "1/%"}
         units |= dict(zip(law.loss.parameters, law.loss.units, strict=True))
         for name, value, low, high, known in law.parameters():
-            yield {
-                **head, "parameter": name, "value": value, "lo95": low, "hi95": high, "unit": units[name],
-                "identified": known,
-            }  # fmt: skip
+            row = {"parameter": name, "value": value, "lo95": low, "hi95": high, "unit": units[name]}
+            yield {**head, **row, "identified": known}
     apart = _separate(best)
     if apart is not None:
         yield {
@@ -294,10 +261,7 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
 
 
 def _separate(law: JointLaw) -> tuple[float, float] | None:
-    """Return the BIC of separate laws under the joint law's scatter, and their held-out error at last days.
-
-    None if the series have too few values for separate laws.
-    """
+    """Return the BIC of separate laws under the joint scatter, and their held-out error; None if too few."""
     aged, series = law.aged, law.aged.series()
     pairs = np.unique(np.column_stack([series, aged.days])[series >= 0], axis=0)
     days = np.bincount(pairs[:, 0].astype(int))  # number of days of each series
@@ -316,8 +280,7 @@ def _separate(law: JointLaw) -> tuple[float, float] | None:
 def _master_curve(law: JointLaw) -> pd.DataFrame:
     """Return values on the master curve, and the law with band at reference temperature and compression.
 
-    If temperature and compression change the rate of aging, times are multiplied by k; if they change the
-    loss, losses are divided by k.
+    Times are multiplied by k if the rate of aging changes; losses are divided by k if the loss changes.
     """
     aged = law.aged
     scaled, start = law.tested_days(), law.x[0]

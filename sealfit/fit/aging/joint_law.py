@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -12,27 +13,25 @@ from scipy.special import fdtrc, stdtrit
 
 from sealfit.effects import aging_laws
 from sealfit.errors import FitError
-from sealfit.fit.aging.joint_least_squares import solved
 from sealfit.fit.aging.law import paule_mandel
 from sealfit.fit.joint.prior import covariance_of
 from sealfit.fit.joint.whitening import log_determinant, whitening_of
+from sealfit.fit.least_squares import levenberg_marquardt
 from sealfit.physics.aging_laws import LOSSES, Loss
 
 # Gas constant in kJ/(mol K).
 GAS_CONSTANT = aging_laws.GAS_CONSTANT / 1000
-# Smallest variance of a value. It keeps the weights of values without scatter, and their squares, finite.
+# Smallest variance of a value: without it the weights of values without scatter would be infinite.
 TINY = 1e-280
-# The same as a share of the largest variance: less is rounding.
+# The same as a share of the largest variance; less is rounding.
 ROUNDING = 1e-12
-# Largest number of series that are left out in turn for held-out errors. The root mean square of their errors
-# is then known to a tenth.
+# Largest number of series that are left out in turn: it determines their RMS error to a tenth.
 MOST_LEFT_OUT = 50
 # Fewest degrees of freedom of a law that is compared with others that leave more.
 SPARE = 2
 
 
-# Variables that change the rate of aging: attribute, and the function of it that the coefficient in ln k (in
-# kJ/mol, 1/%) multiplies.
+# Variables that change the rate of aging: attribute, and its function in ln k beside the coefficient.
 DRIVERS = {
     "E": ("temperature_C", lambda celsius: 1 / (GAS_CONSTANT * (celsius + aging_laws.ZERO_C))),
     "kappa": ("compression_ratio_pct", lambda percent: percent),
@@ -43,9 +42,9 @@ DRIVERS = {
 class Aged:
     """Values of one quantity, each of a specimen or the mean of those of a condition; arrays are (n,).
 
-    `variance`, shape (n,) or (n, n), is the measurement variance or covariance, None if it is 0; the scatter
-    between specimens is estimated and added. The degrees of freedom are those of a variance estimated from
-    replicates, of differences between values and of their common level; 0 if it is known otherwise.
+    `variance`, shape (n,) or (n, n), is the measurement variance or covariance, None if it is 0. The degrees
+    of freedom are those of a variance estimated from replicates, of differences between values and of their
+    common level; 0 if it is known otherwise.
     """
 
     days: np.ndarray
@@ -59,21 +58,17 @@ class Aged:
 
     def part(self, keep: np.ndarray) -> Aged:
         """Return the values in a mask, shape (n,)."""
-        taken = {
-            name: None if getattr(self, name) is None else getattr(self, name)[keep]
-            for name in ("temperature_C", "compression_ratio_pct", "size")
-        }
+        taken = {}
+        for name in ("temperature_C", "compression_ratio_pct", "size"):
+            values = getattr(self, name)
+            taken[name] = None if values is None else values[keep]
         variance = self.variance
         if variance is not None:
             variance = variance[keep] if variance.ndim == 1 else variance[keep][:, keep]
         return replace(self, days=self.days[keep], value=self.value[keep], variance=variance, **taken)
 
     def covariance(self, scatter: float, about: np.ndarray | None = None) -> csr_array:
-        """Return the covariance of the values, shape (n, n).
-
-        `scatter` is the relative standard deviation between specimens, beyond the measured variance. Without
-        `size` it is relative to `about`, shape (n,), by default the measured values.
-        """
+        """Return the covariance, shape (n, n), with scatter relative to `size`, `about` or the values."""
         measured = np.zeros(self.value.size) if self.variance is None else self.variance
         about = self.value if about is None else about
         measured = csr_array(diags_array(measured) if measured.ndim == 1 else measured)
@@ -116,20 +111,17 @@ class Aged:
 
     def series(self) -> np.ndarray:
         """Return the number of each value's series, shape (n,); -1 for unaged specimens."""
-        keys = list(self.known.values())
-        number, aged = np.full(self.days.size, -1), self.days > 0
-        number[aged] = 0
-        if keys:
-            number[aged] = np.unique(np.column_stack(keys)[aged], axis=0, return_inverse=True)[1].ravel()
+        number = np.where(self.days > 0, 0, -1)
+        if self.known:
+            conditions = np.column_stack(list(self.known.values()))[number == 0]
+            number[number == 0] = np.unique(conditions, axis=0, return_inverse=True)[1].ravel()
         return number
 
     def whole_series(self) -> list[np.ndarray]:
         """Return the mask of each series, shape (n,) each; of `MOST_LEFT_OUT`, evenly spread, if more."""
         series = self.series()
-        last = series.max()
-        return [
-            series == k for k in np.unique(np.linspace(0, last, min(last + 1, MOST_LEFT_OUT)).astype(int))
-        ]
+        chosen = np.linspace(0, series.max(), min(series.max() + 1, MOST_LEFT_OUT))
+        return [series == k for k in np.unique(chosen.astype(int))]
 
     def last_days(self) -> list[np.ndarray]:
         """Return the mask of the last day of each of these series, shape (n,) each."""
@@ -143,10 +135,8 @@ class Aged:
 # with T in kelvin and C the height while aging in percent. Temperature and compression change the rate of
 # aging (w = 0: time-temperature superposition, all series fall on one master curve over k t) or the loss
 # itself (w = 1). mu_0 is that of the unaged rubber, shared by all. phi is one of
-# `sealfit.physics.aging_laws`. BIC chooses the shape and w; the rivals are kept beside the chosen law.
-#
-# Ferry 1980, Viscoelastic Properties of Polymers, chapter 11 (superposition); ISO 11346 (life of rubber by
-# Arrhenius).
+# `sealfit.physics.aging_laws`. BIC chooses phi and w. Ferry 1980, Viscoelastic Properties of Polymers,
+# chapter 11 (superposition); ISO 11346 (life of rubber by Arrhenius).
 
 # Quantities that temperature and compression may change.
 TARGETS = ("rate", "loss")
@@ -156,7 +146,7 @@ TURNS = 4
 CONVERGED = 0.02
 # Logarithm from which a time in days, or its inverse, is no bound: 5e21 d.
 UNBOUNDED = 50.0
-# Largest difference in BIC of a rival law. It is less likely than the chosen law by a factor of up to exp(3).
+# Largest difference in BIC of a rival law: it is less likely than the chosen law by a factor of up to exp(3).
 RIVAL = 6.0
 # A positive parameter is not determined if its 95 % interval spans more than this natural logarithm.
 KNOWN = np.log(100.0)
@@ -222,10 +212,8 @@ class JointLaw:
 
     def away(self, aged: Aged) -> dict[str, np.ndarray]:
         """Return the factors of E and kappa, if varied, in ln k at the conditions, shape (n,) each."""
-        return {
-            name: aged.away(name, self.aged.middle[name])
-            for name in self.names[2 + len(self.loss.parameters) :]
-        }
+        varied = self.names[2 + len(self.loss.parameters) :]
+        return {name: aged.away(name, self.aged.middle[name]) for name in varied}
 
     def slope(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
         """Return the derivatives with respect to x, shape (p, n), or (..., p, n) for x of shape (..., p)."""
@@ -259,6 +247,95 @@ class JointLaw:
                 yield name, float(self.x[k]), float(self.x[k] - half), float(self.x[k] + half), bool(known)
 
 
+# ---------------------------------------------------------------- least squares
+# Starting values of E in kJ/mol.
+ENERGIES = (0.0, 50.0, 100.0)
+# Starting values and bounds of the parameters of the shapes: days, and exponents.
+SHAPES = {
+    "b": (0.01, 0.3, 10.0), "tau": (0.5, 5.0, 50.0), "beta": (0.5, 1.0), "n": (0.2, 0.5, 1.0),
+    "t_i": (0.3, 3.0),
+}  # fmt: skip
+LIMITS = {"b": (1e-9, 1e4), "tau": (1e-6, 1e6), "beta": (0.05, 5.0), "n": (0.01, 5.0), "t_i": (1e-3, 1e3)}
+# Number of linear parameters: mu_0 and a.
+LINEAR = 2
+# Number of starting points that are polished.
+POLISHED = 4
+# The loss is constant, and a not determined, if mu_0 explains all but this share of its square.
+DEPENDENT = 1e-20
+
+
+def solved(law: JointLaw, aged: Aged, white: csr_array, start: np.ndarray | None = None) -> np.ndarray:
+    """Return the least-squares parameters, shape (p,), from a start or a grid; `white` whitens `aged`."""
+    problem = _Projected(law, aged, white, aged.value[None])
+    nonlinear = problem.grid() if start is None else start[None, LINEAR:]
+    x, rss = problem.polished(nonlinear, np.zeros(len(nonlinear), int))
+    return x[np.argmin(rss)]
+
+
+def solved_many(law: JointLaw, white: csr_array, values: np.ndarray) -> np.ndarray:
+    """Return the parameters for many sets of values, (sets, n) -> (sets, p), from the law's parameters."""
+    starts = np.tile(law.x[LINEAR:], (len(values), 1))
+    return _Projected(law, law.aged, white, values).polished(starts, np.arange(len(values)))[0]
+
+
+class _Projected:
+    """Variable projection of a law on sets of values, shape (sets, n): mu_0 and a are solved for.
+
+    Golub & Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432, doi:10.1137/0710036, with the tangent of
+    Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995.
+    """
+
+    def __init__(self, law: JointLaw, aged: Aged, white: csr_array, values: np.ndarray) -> None:
+        self.law, self.aged, self.values, self.white = law, aged, values, white
+        level = white.sum(axis=1)
+        self.column = level / np.linalg.norm(level)  # of mu_0
+        self.level = (level / (level @ level)) @ white
+        self.measured = self._whitened(values[:, None])
+        self.reach = float((white.data**2).sum())
+
+    def _whitened(self, many: np.ndarray) -> np.ndarray:
+        """Return rows, shape (r, m, n), whitened, with mu_0 projected out."""
+        many = (self.white @ many.reshape(-1, many.shape[2]).T).T.reshape(many.shape)
+        return many - (many @ self.column)[..., None] * self.column
+
+    def solve(self, nonlinear: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return mu_0 and a, shape (r, 2), the whitened residual, (r, n), and its derivative, (r, p - 2, n).
+
+        `nonlinear`, shape (r, p - 2), are all other parameters of the sets of values `of`, shape (r,).
+        """
+        law, measured = self.law, self.measured[of]
+        # The law with mu_0 = 0 and a = -1 is the loss.
+        unit = np.concatenate([np.tile([0.0, -1.0], (len(nonlinear), 1)), nonlinear], axis=1)
+        plain = law.slope(self.aged, unit)[:, 1:]
+        columns = self._whitened(plain)
+        square = (columns[:, :1] ** 2).sum(axis=2, keepdims=True)
+        sound = square > DEPENDENT * self.reach * (plain[:, :1] ** 2).max(axis=2, keepdims=True)
+        column = np.divide(columns[:, :1], np.sqrt(square), out=np.zeros(measured.shape), where=sound)
+        along = (measured * column).sum(axis=2, keepdims=True)
+        a = np.divide(along, np.sqrt(square), out=np.zeros(square.shape), where=sound)
+        slope = columns[:, 1:] - (columns[:, 1:] * column).sum(axis=2, keepdims=True) * column
+        mu_0 = ((self.values[of] - a[:, 0] * plain[:, 0]) @ self.level)[:, None]
+        return np.concatenate([mu_0, a[:, 0]], axis=1), (along * column - measured)[:, 0], -a * slope
+
+    def grid(self) -> np.ndarray:
+        """Return the best points of a grid, shape (POLISHED, p - 2)."""
+        own = self.law.loss.parameters
+        grids = [np.log(SHAPES[name]) for name in own]
+        grids += [ENERGIES if name == "E" else (0.0,) for name in self.law.names[LINEAR + len(own) :]]
+        points = np.array(list(product(*grids)))
+        rest = self.solve(points, np.zeros(len(points), int))[1]
+        return points[np.argsort((rest**2).sum(axis=1), kind="stable")[:POLISHED]]
+
+    def polished(self, nonlinear: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return all parameters, shape (r, p), and sums of squares, shape (r,), at the optima from starts."""
+        free = (-np.inf, np.inf)
+        own = self.law.loss.parameters
+        limits = [np.log(LIMITS[name]) if name in own else free for name in self.law.names[LINEAR:]]
+        low, high = np.reshape(limits, (-1, 2)).T
+        found, rss = levenberg_marquardt(lambda x, rows: self.solve(x, of[rows])[1:], nonlinear, low, high)
+        return np.concatenate([self.solve(found, of)[0], found], axis=1), rss
+
+
 def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> JointLaw:
     """Fit one law to all series of a quantity, and the scatter between specimens.
 
@@ -276,9 +353,8 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
             fix="Test more days, or choose a law with fewer parameters. Conditions where the value is not "
             "identified do not count; the report says why.",
         )
-    empty = JointLaw(
-        aged, shape, acts_on, names, np.zeros(len(names)), np.zeros((len(names),) * 2), 0.0, np.inf
-    )
+    unknown = np.zeros(len(names)), np.zeros((len(names),) * 2)
+    empty = JointLaw(aged, shape, acts_on, names, *unknown, 0.0, np.inf)
     x, scatter, before = None, 0.05, np.inf
     for _ in range(TURNS):
         x = solved(empty, aged, aged.whitening(scatter), x)
@@ -299,8 +375,7 @@ def fit_laws(aged: Aged, losses: Sequence[str] = tuple(LOSSES)) -> list[JointLaw
     """Return every law that the values determine, acting on rate and on loss, in order of BIC.
 
     Laws that leave fewer than `SPARE` degrees of freedom are left out if another leaves more: such a law
-    often passes through all values, and its scatter, and so its BIC, is far too small. FitError if they
-    determine none.
+    often passes through all values, and its BIC is far too small. FitError if they determine none.
     """
     found, first = [], None
     for loss in losses:
@@ -323,10 +398,7 @@ def rivals_of(laws: Sequence[JointLaw]) -> list[JointLaw]:
 
 
 def left_out(law: JointLaw) -> dict[str, float]:
-    """Return a law's RMS held-out error at whole series and at last days; NaN if none can be left out.
-
-    Each of up to `MOST_LEFT_OUT` series is left out in turn.
-    """
+    """Return a law's RMS held-out error at whole series and at last days; NaN if none can be left out."""
     aged, whole = law.aged, law.aged.whole_series()
     found = {}
     for name, masks in (("series", whole if len(whole) > 2 else []), ("last_day", aged.last_days())):

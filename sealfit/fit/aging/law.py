@@ -1,10 +1,8 @@
 """Eq. 15 fitted to the coefficients of many conditions: one law per curve, one unaged value for all curves.
 
 A curve is one quantity (mu_s or mu_c) of one series. Curves of a quantity share mu_0, so their values are
-fitted together by generalised least squares. ln b is first searched globally, curve by curve.
-
-Given mu_0, the series are independent: they are fitted one by one, many at once as arrays, and only mu_0 is
-fitted to all values (variable projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
+fitted together by generalised least squares. Given mu_0 the series are independent: a and b are eliminated
+series by series, many at once as arrays (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
 doi:10.1137/0710036). The cost is proportional to the number of series.
 """
 
@@ -33,9 +31,9 @@ from sealfit.fit.least_squares import (
 SOONEST, LATEST = 1e-9, 1e3
 # Grid points of b per decade. ln(1 + t/b) changes slowly over a decade of b.
 PER_DECADE = 8
-# Largest relative scatter. If a law is zero, no relative scatter explains its residuals.
+# Largest relative scatter; if a law is zero, no relative scatter explains its residuals.
 MOST_SCATTER = 1e6
-# Number of points along ln b at which the intervals of a and c are computed, and at which b is searched anew.
+# Points along ln b at which the intervals of a and c are computed, and at which b is searched anew.
 PROFILED, SCANNED = 17, 120
 # Directions of a and ln b with singular values below this share are not determined.
 DEPENDENT = 1e-10
@@ -70,7 +68,6 @@ def solve_law(days, value, weight) -> BatchFit:
     return global_optimum(Separable(basis, value, weight, (False, False)), even_grid(low, high, PER_DECADE))
 
 
-# ---------------------------------------------------------------- values
 @dataclass(frozen=True)
 class Values:
     """Measured values of one rubber; values of one condition are adjacent."""
@@ -80,10 +77,9 @@ class Values:
     origin: np.ndarray  # (n,) int: number of the value's mu_0
     curve: np.ndarray  # (n,) int: number of its curve, -1 for unaged rubber
     covariance: csr_array  # (n, n), or an array
-    # (n,), values to which the scatter between specimens is relative; None: the law's own
-    size: np.ndarray | None = None
-    # degrees of freedom of a covariance estimated from replicates, of differences between values and of their
-    # common level; 0 if it is known otherwise
+    size: np.ndarray | None = None  # (n,) values to which the scatter is relative; None: the law's own
+    # Degrees of freedom of a covariance estimated from replicates, of differences between values and of their
+    # common level; 0 if it is known otherwise.
     replicates_df: float = 0.0
     level_df: float = 0.0
 
@@ -141,15 +137,11 @@ class Values:
         """Return some of the values, with origins and curves renumbered."""
         curve = self.curve[keep]
         numbered = np.searchsorted(np.unique(curve[curve >= 0]), curve)
-        return replace(
-            self,
-            days=self.days[keep],
-            value=self.value[keep],
-            origin=np.unique(self.origin[keep], return_inverse=True)[1],
-            curve=np.where(curve >= 0, numbered, -1),
-            covariance=self.covariance[keep][:, keep],
-            size=None if self.size is None else self.size[keep],
-        )
+        origin = np.unique(self.origin[keep], return_inverse=True)[1]
+        size = None if self.size is None else self.size[keep]
+        given = {"days": self.days[keep], "value": self.value[keep], "origin": origin, "size": size}
+        curve, covariance = np.where(curve >= 0, numbered, -1), self.covariance[keep][:, keep]
+        return replace(self, **given, curve=curve, covariance=covariance)
 
     def scale(self, model: np.ndarray) -> np.ndarray:
         """Return the values to which the scatter is relative, shape (n,), given the law's."""
@@ -159,10 +151,10 @@ class Values:
 class EqualGroups:
     """Groups of values and of their curves, of one size each and independent given mu_0.
 
-    A group is a series with its correlated quantities, an unaged condition, or, if batches correlate
-    conditions, several of them. `rows`, shape (g, n), and `curves`, (g, w), are its values and curves,
-    ascending. Its p parameters are all mu_0, then a, then ln b of its curves; `places`, shape (g, p), are
-    their places among all parameters, and `bounds`, shape (2, g, p), their limits.
+    A group is a series with its correlated quantities, an unaged condition, or, if batches correlate them,
+    several. `rows`, shape (g, n), and `curves`, (g, w), are its values and curves, ascending. Its p
+    parameters are all mu_0, then a, then ln b of its curves; `places`, shape (g, p), are their places among
+    all parameters, and `bounds`, shape (2, g, p), their limits.
     """
 
     def __init__(self, values: Values, rows: np.ndarray, curves: np.ndarray) -> None:
@@ -173,10 +165,9 @@ class EqualGroups:
         shared = np.tile(np.arange(self.m), (len(rows), 1))
         self.places = np.hstack([shared, self.m + curves, self.m + values.curves + curves])
         self.size = self.m + 2 * values.curves
-        b = slice(self.m + self.width, None)
-        self.bounds = np.full((2, *self.places.shape), np.inf)  # of the parameters
+        self.bounds = np.full((2, *self.places.shape), np.inf)
         self.bounds[0] *= -1
-        self.bounds[:, :, b] = np.array(values.limits)[:, curves]
+        self.bounds[:, :, self.m + self.width :] = np.array(values.limits)[:, curves]
         row, column = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
         self.whitening = values.whitening[row.ravel(), column.ravel()].reshape(row.shape)
 
@@ -204,10 +195,7 @@ class EqualGroups:
         return (x[self.places] > self.bounds[0]) & (x[self.places] < self.bounds[1])
 
     def eliminated(self, x: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Return whitened derivatives with respect to mu_0 and a column, a and b eliminated, (g, m + 1, n).
-
-        `x`, shape (all,), are all parameters; `column`, shape (g, n), is any whitened column.
-        """
+        """Return whitened derivatives by mu_0 and a column, (g, n), less those by a and b, (g, m + 1, n)."""
         _, slope = self.at(x)
         columns = np.concatenate([slope[:, : self.m], column[:, None]], axis=1)
         if not self.width:
@@ -253,9 +241,8 @@ def law_model(values: Values, x: np.ndarray) -> np.ndarray:
 def fit_law(values: Values, start: np.ndarray | None = None) -> LawFit:
     """Return the global generalised least-squares fit of all curves together.
 
-    Every curve is first fitted alone (with the unaged values of its quantity). Then all are fitted together
-    from this start. Then each b is searched over its whole range with the other parameters fixed, until none
-    improves the fit. From `start`, the parameters of a fit to nearly the same values, the fit is only local.
+    Every curve is first fitted alone, then all together. Then each b is searched over its whole range until
+    none improves the fit. From `start`, the parameters of nearly the same values, the fit is only local.
     """
     if start is not None:
         return _polished(values, start)
@@ -276,10 +263,10 @@ def _polished(values: Values, start: np.ndarray) -> LawFit:
     groups, endless = values.groups, np.full(values.origins + values.curves, np.inf)
 
     def evaluate(x, _):
-        found = [own.at(x[0]) for own in groups]
+        rests, slopes = zip(*(own.at(x[0]) for own in groups), strict=True)
         slope = np.empty(1, object)
-        slope[0] = [one for _, one in found]
-        return np.concatenate([rest.ravel() for rest, _ in found])[None], slope
+        slope[0] = slopes
+        return np.concatenate([rest.ravel() for rest in rests])[None], slope
 
     low, high = np.r_[-endless, values.limits[0]], np.r_[endless, values.limits[1]]
     x, rss = levenberg_marquardt(evaluate, start[None], low, high, linear=_Eliminating(groups))
@@ -287,11 +274,7 @@ def _polished(values: Values, start: np.ndarray) -> LawFit:
 
 
 class _Eliminating(Linear):
-    """Products for one problem, whose derivatives are a list by groups.
-
-    A step eliminates a and b group by group, solves the remaining equations of mu_0 (Schur complement), and
-    substitutes back.
-    """
+    """Products for one problem, with derivatives by groups; a step is by a Schur complement of mu_0."""
 
     def __init__(self, groups: list[EqualGroups]) -> None:
         self.groups = groups

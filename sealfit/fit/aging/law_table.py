@@ -17,7 +17,7 @@ from sealfit.fit.steady import table_row
 
 # Tolerance of the ends of intervals in ln b: 0.1 % of b.
 CLOSE = 1e-3
-# The first step along ln b from the optimum outwards; each further step is twice as long.
+# First step along ln b from the optimum outwards; each further step is twice as long.
 FIRST_STEP = 0.25
 
 # b is not determined if the ends of its 95 % interval differ by more than this ratio.
@@ -33,16 +33,15 @@ NO_SCATTER = (
 
 
 # ---------------------------------------------------------------- other series
-# For one series all others are a Gaussian likelihood of mu_0: their laws are linearised, and their a and b
-# are eliminated (Schur complement). mu_0 hardly changes along the profile of a curve, so that the
-# linearisation is harmless. The cost is proportional to the number of series.
+# For one series all others are a Gaussian likelihood of mu_0: their laws are linearised, as mu_0 hardly
+# changes along a profile, and their a and b are eliminated (Schur complement). The cost is proportional to
+# the number of series.
 
 
 def elsewhere(fit: LawFit, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return what all other groups contribute to the normal matrix of mu_0 and a whitened column.
+    """Return what other groups add to the normal matrix of mu_0 and a whitened column, (g, m + 1, m + 1).
 
-    `columns`, shape (g, n) each, and the results, shape (g, m + 1, m + 1) each, are by `values.groups`. a and
-    b of the other groups are eliminated. Groups are independent, and their contributions add.
+    `columns`, shape (g, n) each, and the results are by `values.groups`.
     """
     pairs = zip(fit.values.groups, columns, strict=True)
     rows = [own.eliminated(fit.x, column) for own, column in pairs]
@@ -54,9 +53,9 @@ def elsewhere(fit: LawFit, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def likelihoods(fit: LawFit) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the likelihood of mu_0 from the other groups, by `values.groups`.
+    """Return the likelihood of mu_0 from other groups: R, shape (g, m + 1, m), and r, (g, m + 1), of each.
 
-    It is R, shape (g, m + 1, m), and r, (g, m + 1): their chi-square is |R (mu_0 - fitted) + r|^2.
+    Their chi-square is |R (mu_0 - fitted) + r|^2.
     """
     found = []
     for square in elsewhere(fit, fit.residuals):
@@ -67,10 +66,7 @@ def likelihoods(fit: LawFit) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def curve_errors(fit: LawFit, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance of mu_0, a and ln b of curves, (curves, 3, 3), and their shift, (curves, 3).
-
-    `moved`, shape (n,), is the change of the values that causes the shift.
-    """
+    """Return the covariance of mu_0, a and ln b of curves, (curves, 3, 3), and their shift by `moved`."""
     values, m = fit.values, fit.values.origins
     covariance, shift = np.zeros((values.curves, 3, 3)), np.zeros((values.curves, 3))
     white = values.whitening @ moved
@@ -93,21 +89,11 @@ def curve_errors(fit: LawFit, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def _of_mu_0(root: np.ndarray, p: int) -> np.ndarray:
     """Return the derivatives of R (mu_0 - fitted), shape (g, p, m + 1), with respect to p parameters."""
-    found = np.zeros((len(root), p, root.shape[1]))
-    found[:, : root.shape[2]] = np.swapaxes(root, 1, 2)
-    return found
+    return np.pad(np.swapaxes(root, 1, 2), ((0, 0), (0, p - root.shape[2]), (0, 0)))
 
 
-# ---------------------------------------------------------------- intervals
-@dataclass(frozen=True)
-class CurveInterval:
-    """95 % intervals of one curve; an open end is 0 or inf for b, -inf or inf for a and c."""
-
-    a: tuple[float, float]
-    b: tuple[float, float]
-    c: tuple[float, float]
-
-
+# 95 % intervals of a, b and c of one curve; an open end is 0 or inf for b, -inf or inf for a and c.
+CurveInterval = dict[str, tuple[float, float]]
 End = tuple[float, bool]  # of an interval of ln b, and whether it is open
 
 
@@ -115,8 +101,8 @@ def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterv
     """Return the profile-likelihood intervals of every curve.
 
     The interval of b is where the least chi-square at fixed ln b exceeds the minimum by at most the rise, t^2
-    of each quantity, shape (origins,). Those of a and c = -a ln b, which are linear in a at fixed b, are the
-    unions of their intervals over these b.
+    of each quantity, shape (origins,). Those of a and c = -a ln b are the unions of their intervals over
+    these b.
     """
     intervals: dict[int, CurveInterval] = {}
     for own, others in zip(fit.values.groups, likelihoods(fit), strict=True):
@@ -141,10 +127,10 @@ def _intervals(profile: _Profile, rise: np.ndarray) -> list[CurveInterval]:
 
 
 class _Profile:
-    """The profile of chi-square along ln b of one curve in each of some groups.
+    """The profile of chi-square along ln b of the curves at one `place` in groups of equal size.
 
-    `others` is the likelihood of mu_0 from all other groups, as in `likelihoods`, and `place` the number of
-    the curve within its group. `chi2` and `log_b`, shape (g,), are those of the joint optimum.
+    `others` is the likelihood of mu_0 from all other groups, as in `likelihoods`. `chi2` and `log_b`, shape
+    (g,), are those of the joint optimum.
     """
 
     def __init__(
@@ -207,18 +193,14 @@ def _interval(log_b: np.ndarray, a: np.ndarray, half: np.ndarray, low: End, high
     for name, factor in (("a", 1.0), ("c", -log_b)):
         middle, reach = factor * a, np.abs(factor) * half
         around[name] = [float((middle - reach).min()), float((middle + reach).max())]
-    signs = [end for end, reached in ((1, around["a"][1] > 0), (0, around["a"][0] < 0)) if reached]
-    for outer in signs:
+    for outer, reached in ((1, around["a"][1] > 0), (0, around["a"][0] < 0)):
         endless = np.inf if outer else -np.inf
-        if high[1]:  # a grows without bound with b
+        if reached and high[1]:  # a grows without bound with b
             around["a"][outer], around["c"][1 - outer] = endless, -endless
-        if low[1]:  # c grows without bound as b goes to 0
+        if reached and low[1]:  # c grows without bound as b goes to 0
             around["c"][outer] = endless
     b = (0.0 if low[1] else float(np.exp(low[0])), np.inf if high[1] else float(np.exp(high[0])))
-    return CurveInterval(tuple(around["a"]), b, tuple(around["c"]))
-
-
-# ---------------------------------------------------------------- rows
+    return {"a": tuple(around["a"]), "b": b, "c": tuple(around["c"])}
 
 
 @dataclass(frozen=True)
@@ -248,19 +230,15 @@ class OneQuantity:
         return (self.alone.values.whitening @ (self.alone.values.value - self.alone.model)) ** 2
 
     @property
-    def df(self) -> float:
-        """Degrees of freedom of the intervals of a, b and c: those of the scatter that they contain."""
-        return self.alone.df if self.tau > 0 else self.alone.values.replicates_df or self.alone.df
+    def t(self) -> float:
+        """Student's quantile of 95 % intervals of a, b and c, with the df of the scatter they contain."""
+        df = self.alone.df
+        return t_of_95(df if self.tau > 0 else self.alone.values.replicates_df or df)
 
     @property
     def level_df(self) -> float:
         """Degrees of freedom of the intervals of mu_0 and of the law's values."""
         return self.alone.df if self.tau > 0 else self.alone.values.level_df or self.alone.df
-
-    @property
-    def t(self) -> float:
-        """Student's quantile of 95 % intervals of a, b and c."""
-        return t_of_95(self.df)
 
 
 def t_of_95(df: float) -> float:
@@ -276,19 +254,21 @@ class Estimate:
     covariance: np.ndarray  # (3, 3) of x
     shift: np.ndarray  # (3,) change of x if the sensor reads one standard uncertainty too high
 
+    def error(self, gradient: list[float]) -> float:
+        """Return the standard error of a function of x with a gradient, shape (3,)."""
+        with np.errstate(invalid="ignore"):
+            return float(np.sqrt(np.array(gradient) @ self.covariance @ gradient))
+
     def error_of_c(self) -> float:
         """Return the standard error of c = -a ln b."""
-        gradient = np.array([0.0, -self.x[2], -self.x[1]])
-        with np.errstate(invalid="ignore"):
-            return float(np.sqrt(gradient @ self.covariance @ gradient))
+        return self.error([0.0, -self.x[2], -self.x[1]])
 
     def loss(self, days: float) -> tuple[float, float]:
         """Return the loss a ln(1 + t / b) up to a day, and its standard error."""
         _, a, u = self.x
         share = days * np.exp(-u)
-        gradient = np.array([0.0, np.log1p(share), -a * share / (1.0 + share)])
-        with np.errstate(invalid="ignore"):
-            return float(a * gradient[1]), float(np.sqrt(gradient @ self.covariance @ gradient))
+        lost = float(np.log1p(share))
+        return a * lost, self.error([0.0, lost, -a * share / (1.0 + share)])
 
 
 def law_rows(curve: SeriesCurve, found: Estimate, ends: CurveInterval, df: float) -> Iterator[dict]:
@@ -301,49 +281,40 @@ def law_rows(curve: SeriesCurve, found: Estimate, ends: CurveInterval, df: float
     of_mu_0 = (mu_0 - t * se[0], mu_0 + t * se[0])
     for name, value, error, systematic, (low, high) in (
         ("mu_0", mu_0, se[0], move[0], of_mu_0),
-        ("a", a, se[1], move[1], ends.a),
-        ("b", b, b * se[2], b * move[2], ends.b),
-        ("c", -a * u, found.error_of_c(), -u * move[1] - a * move[2], ends.c),
+        ("a", a, se[1], move[1], ends["a"]),
+        ("b", b, b * se[2], b * move[2], ends["b"]),
+        ("c", -a * u, found.error_of_c(), -u * move[1] - a * move[2], ends["c"]),
     ):
         yield table_row(
-            quantity=curve.quantity,
-            parameter=name,
-            value=value,
-            se=error,
-            lo95=None if name == "b" and low == 0.0 else low,
-            hi95=high,
-            u_sys=abs(systematic),
-            unit="d" if name == "b" else curve.unit,
-            identified=judged[name][0],
+            quantity=curve.quantity, parameter=name, value=value, se=error,
+            lo95=None if name == "b" and low == 0.0 else low, hi95=high, u_sys=abs(systematic),
+            unit="d" if name == "b" else curve.unit, identified=judged[name][0],
             reason=" ".join(filter(None, (judged[name][1], beside))),
-        ) | {"series": curve.series}
+        ) | {"series": curve.series}  # fmt: skip
 
 
 def _judge(curve: SeriesCurve, found: Estimate, ends: CurveInterval, t: float) -> dict[str, tuple[bool, str]]:
     verdict = dict.fromkeys(LAW, (True, ""))
     first, last, b = curve.days[0], curve.days[-1], float(np.exp(found.x[2]))
-    low, high = ends.b
+    low, high = ends["b"]
     loss, error = found.loss(last)
-    if ends.a[0] <= 0.0 <= ends.a[1] and abs(loss) > t * error:
+    if ends["a"][0] <= 0.0 <= ends["a"][1] and abs(loss) > t * error:
         why = f"all of the loss of {loss:.3g} up to {last:g} d may come before {first:g} d, and a may be 0: "
         why += "test earlier days."
         verdict["a"] = (False, why)
-    elif ends.a[0] <= 0.0 <= ends.a[1]:
+    elif ends["a"][0] <= 0.0 <= ends["a"][1]:
         why = f"no aging is seen up to {last:g} d: a may be 0, and b then has no meaning."
-        verdict["a"] = (bool(np.all(np.isfinite(ends.a))), why)
+        verdict["a"] = (bool(np.all(np.isfinite(ends["a"]))), why)
     elif np.isinf(high):
-        mean = f"{loss / last:.3g} per day"
-        why = f"the loss may be linear up to {last:g} d: only its mean, {mean}, is determined."
+        why = f"the loss may be linear up to {last:g} d: only its mean, {loss / last:.3g} per day, is "
+        why += "determined."
         verdict["a"] = (False, why)
     elif low == 0.0 or high > WIDE_B * low:
         span = f"from {low:.2g} to {high:.2g} d" if low > 0 else f"anything up to {high:.2g} d"
-        why = (
-            f"b may be {span}: it trades off with a and mu_0; "
-            f"tests before {max(min(high, first), 1e-3):.2g} d decide."
-        )
+        why = f"b may be {span}: it trades off with a and mu_0; tests before "
+        why += f"{max(min(high, first), 1e-3):.2g} d decide."
     else:
-        why = ""
-        remark = ""
+        why = remark = ""
         if b < first and curve.unaged:
             remark = f"below the first day tested ({first:g} d): it rests on the unaged rubber's value."
         elif b > last:
@@ -370,7 +341,7 @@ def without_law(curve: SeriesCurve) -> Iterator[dict]:
 def statistics_rows(curve: SeriesCurve, joint: LawFit, quantity: OneQuantity) -> Iterator[dict]:
     """Return the rows with the statistics of the fit of this curve."""
     part, squares, share, tau = quantity.part, quantity.squares, quantity.series, quantity.tau
-    values = joint.values
+    values, replicates = joint.values, joint.values.replicates_df
     own = values.curve == curve.place
     q = values.origin[own][0]
     unaged = (values.curve < 0) & (values.origin == q)
@@ -378,7 +349,6 @@ def statistics_rows(curve: SeriesCurve, joint: LawFit, quantity: OneQuantity) ->
     own_df = float(own.sum() - 2 + (unaged.sum() - 1) / share)
     shown = own | unaged
     error = (joint.model - values.value)[shown] / values.scale(values.value)[shown]
-    replicates = values.replicates_df
     p = np.nan
     if own_df > 0:
         p = float(fdtrc(own_df, replicates, chi2 / own_df) if replicates else chdtrc(own_df, chi2))
@@ -409,27 +379,15 @@ def statistics_rows(curve: SeriesCurve, joint: LawFit, quantity: OneQuantity) ->
         ("last_day", curve.days[-1], "d", ""),
     ):
         yield table_row(
-            quantity="statistics",
-            parameter=f"{name}:{statistic}",
-            value=value,
-            unit=its_unit,
-            reason=why,
+            quantity="statistics", parameter=f"{name}:{statistic}", value=value, unit=its_unit, reason=why
         ) | {"series": curve.series}
 
 
 def covariance_rows(curve: SeriesCurve, covariance: np.ndarray) -> Iterator[dict]:
     """Return the rows of table `aging_covariance`: the covariance of mu_0, a and ln b, shape (3, 3)."""
     names, units = ("mu_0", "a", "ln b"), (curve.unit, curve.unit, "")
-    for i in range(3):
-        for j in range(i + 1):
-            known = bool(np.isfinite(covariance[j, i]))
-            yield {
-                "series": curve.series,
-                "model": "before",
-                "quantity": curve.quantity,
-                "parameter": names[j],
-                "other": names[i],
-                "value": float(covariance[j, i]) if known else np.nan,
-                "unit": " ".join(f"({u})" for u in (units[j], units[i]) if u),
-                "identified": known,
-            }
+    for i, j in zip(*np.tril_indices(3), strict=True):
+        known = bool(np.isfinite(covariance[j, i]))
+        row = {"series": curve.series, "model": "before", "quantity": curve.quantity, "parameter": names[j]}
+        row |= {"other": names[i], "value": float(covariance[j, i]) if known else np.nan}
+        yield row | {"unit": " ".join(f"({u})" for u in (units[j], units[i]) if u), "identified": known}

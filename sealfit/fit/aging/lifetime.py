@@ -10,22 +10,18 @@ from scipy.optimize import brentq
 from scipy.special import ndtri, stdtr
 
 from sealfit.errors import RequestError
-from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw
-from sealfit.fit.aging.joint_least_squares import solved_many
+from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw, solved_many
 from sealfit.fit.joint.whitening import blockwise, whitening_of
 from sealfit.fit.least_squares import central_jacobian
 
-# ---------------------------------------------------------------- lifetime
 # The lifetime t of a joint law solves :math:`a\, k^w \varphi(k^{1-w} t) = \mu_0 - \mu^*`. Its interval is
-# that of ln t by the delta method with the full covariance of the law; `resampled` checks it by a parametric
-# bootstrap. ISO 11346 (rubber, estimation of life-time and maximum temperature of use) has a threshold
-# relative to the start.
+# that of ln t by the delta method; `resampled` checks it by a parametric bootstrap. ISO 11346 (rubber,
+# estimation of life-time and maximum temperature of use) has a threshold relative to the start.
 
 DAYS_PER_YEAR = 365.25
 # Range of temperatures of use in degrees Celsius.
 SPAN_C = (-80.0, 300.0)
-# Step in degrees Celsius of the search for the ends of a temperature interval, and number of bisections after
-# it.
+# Step in degrees Celsius of the search for the ends of a temperature interval, and bisections after it.
 STRIDE_C, HALVINGS = 2.0, 12
 # Range of the height in use, in percent of the original height; above 100 the rubber is stretched.
 SPAN_PCT = (1.0, 200.0)
@@ -36,8 +32,8 @@ USES = {
 }
 # Range of lifetimes in days. A law has no meaning beyond it.
 AT_ONCE, FOREVER = 1e-9, 1e9
-# Ends of a 95 % interval of drawn lifetimes, and the method of their quantiles, which inf does not disturb.
-ENDS, OF_DRAWS = (0.025, 0.975), "inverted_cdf"
+# Number of drawn lifetimes, ends of their 95 % interval, and the method of quantiles: they may be inf.
+DRAWS, ENDS, OF_DRAWS = 500, (0.025, 0.975), "inverted_cdf"
 
 
 @dataclass(frozen=True)
@@ -54,10 +50,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class DaysToThreshold:
-    """Days to a threshold, the 95 % interval, and the degree of extrapolation.
-
-    `days` is inf if the law does not reach the threshold, 0 if unaged rubber is beyond it.
-    """
+    """Days to a threshold, with 95 % interval: inf if it is not reached, 0 if unaged rubber is beyond it."""
 
     days: float
     low: float  # ends of the interval in days, inf if open
@@ -77,18 +70,9 @@ def lifetime(
 ):
     """Return the `DaysToThreshold` of rubber aged at a temperature and compression.
 
-    Parameters
-    ----------
-    law, goal : JointLaw, Goal
-        Fitted law, and end of life.
-    temperature_C, compression_ratio_pct : float, optional
-        Temperature in degrees Celsius and height in percent in use; needed if the tests varied them.
-
-    Raises
-    ------
-    RequestError
-        If one is missing that the law needs, given though the tests did not vary it, or out of the range of
-        use.
+    The temperature in degrees Celsius and the height in percent in use are needed if the tests varied them.
+    RequestError if one is missing that the law needs, given though the tests did not vary it, or out of the
+    range of use.
     """
     place = _place(law, temperature_C, compression_ratio_pct)
     days = _days(law, law.x, goal, place)
@@ -114,17 +98,16 @@ def over_laws(
     """Return the ends of the model-averaged 95 % interval of the lifetime, 0 or inf if open.
 
     The log lifetime of each law has a Student distribution, or that of values drawn anew where it is 0 or
-    inf; the weights are exp(-BIC/2). With few tests the law of least BIC is often not the true one, and its
-    own interval too short. The laws are fitted to the same values; the other arguments are those of
-    `lifetime`. Buckland, Burnham & Augustin 1997, Biometrics 53(2), 603-618, doi:10.2307/2533961.
+    inf; the weights are exp(-BIC/2), as the law of least BIC is often not the true one. Buckland, Burnham &
+    Augustin 1997, Biometrics 53(2), 603-618, doi:10.2307/2533961.
     """
     weights = np.exp(-0.5 * np.array([law.bic - min(one.bic for one in laws) for law in laws]))
     lives = [lifetime(law, goal, temperature_C, compression_ratio_pct) for law in laws]
     place = _place(laws[0], temperature_C, compression_ratio_pct)
-    drawn = [
+    drawn = (
         None if 0 < life.days < FOREVER else _drawn(law, goal, place)
         for law, life in zip(laws, lives, strict=True)
-    ]
+    )
     found = list(zip(weights / weights.sum(), laws, lives, drawn, strict=True))
 
     def share(log_days: float) -> float:
@@ -141,7 +124,7 @@ def over_laws(
 
     limits = np.log(1e-12), np.log(FOREVER)
     ends = []
-    for wanted in (0.025, 0.975):
+    for wanted in ENDS:
         if share(limits[0]) >= wanted:
             ends.append(0.0)
         elif share(limits[1]) < wanted:
@@ -203,33 +186,25 @@ def _outside(law: JointLaw, place: Aged) -> tuple[str, ...]:
 
 
 def resampled(
-    law: JointLaw,
-    goal: Goal,
-    temperature_C: float | None = None,
-    compression_ratio_pct: float | None = None,
-    *,
-    draws: int = 500,
-    seed: int = 1,
+    law: JointLaw, goal: Goal, temperature_C: float | None = None, compression_ratio_pct: float | None = None
 ) -> tuple[float, float]:
     """Return the ends of the 95 % interval of the lifetime by a parametric bootstrap.
 
-    Quantiles of the logarithm are multiplied by Student's over the normal quantile, as the scatter is an
-    estimate. `seed` is that of the random numbers.
+    Quantiles of the logarithm are multiplied by Student's over the normal one, as the scatter is an estimate.
     """
     place = _place(law, temperature_C, compression_ratio_pct)
-    found = _drawn(law, goal, place, draws, seed)
     days, wider = _days(law, law.x, goal, place), law.t / ndtri(0.975)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.log(np.quantile(found, ENDS, method=OF_DRAWS) / days)
+        ends = np.log(np.quantile(_drawn(law, goal, place), ENDS, method=OF_DRAWS) / days)
     low, high = days * np.exp(np.clip(ends * wider, -700, 700))
     return float(low) if low > AT_ONCE else 0.0, float(high) if high < FOREVER else np.inf
 
 
-def _drawn(law: JointLaw, goal: Goal, place: Aged, draws: int = 500, seed: int = 1) -> np.ndarray:
-    """Return lifetimes in days of fits to values drawn anew, shape (draws,)."""
+def _drawn(law: JointLaw, goal: Goal, place: Aged) -> np.ndarray:
+    """Return lifetimes in days of fits to values drawn anew, shape (DRAWS,)."""
     mean = law.at(law.aged)
     covariance = law.aged.covariance(law.scatter, mean)
-    normal = np.random.default_rng(seed).standard_normal((draws, mean.size))
+    normal = np.random.default_rng(1).standard_normal((DRAWS, mean.size))
     drawn = mean + normal @ blockwise(np.linalg.cholesky, covariance).T
     return np.array([_days(law, x, goal, place) for x in solved_many(law, whitening_of(covariance), drawn)])
 
@@ -239,17 +214,10 @@ def temperature_for(
 ) -> tuple[float, float, float]:
     """Return the temperature of use at which the lifetime is a number of years, and its 95 % interval.
 
-    Returns
-    -------
-    celsius, low, high : float
-        In degrees Celsius; celsius is inf if the lifetime is longer at all temperatures searched, -inf if
-        shorter. The interval contains the temperatures whose lifetime interval contains the years (Fieller's
-        method); an end that was not found is infinite.
-
-    Raises
-    ------
-    RequestError
-        If the rubber was aged at one temperature only, or the years are not positive.
+    It is inf in degrees Celsius if the lifetime is longer at all temperatures searched, -inf if shorter. The
+    interval contains the temperatures whose lifetime interval contains the years (Fieller's method); an end
+    that was not found is infinite. RequestError if the rubber was aged at one temperature only, or the years
+    are not positive.
     """
     if not 0 < years < np.inf:
         raise RequestError(f"--years {years:g} is no time to last.", fix="Give a number above 0.")
@@ -269,8 +237,7 @@ def temperature_for(
 
     ends = [longer(celsius) for celsius in SPAN_C]
     if ends[0] * ends[1] > 0:
-        always = np.inf if ends[0] > 0 else -np.inf
-        return always, -np.inf, np.inf
+        return np.inf if ends[0] > 0 else -np.inf, -np.inf, np.inf
     celsius = float(brentq(longer, *SPAN_C, xtol=1e-6))
     return celsius, _last(contains, celsius, SPAN_C[0]), _last(contains, celsius, SPAN_C[1])
 
@@ -289,13 +256,8 @@ def _last(contains: Callable[[float], bool], inside: float, limit: float) -> flo
     return float(direction * np.inf)
 
 
-# ---------------------------------------------------------------- lifetime answer
 def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
-    """Return the goal of a request.
-
-    RequestError if not exactly one of both is given, the threshold is no number, or the loss is no share of
-    the start.
-    """
+    """Return the goal of a request; RequestError unless exactly one of both is given, and in range."""
     if (threshold is None) == (loss_pct is None):
         raise RequestError(
             "what ends a life is not said." if threshold is None else "two ends of life were given.",
@@ -319,10 +281,9 @@ def answer(
     compression_ratio_pct: float | None = None,
     resample: bool = False,
 ) -> dict:
-    """Return a law's answer as plain values: the lifetime with its interval, or temperature for a lifetime.
+    """Return a law's lifetime with its interval, or with `years` the temperature for it, as plain values.
 
-    With `years` it is the temperature for this lifetime. With `resample` the interval is checked by
-    `resampled`. RequestError if the request cannot be answered: see `lifetime` and `temperature_for`.
+    With `resample` the interval is checked by `resampled`. RequestError as `lifetime` and `temperature_for`.
     """
     if years is not None and temperature_C is not None:
         raise RequestError(
@@ -341,23 +302,16 @@ def answer(
         tested = law.aged.temperature_C[law.aged.days > 0]
         low, high = float(tested.min()), float(tested.max())
         return found | {
-            "years": years,
-            "temperature_C": _finite(celsius),
-            "temperature_ci95": finite_ends(ends),
+            "years": years, "temperature_C": _finite(celsius), "temperature_ci95": finite_ends(ends),
             "always": None if np.isfinite(celsius) else "longer" if celsius > 0 else "shorter",
-            "extrapolated": not low <= celsius <= high,
-            "tested_C": [low, high],
-            "sought_C": list(SPAN_C),
-        }
+            "extrapolated": not low <= celsius <= high, "tested_C": [low, high], "sought_C": list(SPAN_C),
+        }  # fmt: skip
     life = lifetime(law, goal, temperature_C, compression_ratio_pct)
     found |= {
-        "threshold": life.threshold,
-        "days": _finite(life.days),
-        "ci95": finite_ends((life.low, life.high)),
-        "extrapolated": life.extrapolated,
-        "beyond_tests": _finite(life.beyond),
+        "threshold": life.threshold, "days": _finite(life.days), "ci95": finite_ends((life.low, life.high)),
+        "extrapolated": life.extrapolated, "beyond_tests": _finite(life.beyond),
         "outside": list(life.outside),
-    }
+    }  # fmt: skip
     if resample and 0 < life.days < FOREVER:
         found["ci95_resampled"] = finite_ends(resampled(law, goal, temperature_C, compression_ratio_pct))
     return found

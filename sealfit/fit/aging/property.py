@@ -1,7 +1,7 @@
 r"""The aging law of a property measured on specimens: strength, hardness, compression set, ...
 
-Specimens of one condition are replicates. Specimens scatter independently, and those of a batch have a
-deviation in common, which is no pure error: a specimen of condition c and batch b has
+Specimens of one condition are replicates. They scatter independently, and those of a batch have a deviation
+in common, which is no pure error: a specimen of condition c and batch b has
 
 .. math:: y = \mu(t_c) + B_b + \varepsilon, \qquad \mathrm{Var}\, B_b = \sigma_B^2, \quad
     \mathrm{Var}\, \varepsilon = \sigma^2
@@ -31,7 +31,7 @@ MOST_RATIO = 1e6
 ROUNDING = 1e-9
 # Smallest variance. It keeps the weights finite if all values are zero.
 TINY = 1e-300
-# Level of the test for values that are far off, of all values together (Bonferroni).
+# Level of the test for values that are far off, for all values together (Bonferroni).
 FAR_OFF = 0.001
 
 
@@ -39,7 +39,7 @@ FAR_OFF = 0.001
 class Means:
     """Means of one property of one rubber over specimens and batches, by condition.
 
-    Standard deviations are nan where these values do not determine them. Degrees of freedom are
+    Standard deviations are nan where the values do not determine them. Degrees of freedom are
     Satterthwaite's, and 0 without replicates.
     """
 
@@ -112,10 +112,7 @@ def _satterthwaite(share: float, df: tuple[int, int]) -> float:
 
 
 def _variances(specimens: pd.DataFrame) -> tuple[float, float, tuple[int, int]]:
-    """Return the variances between specimens and between batches, and their degrees of freedom.
-
-    A variance that the values do not determine is nan. The means of the conditions have no influence.
-    """
+    """Return the variances between specimens and batches, nan if not determined, and degrees of freedom."""
     value, condition, batch = specimens["value"].astype(float), specimens["condition"], specimens["batch"]
     df = len(value) - condition.nunique()
     left = (value - value.groupby(condition).transform("mean")).to_numpy(float)
@@ -177,10 +174,7 @@ def far_off(specimens: pd.DataFrame) -> pd.DataFrame:
 
 
 def fit_properties(specimens: pd.DataFrame, config: Config) -> dict[str, pd.DataFrame]:
-    """Return the tables of the laws of table `property_values`, for series and for all series.
-
-    The config names the condition columns.
-    """
+    """Return the tables of the laws of table `property_values`, for series and for all series."""
     series, aged, units = [], {}, {}
     for (rubber, quantity), own in specimens.groupby(["rubber", "quantity"], sort=True):
         means, units[quantity] = means_of(own), str(own["unit"].iloc[0])
@@ -192,10 +186,7 @@ def fit_properties(specimens: pd.DataFrame, config: Config) -> dict[str, pd.Data
 
 
 def laws_of_property(specimens: pd.DataFrame, quantity: str, name: str | None = None) -> list[JointLaw]:
-    """Return the laws of one property for all series in order of BIC, or only a named one.
-
-    Errors are those of `sealfit.fit.aging.all_series.law_of`.
-    """
+    """Return the laws of one property in order of BIC, or only a named one; errors are those of `law_of`."""
     groups = specimens.groupby(["rubber", "quantity"], sort=True)
     return laws_of({pair: means_of(own).aged() for pair, own in groups}, quantity, name)
 

@@ -11,19 +11,11 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
-from sealfit.fit import covariance_matrix
 from sealfit.fit.dynamic.bristle_model import Cells, RisingStroke, StribeckCurve, over_strokes
-from sealfit.fit.dynamic.presliding import (
-    AT,
-    Stiffness,
-    break_away_rows,
-    fit_stiffness,
-    largest_rows,
-    peaks,
-)
+from sealfit.fit.dynamic.presliding import AT, Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
 from sealfit.fit.dynamic.starts import Along, StrokeStart, starts_of, strokes_along, whole_strokes
 from sealfit.fit.joint.rows import nesting_run, records
-from sealfit.fit.steady import SteadyFit, condition_keys, parameter_units, table_row
+from sealfit.fit.steady import SteadyFit, condition_keys, covariance_matrix, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.tables import DYNAMIC_CURVES, DYNAMIC_FIT
 
@@ -51,25 +43,24 @@ def bristle_rows(
 ) -> Iterator[dict]:
     """Yield rows of table `dynamic_fit` for one condition: sigma_0, sigma_1 and statistics of the fit.
 
-    `found` is None if no stroke has a recorded start; `braked` is whether the sliding force of every stroke
-    opposes its motion.
+    `found` is None without a recorded start; `braked` is whether all sliding forces oppose the motion.
     """
-    units = dynamic_units(config)
+    units = config.units
+    unit_0 = f"{units.unit('force')}/{units.unit('displacement')}"
+    unit_1 = parameter_units(units, has_load=True)["sigma_2"]
     if found is None or not found.seen:
         reason = TOO_FAST if found is not None else NO_START if braked else ALONG
-        for name in ("sigma_0", "sigma_1"):
-            yield table_row(
-                quantity="dynamic", parameter=name, unit=units[name], identified=False, reason=reason
-            )
+        for name, unit in (("sigma_0", unit_0), ("sigma_1", unit_1)):
+            row = {"quantity": "dynamic", "parameter": name, "unit": unit}
+            yield table_row(**row, identified=False, reason=reason)
         return
-    yield _stiffness_row(found, curve, units["sigma_0"], config)
-    yield _damping_row(found, curve, units["sigma_1"])
-    rise = curve.coulomb_N / found.sigma_0
+    yield _stiffness_row(found, curve, unit_0, config)
+    yield _damping_row(found, curve, unit_1)
     for name, value, unit in (
-        ("rise", rise, config.units.unit("displacement")),
+        ("rise", curve.coulomb_N / found.sigma_0, units.unit("displacement")),
         ("samples_in_rise", found.within, ""),
         ("files", found.files, ""),
-        ("rmse", found.rmse_N, config.units.unit("force")),
+        ("rmse", found.rmse_N, units.unit("force")),
     ):
         yield table_row(quantity="statistics", parameter=name, value=value, unit=unit)
 
@@ -104,15 +95,6 @@ def _damping_row(found: Stiffness, curve: StribeckCurve, unit: str) -> dict:
     return table_row(**row, identified=False, reason=reason)
 
 
-def dynamic_units(config: Config) -> Mapping[str, str]:
-    """Return the units of sigma_0 and sigma_1 under the config's units."""
-    units = config.units
-    return {
-        "sigma_0": f"{units.unit('force')}/{units.unit('displacement')}",
-        "sigma_1": parameter_units(units, has_load=True)["sigma_2"],
-    }
-
-
 # ---------------------------------------------------------------- dynamic
 # Columns of table `traces` that are read.
 OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]
@@ -126,31 +108,17 @@ def fit_dynamic(
     *,
     workers: int = 1,
 ) -> dict[str, pd.DataFrame]:
-    """Fit sigma_0 and sigma_1 of Eqs. 1 to 7 to the pre-sliding part of every condition's strokes.
+    """Return tables `dynamic_fit` and `dynamic_curves`: sigma_0 and sigma_1 of Eqs. 1 to 7 by condition.
 
-    Parameters
-    ----------
-    traces : DataFrame or sequence of StoredTraces
-        Table `traces`, or its stored partitions, which are read one at a time.
-    steady : DataFrame
-        Table `steady` or `steady_after`; rows with `used` false are left out.
-    steady_fit : dict of DataFrame
-        Its fits, with the Stribeck curve of each condition; a curve that is not identified is flat.
-    config : Config
-        Names the condition columns, the units and the sensor's accuracy.
-    workers : int
-        Number of processes.
+    They are fitted to the pre-sliding part of its strokes. `traces` is table `traces`, or its stored
+    partitions, which are read one at a time; rows of `steady` with `used` false are left out; a Stribeck
+    curve that is not identified in `steady_fit` is flat.
 
-    Returns
-    -------
-    dict of DataFrame
-        Tables `dynamic_fit`, with the condition columns, and `dynamic_curves`, the mean starts, measured and
-        fitted. In `dynamic_fit` `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed
-        and direction: the force, and its ratio to the sliding force), "largest" (likewise: ratio of the
-        largest force in the strokes to the sliding force) or "statistics".
+    In `dynamic_fit` `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed and
+    direction: the force, and its ratio to the sliding force), "largest" (likewise: ratio of the largest force
+    in the strokes to the sliding force) or "statistics". `dynamic_curves` has the mean starts, measured and
+    fitted.
 
-    Notes
-    -----
     The unit of evidence is the file for the length of the rise and the run for the level of the force; it is
     the stroke if there is only one file or run. Intervals of sigma_0 are symmetric in its logarithm. `u_sys`
     assumes one unknown error of |force| for all samples.
@@ -160,11 +128,11 @@ def fit_dynamic(
     asked = _asked(traces, steady, _curves(steady, steady_fit))
     found = run_map(partial(_fit_some, config=config), asked, workers=workers)
     rows, curves, broken, largest = (_together(tables) for tables in zip(*found, strict=True))
-    tables = [
-        rows,
-        largest_rows(largest, config) if len(largest) else largest,
-        break_away_rows(broken, _widened(steady_fit["steady_fit"]), config) if len(broken) else broken,
-    ]
+    tables = [rows]
+    if len(largest):
+        tables.append(largest_rows(largest, config))
+    if len(broken):
+        tables.append(break_away_rows(broken, _widened(steady_fit["steady_fit"]), config))
     keys = condition_keys(steady, config)
     table = pd.concat([part for part in tables if len(part)], ignore_index=True)
     table = table.merge(keys, on="condition", how="left", validate="many_to_one").assign(model="before")
@@ -247,22 +215,14 @@ def _mean_start(cells: Cells, models: Sequence[np.ndarray] | None) -> pd.DataFra
     """Return the mean start, measured and, if there is a fit, modelled, as rows of `dynamic_curves`."""
     force, error, n = over_strokes(cells.force_N)
     model = over_strokes(cells.means(models))[0] if models else np.full(n.shape, np.nan)
-    table = {
-        "distance_mm": cells.middle_mm,
-        "force_N": force,
-        "force_se_N": error,
-        "n": n,
-        "model_N": model,
-    }
-    return pd.DataFrame(table)[n > 0]
+    columns = {"force_N": force, "force_se_N": error, "n": n, "model_N": model}
+    return pd.DataFrame({"distance_mm": cells.middle_mm, **columns})[n > 0]
 
 
 def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
     """Return the reduced chi-square of all conditions' run means under the repeats' scatter, and its df."""
     rows = steady_fit[steady_fit["quantity"] == "statistics"]
-    table = rows[rows["parameter"].isin(["chi2", "df"])].pivot(
-        index="condition", columns="parameter", values="value"
-    )
+    table = rows.pivot(index="condition", columns="parameter", values="value")
     table = table.reindex(columns=["chi2", "df"]).dropna()
     df = float(table["df"].sum())
     return (float(table["chi2"].sum()) / df, df) if df > 0 else (1.0, 1.0)
@@ -271,10 +231,9 @@ def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
 def _evidence(
     starts: Sequence[StrokeStart], steady: pd.DataFrame, curve: StribeckCurve
 ) -> list[RisingStroke]:
-    """Return the starts of a condition with their units of evidence and their ratio to the curve.
+    """Return the starts of a condition with units of evidence and their ratio to the curve.
 
-    The ratio is that of the loads, or of the sliding forces if the curve is not determined. `steady` has the
-    row of each start.
+    It is that of the loads, or of the sliding forces if the curve is not determined, by rows of `steady`.
     """
     size = steady["load_N" if curve.known else "size_N"].to_numpy(float)
     known = size[~np.isnan(size)]
@@ -310,10 +269,7 @@ def _curves(steady: pd.DataFrame, steady_fit: SteadyFit) -> dict[str, StribeckCu
 def _curve(
     values: Mapping[str, float], covariances: Mapping[tuple[str, str], float], steady: pd.DataFrame
 ) -> StribeckCurve:
-    """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified.
-
-    `values` are identified parameters and statistics by name, `covariances` those of pairs of parameters.
-    """
+    """Return a condition's Stribeck curve under its mean load; flat at its median force if not identified."""
     load = steady["load_N"].mean(skipna=False)
     sigma_2 = max(float(values.get("sigma_2", 0.0)), 0.0)
     for static, coulomb, factor in (("mu_s", "mu_c", load), ("F_s", "F_c", 1.0)):
@@ -321,9 +277,7 @@ def _curve(
         if None not in known:
             unit = np.array([factor, factor, 1.0, 1.0])
             covariance = covariance_matrix(covariances, (static, coulomb, "v_s", "sigma_2"))
-            parameters = unit * [*known, sigma_2]
-            return StribeckCurve(
-                *parameters.tolist(), covariance * np.outer(unit, unit), int(values.get("df", 1))
-            )
+            covariance = covariance * np.outer(unit, unit)
+            return StribeckCurve(*(unit * [*known, sigma_2]).tolist(), covariance, int(values.get("df", 1)))
     flat = float(np.median(steady["size_N"] - sigma_2 * steady["speed_mm_s"].abs()))
     return StribeckCurve(flat, flat, np.inf, sigma_2)

@@ -17,10 +17,9 @@ MOST_CELLS = 200
 
 
 class Cells:
-    """Cells of distance for strokes of one condition, commanded speed and direction.
+    """Cells of distance for strokes of a condition, commanded speed and direction, to their median reach.
 
-    They extend to the median distance of the strokes, `reach_mm`. Their number, `count`, is the median number
-    of samples of a stroke, `samples`, at most MOST_CELLS; `middle_mm`, shape (cells,), are their midpoints.
+    `count` is the median number of samples of a stroke, `samples`, at most MOST_CELLS.
     """
 
     def __init__(self, parts: Sequence[StrokePart]) -> None:
@@ -43,10 +42,7 @@ class Cells:
 
 
 def over_strokes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean over strokes in each cell, its standard error and their number, shape (cells,) each.
-
-    `values`, shape (strokes, cells), are NaN if missing.
-    """
+    """Return the mean over strokes of values, (strokes, cells), its standard error and number, (cells,)."""
     there = np.isfinite(values)
     n = there.sum(axis=0)
     mean = np.where(n > 0, np.where(there, values, 0.0).sum(axis=0) / np.maximum(n, 1), np.nan)
@@ -61,14 +57,12 @@ STIFFNESSES = 40
 DAMPINGS = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0])
 # Samples between these shares of the rise determine its length.
 SHARE = (0.02, 0.98)
-# Damping is distinguishable if more than this share of its sum of squares remains after projection off the
-# level and the initial force of the strokes. At constant speed nothing remains, otherwise about the square of
-# the relative variation of the speed. 1e-4: a variation of 1 %.
+# Least share of the damping's sum of squares that other parameters of strokes do not explain: about the
+# square of the relative variation of the speed, here 1 %.
 DISTINCT = 1e-4
 # Number of rise lengths after which the exponential is zero; larger exponents overflow.
 FAR = 500.0
-# Level and start are not distinguishable if the determinant of their normal equations is below this share of
-# the product of its diagonal.
+# Level and start are distinguishable if the determinant of their Gram matrix, scaled, is above this.
 APART = 1e-10
 
 
@@ -104,10 +98,7 @@ class StribeckCurve:
         return bool(np.isfinite(self.v_s))
 
     def moved(self) -> Iterator[StribeckCurve]:
-        """Yield the curve changed by one standard deviation along each principal axis of its covariance.
-
-        Each keeps at least a tenth of its value, as the model needs them positive.
-        """
+        """Yield the curve one standard deviation off along each principal axis; values stay above a tenth."""
         size = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         unit = np.where(size > 0, size, 1.0)
         variance, axes = np.linalg.eigh(self.covariance / np.outer(unit, unit))
@@ -121,17 +112,13 @@ class StribeckCurve:
         """Return G, the bristle force in steady sliding in N, shape of the speed."""
         if not self.known:
             return np.full(np.shape(speed_mm_s), self.coulomb_N)
-        return bristle_limit(
-            speed_mm_s, 1.0, mu_s=self.static_N, mu_c=self.coulomb_N, v_s=self.v_s, sigma_0=1.0
-        )
+        mu = {"mu_s": self.static_N, "mu_c": self.coulomb_N}
+        return bristle_limit(speed_mm_s, 1.0, **mu, v_s=self.v_s, sigma_0=1.0)
 
 
 @dataclass(frozen=True)
 class BristleTangent:
-    """Residual of the forces at (log sigma_0, tau), and its derivative; strokes are padded with zeros.
-
-    The linear parameters, `level` and `begin`, are at their optimum.
-    """
+    """Residual of the forces at (log sigma_0, tau), with optimal linear parameters, and its derivative."""
 
     level: np.ndarray  # (strokes,) force relative to the curve
     begin: np.ndarray  # (strokes,) bristle force at the start, in N
@@ -202,10 +189,7 @@ class Rises:
         return inverse, linear, self.force - (linear * both).sum(axis=1)
 
     def tangent(self, at: np.ndarray) -> BristleTangent:
-        """Return the residual at (log sigma_0, tau), and its derivative.
-
-        The derivative of the linear parameters is that of their normal equations (Golub and Pereyra 1973).
-        """
+        """Return the residual at (log sigma_0, tau) with optimal linear parameters, and its derivative."""
         (columns, slopes), tau = self._columns(float(np.exp(at[0])), slopes=True), float(at[1])
         both = columns[0] + tau * columns[1]
         inverse, linear, residual = self._solved(both)
@@ -224,10 +208,7 @@ class Rises:
         return float(at.normal[:, 1, 1].sum()) > DISTINCT * float((effect**2).sum())
 
     def best_of_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the best point of a grid, (log sigma_0, tau), and its lower and upper bounds, shape (2, 2).
-
-        tau is 0 if the damping is not distinguishable.
-        """
+        """Return the best point of a grid, (log sigma_0, tau), and bounds, (2, 2); tau is 0 if not seen."""
         level = float(np.median(self.limit[self.there]))
         steps = self.step[self.step > 0]
         lengths = np.geomspace(0.3 * np.median(steps), self.step.sum(axis=1).max(), STIFFNESSES)
@@ -251,8 +232,7 @@ class Rises:
 
     def gain_of(self, rss: float) -> float:
         """Return the fall of the rss from a force that is constant after one row, in residual variances."""
-        there = self.there[:, 1:]
-        force = self.force[:, 1:]
+        there, force = self.there[:, 1:], self.force[:, 1:]
         mean = force.sum(axis=1) / there.sum(axis=1)
         flat = float((((force - mean[:, None]) * there) ** 2).sum())
         rounding = 1e-20 * float((force**2).sum())
@@ -287,12 +267,11 @@ def _followed(slid: np.ndarray, added: np.ndarray, begin: np.ndarray | float = 0
     overflow, the rows are split in two halves. s >= 0 and a have the shape (strokes, rows).
     """
     far = np.cumsum(slid, axis=-1)
-    rows = slid.shape[-1]
-    if far[..., -1].max() > FAR and rows > 1:
-        first = _followed(slid[..., : rows // 2], added[..., : rows // 2], begin)
-        return np.concatenate(
-            [first, _followed(slid[..., rows // 2 :], added[..., rows // 2 :], first[..., -1:])], axis=-1
-        )
+    half = slid.shape[-1] // 2
+    if far[..., -1].max() > FAR and half:
+        first = _followed(slid[..., :half], added[..., :half], begin)
+        last = _followed(slid[..., half:], added[..., half:], first[..., -1:])
+        return np.concatenate([first, last], axis=-1)
     grown = np.exp(np.minimum(far, FAR))
     return (begin + np.cumsum(added * grown, axis=-1)) / grown
 

@@ -1,19 +1,18 @@
 r"""What happens before steady sliding: sigma_0, sigma_1 and the break-away force.
 
-One pair of sigma_0 and sigma_1 is fitted to the pre-sliding part of the strokes of a condition.
-Over a stroke the bristles' force :math:`B = \sigma_0 z` follows Eqs. 2 and 6 exactly, step by step of the
-distance x,
+One pair of sigma_0 and sigma_1 is fitted to the pre-sliding part of the strokes of a condition. Over a stroke
+the bristles' force :math:`B = \sigma_0 z` follows Eqs. 2 and 6 exactly, step by step of the distance x,
 
 .. math::
     \frac{dB}{dx} = \sigma_0 \Big(1 - \frac{B}{G}\Big), \quad F = B + \tau \dot B + \sigma_2 v, \quad
     G = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}], \quad \tau = \sigma_1 / \sigma_0,
 
-with the Stribeck curve G of the condition's steady fit. B is linear in its initial value. Each stroke has two
-linear parameters, its level and its initial bristle force (0, or negative after a reversal), which are solved
-for exactly. sigma_0 and tau are searched on a grid and refined (Golub and Pereyra 1973, SIAM J. Numer. Anal.
-10(2), 413-432, doi:10.1137/0710036). The rise determines the length G / sigma_0; its unit of evidence is the
-file, as neighbouring samples are correlated. The level of the strokes converts it to a stiffness; its unit of
-evidence is the run, as a set-up shifts all files of a run.
+with the Stribeck curve G of the condition's steady fit. Each stroke has two linear parameters, its level and
+its initial bristle force (0, or negative after a reversal), which are solved for exactly. sigma_0 and tau are
+searched on a grid and refined (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10(2), 413-432,
+doi:10.1137/0710036). The unit of evidence of the length of the rise, G / sigma_0, is the file, as
+neighbouring samples are correlated; that of the level of the strokes is the run, as a set-up shifts all files
+of a run.
 """
 
 from __future__ import annotations
@@ -35,14 +34,12 @@ from sealfit.fit.least_squares import levenberg_marquardt
 LEAST = 3
 # Fall of the sum of squares by the rise, in residual variances, that an estimate needs.
 RISES = 30.0
-# A fit disagrees with the data if its RMS residual exceeds these multiples of the noise and of the sliding
-# force.
+# A fit disagrees with the data if its RMS residual exceeds these multiples of noise and sliding force.
 MISSED_NOISE, MISSED_LEVEL = 2.0, 0.03
 # Half-width of the 95 % interval of log sigma_0 from which sigma_0 is not determined.
 OPEN = np.log(3.0)
 
-# Width of the window over which a peak is averaged, the larger of a number of samples and a share of the
-# distance.
+# Window over which a peak is averaged, the larger of a number of samples and a share of the distance.
 SAMPLES, SHARE = 8, 1 / 40
 # Family-wise error rate of the test for a peak in a campaign.
 FAMILY = 0.01
@@ -56,15 +53,9 @@ NO_PEAK = "the force comes up to its sliding value without passing above it"
 FEW = "no repeats: no scatter is known"
 
 
-# ---------------------------------------------------------------- stiffness and damping
-
-
 @dataclass(frozen=True)
 class Stiffness:
-    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s, with their scatter between units.
-
-    tau is NaN if the damping is not distinguishable from the level and initial force of the strokes.
-    """
+    """sigma_0 in N/mm and tau = sigma_1 / sigma_0 in s; tau is NaN if the damping is not distinguishable."""
 
     sigma_0: float
     tau_s: float
@@ -117,10 +108,7 @@ class Stiffness:
 
 
 def fit_stiffness(strokes: Sequence[RisingStroke], curve: StribeckCurve) -> Stiffness | None:
-    """Return sigma_0 and tau of the strokes of a condition; None without strokes.
-
-    `strokes` are all that start at rest or at a reversal, and `curve` is the condition's Stribeck curve.
-    """
+    """Return sigma_0 and tau of all strokes of a condition that start at rest or a reversal; None without."""
     if not strokes:
         return None
     rises = Rises(strokes, curve)
@@ -144,15 +132,12 @@ def fit_stiffness(strokes: Sequence[RisingStroke], curve: StribeckCurve) -> Stif
     by_files, df = _between_files(found, inverse, rises.file)
     by_level = float(level.var(ddof=1) / level.size) if level.size > 1 else np.nan
     by_curve = np.array(shifts).T @ np.array(shifts) if shifts else np.zeros((2, 2))
-    parts = (
-        (np.diag(by_files), df),
-        (np.array([by_level, 0.0]), level.size - 1),
-        (np.diag(by_curve), curve.df),
-    )
+    level_variance = np.array([by_level, 0.0])
+    parts = (np.diag(by_files), df), (level_variance, level.size - 1), (np.diag(by_curve), curve.df)
     return Stiffness(
         sigma_0=float(np.exp(x[0] + level.mean())),
         tau_s=float(x[1]) if damped else np.nan,
-        covariance=by_files + np.diag([by_level, 0.0]) + by_curve,
+        covariance=by_files + np.diag(level_variance) + by_curve,
         df=together(parts),
         gain=rises.gain_of(found.rss),
         within=rises.inside(float(np.exp(x[0])), found.level, found.begin),
@@ -183,8 +168,7 @@ def _between_files(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the cluster-robust covariance of estimates, shape (p, p), and degrees of freedom, shape (p,).
 
-    It is the jackknife over files (CR3). The degrees of freedom depend on the leverages of the files.
-    `inverse` is that of J'J, and `file`, shape (strokes,), the number of each stroke's file.
+    It is the jackknife over files (CR3). `inverse` is that of J'J; `file` has the number of strokes' files.
     """
     files, p = int(file.max()) + 1, len(inverse)
     if files < 2:
@@ -200,22 +184,16 @@ def _between_files(
     return covariance, df
 
 
-# ---------------------------------------------------------------- break-away
-# The peak of the force before steady sliding, per commanded speed and direction.
-
-
 def peaks(cells: Cells, file: np.ndarray) -> pd.DataFrame:
-    """Return the break-away force F_ba and its ratio to the sliding force, per unit of evidence.
+    """Return the break-away force F_ba and its ratio to the sliding force, a row per unit of evidence.
 
     A unit is a file, or a stroke of a single file; `file`, shape (n,), is the number of the file in each row
     of table `steady`. The sliding force is extrapolated to the peak along the line through the beginning of
     steady sliding, so that warming along the stroke does not count as break-away. The position of the peak is
-    taken from the mean of the other units, and the force of a start is read there, as the maximum of noisy
-    samples is biased. For the test for a peak, `top` is the force above sliding where the mean of all units
-    is largest, `noise` its standard error in units of that of a sample, and `places` the number of positions;
-    `F` is the sliding force.
-
-    The table has one row per unit; units with an unknown value are left out.
+    that of the mean of the other units, as the maximum of noisy samples is biased. For the test for a peak,
+    `top` is the force above sliding where the mean of all units is largest, `noise` its standard error in
+    units of that of a sample, and `places` the number of positions; `F` is the sliding force. Units with an
+    unknown value are left out.
     """
     half = int(np.ceil(cells.count * max(SAMPLES / cells.samples, SHARE) / 2))  # of the window, in cells
     lines = np.array([astuple(part.sliding) for part in cells.parts], float)
@@ -255,11 +233,7 @@ def peaks(cells: Cells, file: np.ndarray) -> pd.DataFrame:
 
 
 def _highest(above: np.ndarray, hits: np.ndarray) -> int:
-    """Return the cell in which the mean force above sliding of strokes is largest.
-
-    `above` and `hits`, shape (strokes, cells), are the sum of the force above sliding over a window about
-    each cell, and the number of cells in the sum.
-    """
+    """Return the cell in which the mean of sums of the force above sliding, of `hits` samples, is largest."""
     total, count = above.sum(axis=0), hits.sum(axis=0)
     sure = count > count.max() / 2  # means of fewer cells are too noisy
     return int(np.argmax(np.where(sure, total / np.maximum(count, 1), -np.inf)))
@@ -291,9 +265,8 @@ def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: C
     groups = [found[name] for name in AT]
     spread, df = _pooled(pd.DataFrame(shares), groups)
     table = pd.DataFrame({name: found[name] for name in (FORCE, TOP, NOISE, PLACES)})
-    table = table.assign(**{f"log {name}": logs[name] for name in (FORCE, RATIO)}).groupby(
-        groups, dropna=False, sort=False
-    )
+    table = table.assign(**{f"log {name}": logs[name] for name in (FORCE, RATIO)})
+    table = table.groupby(groups, dropna=False, sort=False)
     n, places, mean = table.size().to_numpy(), float(table[PLACES].first().sum()), table.mean()
     setup = max(widened[0] - 1, 0.0) * spread[SLIDING] ** 2
     error = spread[TOP] * mean[NOISE].to_numpy() / np.sqrt(n)
@@ -319,27 +292,17 @@ def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: C
 
 
 def largest_rows(found: pd.DataFrame, config: Config) -> pd.DataFrame:
-    """Return rows of table `dynamic_fit` for the largest force in strokes over their sliding force.
+    """Return rows of table `dynamic_fit` for the largest force in whole strokes over their sliding force.
 
-    It may be at the end of a stroke as well as at its start, so it is no break-away; `reason` has its
-    position. `found` is the result of `peaks` for whole strokes, with condition, commanded speed and
-    direction.
+    It may be at the end of a stroke; `reason` has its position. `found` is the result of `peaks`.
     """
     groups = found.assign(**{RATIO: np.log(found[RATIO])}).groupby(AT, dropna=False, sort=False)
     table = groups.agg({RATIO: "mean", WHERE: "first", REACH: "first"}).reset_index()
     unit = config.units.unit("displacement")
-    reason = [
-        INTO.format(where=where, reach=reach, unit=unit)
-        for where, reach in zip(table[WHERE], table[REACH], strict=True)
-    ]
-    row = {
-        "quantity": "largest",
-        "parameter": LARGEST,
-        "value": np.exp(table[RATIO]),
-        "unit": "",
-        "identified": True,
-    }
-    return table[AT].assign(**row, reason=reason)
+    places = zip(table[WHERE], table[REACH], strict=True)
+    reason = [INTO.format(where=where, reach=reach, unit=unit) for where, reach in places]
+    row = {"quantity": "largest", "parameter": LARGEST, "value": np.exp(table[RATIO]), "unit": ""}
+    return table[AT].assign(**row, identified=True, reason=reason)
 
 
 def _pooled(values: pd.DataFrame, groups: Sequence[pd.Series]) -> tuple[dict[str, np.ndarray], np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +15,7 @@ from sealfit.ingest.stored_parts import noise_from_bends, stroke_index, strokes_
 
 # Starting values of the length of a ramp, in time steps.
 RAMPS = np.geomspace(0.5, 200.0, 12)
-# The rows of every stroke are padded to a multiple of this, so that sums do not depend on the strokes fitted
-# together.
+# Rows of strokes are padded to a multiple of this, so that sums do not depend on the strokes fitted together.
 PADDED = 64
 # Largest number of rows fitted together.
 TOGETHER = 16_384
@@ -42,10 +41,6 @@ class _PaddedRows:
     along: np.ndarray
     there: np.ndarray
 
-    @classmethod
-    def of(cls, time: np.ndarray, along: np.ndarray, there: np.ndarray) -> _PaddedRows:
-        return cls(time, cls(time, along, there).centred(along), there)
-
     def some(self, strokes: np.ndarray) -> _PaddedRows:
         return _PaddedRows(self.time[strokes], self.along[strokes], self.there[strokes])
 
@@ -62,9 +57,8 @@ def fit_ramps(
 
     A local speed is too noisy where the speed changes most; the two parameters of a ramp, beginning and
     length, use all samples. Position and final speed are linear and solved for exactly (variable projection:
-    Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995). Beginning and length are fitted by
-    Levenberg-Marquardt from the best of a grid. Displacements are positive along the motion; `paces_mm_s` are
-    approximate final speeds.
+    Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995). Displacements are positive along the motion;
+    `paces_mm_s` are approximate final speeds.
     """
     made: list[Ramp | None] = [None] * len(times_s)
     of_length: dict[int, list[int]] = {}
@@ -73,10 +67,8 @@ def fit_ramps(
     for rows, members in of_length.items():
         size = max(TOGETHER // rows, 1)
         for group in (members[i : i + size] for i in range(0, len(members), size)):
-            fitted = _fit_some(
-                *([values[k] for k in group] for values in (times_s, alongs_mm, paces_mm_s)), rows
-            )
-            for k, ramp in zip(group, fitted, strict=True):
+            own = ([values[k] for k in group] for values in (times_s, alongs_mm, paces_mm_s))
+            for k, ramp in zip(group, _fit_some(*own, rows), strict=True):
                 made[k] = ramp
     return made
 
@@ -93,32 +85,26 @@ def _fit_some(
     # Time at which a start at full speed would have given the same displacement.
     each, last = np.arange(len(sizes)), sizes - 1
     lagged = time[each, last] - (along[each, last] - along[:, 0]) / paces_mm_s
-    padded = _PaddedRows.of(time, along, there)
-    fits = [
-        _fit_shape(padded, shape, lagged, lag, step) for shape, lag in ((_straight, 0.5), (_lagging, 1.0))
-    ]
+    padded = _PaddedRows(time, along, there)
+    padded = replace(padded, along=padded.centred(along))
+    fits = [_fit_shape(padded, *shape, lagged, step) for shape in ((_straight, 0.5), (_lagging, 1.0))]
     distance, rate, speed, squares = (np.stack(both) for both in zip(*fits, strict=True))
     best = np.argmin(squares, axis=0)
     rms = np.sqrt(squares[best, each] / sizes)
-    return [
-        Ramp(
-            speed[b, k] * distance[b, k, :n], speed[b, k] * rate[b, k, :n], float(speed[b, k]), float(rms[k])
-        )
-        for k, (b, n) in enumerate(zip(best.tolist(), sizes.tolist(), strict=True))
-    ]
+    ramps = []
+    for k, (b, n) in enumerate(zip(best.tolist(), sizes.tolist(), strict=True)):
+        moved = speed[b, k] * distance[b, k, :n], speed[b, k] * rate[b, k, :n]
+        ramps.append(Ramp(*moved, float(speed[b, k]), float(rms[k])))
+    return ramps
 
 
 Shape = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def _fit_shape(
-    rows: _PaddedRows, shape: Shape, lagged: np.ndarray, lag: float, step: np.ndarray
+    rows: _PaddedRows, shape: Shape, lag: float, lagged: np.ndarray, step: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Return the best ramps of one shape.
-
-    Returns distance and speed for a final speed of 1, shape (strokes, rows) each, and the final speed and the
-    sum of squares, shape (strokes,) each.
-    """
+    """Return distance and speed of the best ramps to a speed of 1, that speed, and the sums of squares."""
     grid = [np.stack([lagged - lag * ramp * step, np.log(ramp * step)], axis=1) for ramp in RAMPS]
     squares = [_solved(rows, rows.centred(_moved(rows, shape, at)[0]))[2] for at in grid]
     at = np.choose(np.argmin(squares, axis=0)[:, None], grid)
@@ -128,8 +114,7 @@ def _fit_shape(
         distance, rate, by_ramp = _moved(own, shape, at)
         distance = own.centred(distance)
         speed, residual, _ = _solved(own, distance)
-        # residual = along - speed * distance(time - at[0], ramp); position and speed are projected out of its
-        # slopes
+        # residual = along - speed * distance(time - at[0], ramp), with position and speed projected out
         slopes = speed[:, None, None] * np.stack([own.centred(rate), -own.centred(by_ramp)], axis=1)
         square = np.einsum("kr,kr->k", distance, distance)
         shared = np.einsum("kir,kr->ki", slopes, distance) / np.maximum(square, 1e-300)[:, None]
@@ -250,8 +235,7 @@ class Along:
 def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
     """Return all strokes with a steady window that begin at rest or at a turn.
 
-    A steady speed or a turn in the midst of a motion does not: its time counts from an earlier row. The
-    samples of a stroke are adjacent in `traces`.
+    A steady speed or a turn in the midst of a motion does not: its time counts from an earlier row.
     """
     edges, own = strokes_of(traces, stroke_index(steady))
     time, along, force = (traces[name].to_numpy(float) for name in ("time_s", "displacement_mm", "force_N"))
@@ -273,12 +257,9 @@ def starts_of(strokes: Sequence[Along]) -> list[StrokeStart]:
     """Return the start of every stroke that has one; a record that begins in steady sliding has none."""
     strokes = [stroke for stroke in strokes if stroke.until >= LEAST]
     noisy = [stroke for stroke in strokes if stroke.noisy]
-    rows = [slice(0, 2 * stroke.until) for stroke in noisy]  # up to steady sliding, and as many rows after
-    ramps = fit_ramps(
-        [stroke.time_s[own] for stroke, own in zip(noisy, rows, strict=True)],
-        [stroke.along_mm[own] for stroke, own in zip(noisy, rows, strict=True)],
-        [stroke.pace_mm_s for stroke in noisy],
-    )
+    # Rows up to steady sliding, and as many after.
+    begun = [(s.time_s[: 2 * s.until], s.along_mm[: 2 * s.until], s.pace_mm_s) for s in noisy]
+    ramps = fit_ramps(*zip(*begun, strict=True)) if begun else []
     ramp_of = dict(zip((stroke.row for stroke in noisy), ramps, strict=True))
     made = (_begun(stroke, ramp_of.get(stroke.row)) for stroke in strokes)
     return [start for start in made if start is not None]
@@ -315,8 +296,8 @@ def _begun(stroke: Along, ramp: Ramp | None) -> StrokeStart | None:
 def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
     """Return distance and speed up to steady sliding by a Savitzky-Golay filter of second order.
 
-    Its width depends on the noise, and the ends are padded with the first and last displacement (Savitzky and
-    Golay 1964, Anal. Chem. 36(8), 1627-1639, doi:10.1021/ac60214a047).
+    Its width depends on the noise. Savitzky and Golay 1964, Anal. Chem. 36(8), 1627-1639,
+    doi:10.1021/ac60214a047.
     """
     half = _half_width(stroke) if stroke.noisy else 1
     rows = slice(0, stroke.until + half + 1)  # all rows that the filter needs

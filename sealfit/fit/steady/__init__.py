@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -38,7 +38,7 @@ from sealfit.units import Units
 
 # Level of the test for lack of fit.
 SIGNIFICANT = 0.05
-# Number of conditions whose intervals are computed together. It bounds the memory.
+# Number of conditions whose intervals are computed together, to bound the memory.
 BLOCK = 250
 # Numeric columns of a fit table.
 NUMBERS = ("value", "se", "lo95", "hi95", "u_sys")
@@ -51,41 +51,23 @@ SteadyFit = Mapping[str, pd.DataFrame]
 
 
 def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
-    r"""Fit Eq. 14 to every condition, and mark the parameters that its speeds determine.
+    r"""Return tables `steady_fit`, `steady_covariance`, `steady_shift` of Eq. 14 fitted to all conditions.
 
     .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
 
-    Run means of both directions are fitted together, weighted by the pooled scatter of repeats. mu_s, mu_c
-    and sigma_2 are not negative; mu_s < mu_c is allowed and reported. Without load the forces F_s and F_c are
-    fitted.
+    Run means of both directions are fitted together, weighted by the pooled scatter of repeats; rows of
+    `steady` with `used` false are left out. mu_s, mu_c and sigma_2 are not negative; mu_s < mu_c is allowed
+    and reported. Without load the forces F_s and F_c are fitted. The config names the condition columns, the
+    units and the sensor's accuracy. FitError if there is no row to fit.
 
-    Parameters
-    ----------
-    steady : DataFrame
-        Table `steady`; rows with `used` false are left out.
-    config : Config
-        Names the condition columns, the units and the sensor's accuracy.
+    In `steady_fit` `quantity` is "steady" (one row per parameter) or "statistics". In `steady_shift` `source`
+    is "sensor" (change of the parameter if the sensor reads every |force| one standard uncertainty too high)
+    or, if effects were subtracted from the forces, the number of a principal direction of their uncertainty,
+    from 1 (included in the covariance and common to all conditions).
 
-    Returns
-    -------
-    dict of DataFrame
-        Tables `steady_fit`, `steady_covariance` and `steady_shift`, with the condition columns. In
-        `steady_fit` `quantity` is "steady" (one row per parameter) or "statistics". In `steady_shift`
-        `source` is "sensor" (change of the parameter if the sensor reads every |force| one standard
-        uncertainty too high; `u_sys` is its magnitude) or, if effects were subtracted from the forces, the
-        number of a principal direction of the effects' uncertainty, from 1 (it is included in the covariance
-        and the intervals, and common to all conditions).
-
-    Raises
-    ------
-    FitError
-        If there is no row to fit.
-
-    Notes
-    -----
     Intervals are profile-likelihood intervals with Student's t. `u_sys` assumes one unknown error of |force|
-    for all samples, which no averaging reduces. A zero offset of the sensor has opposite signs in the two
-    directions and changes the parameters by no more; the loop tests for it.
+    for all samples. A zero offset of the sensor has opposite signs in the two directions and changes the
+    parameters by no more; the loop tests for it.
     """
     conditions, scatter, variance = solve_conditions(steady)
     keys = condition_keys(steady, config)
@@ -109,8 +91,7 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
 def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], RepeatScatter, UnitVariance]:
     """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
 
-    A Stribeck curve that does not differ significantly from a straight line is dropped. FitError if there is
-    no row to fit.
+    A Stribeck curve that is not significant is dropped. FitError if there is no row to fit.
     """
     runs = run_means(steady)
     scatter = repeat_scatter(merge_directions(steady[steady["used"].to_numpy(bool)]))
@@ -127,15 +108,11 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], RepeatScatt
 
 
 def _more_likely_weights(even: list[Condition]) -> list[Condition]:
-    """Return conditions fitted with equal weights or scatter proportional to friction, the more likely ones.
-
-    Without repeats the residuals have to determine how the scatter depends on the force.
-    """
+    """Return conditions with equal weights or scatter proportional to friction, the more likely ones."""
     sizes = np.cumsum([len(c.runs) for c in even])[:-1]
     weight = proportional_weights(np.concatenate([c.model_force() for c in even]))
-    other = [
-        replace(c, runs=c.runs.assign(weight=w)) for c, w in zip(even, np.split(weight, sizes), strict=True)
-    ]
+    parts = zip(even, np.split(weight, sizes), strict=True)
+    other = [replace(c, runs=c.runs.assign(weight=own)) for c, own in parts]
     solve(other)
     chi2 = [sum(c.chi2 for c in conditions) for conditions in (even, other)]
     chosen = more_likely(chi2, [np.ones(weight.size), weight], sum(c.df for c in even))
@@ -148,23 +125,22 @@ def _unit_variance(conditions: list[Condition], scatter: RepeatScatter) -> UnitV
 
 def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
     """One row per condition: series, rubber and condition columns; null where unaged rubber has several."""
-    names = [
-        c for c in dict.fromkeys(["series", "rubber", *condition_columns(config)]) if c in steady.columns
-    ]
+    names = dict.fromkeys(["series", "rubber", *condition_columns(config)])
+    names = [name for name in names if name in steady.columns]
     grouped = steady[steady["condition"].notna()].groupby("condition", sort=True)
     first, several = grouped[names].first(), grouped[names].nunique() > 1
     return first.mask(several).reset_index()
 
 
-# ---------------------------------------------------------------- table
 def _rows(
     condition: Condition, variance: UnitVariance, scatter: RepeatScatter, config: Config
 ) -> Iterator[tuple[Schema, dict]]:
-    """Yield the rows of a condition, each with the table it belongs to."""
+    """Yield the rows of a condition, each with its table."""
     unit_of = parameter_units(config.units, condition.has_load)
-    fitted = condition.jacobian(), condition.arrays[-1], condition.values, condition.names
-    covariance, shift = linearised(*fitted)
-    _, effects = linearised(*fitted, condition.shifts)
+    speed, _, _, weight = condition.arrays
+    moved = np.column_stack([np.ones_like(speed), condition.shifts])
+    covariance, changes = linearised(condition.jacobian(), weight, condition.values, condition.names, moved)
+    shift, effects = changes[:, 0], changes[:, 1:]
     covariance = covariance * variance.value + effects @ effects.T
     # What is smaller is rounding.
     shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)
@@ -215,11 +191,9 @@ def _statistics(
     if repeated and condition.df == 0:
         lack = "as many parameters as runs: the fit cannot disagree with them."
     elif repeated and variance.p < SIGNIFICANT:
-        lack = (
-            "lack of fit: the runs disagree with the model by more than their repeats scatter (set-up "
-            "scatter between runs, or something the model lacks); "
-            f"intervals are widened {np.sqrt(variance.value):.2g} times."
-        )
+        lack = "lack of fit: the runs disagree with the model by more than their repeats scatter (set-up "
+        lack += "scatter between runs, or something the model lacks); "
+        lack += f"intervals are widened {np.sqrt(variance.value):.2g} times."
     if condition.left_out:
         lack += f" {condition.left_out} runs without load were left out of the fit."
     own = no_repeats or ("own" if variance.own else "pooled")
@@ -256,20 +230,18 @@ def _product(one: str, other: str) -> str:
     return " ".join(f"({unit})" for unit in (one, other) if unit)
 
 
+def covariance_matrix(covariances: Mapping[tuple[str, str], float], names: Sequence[str]) -> np.ndarray:
+    """Return the covariance of parameters, shape (p, p), from values by ("mu_s", "mu_c"); 0 if unknown."""
+    upper = np.array([[covariances.get((one, other), 0.0) for other in names] for one in names])
+    upper = np.where(np.isfinite(upper), upper, 0.0)
+    return upper + np.triu(upper, 1).T
+
+
 def table_row(
     *, quantity: str, parameter: str, unit: str, identified: bool = True, reason: str = "", **numbers
 ) -> dict:
-    """Return one row of a fit table; None and infinite ends become null.
-
-    `numbers` are any of value, se, lo95, hi95 and u_sys.
-    """
+    """Return one row of a fit table from any of `NUMBERS`; None and infinite ends become null."""
     known = {name: value for name, value in numbers.items() if value is not None and np.isfinite(value)}
-    return {
-        "model": "before",
-        "quantity": quantity,
-        "parameter": parameter,
-        **{name: float(known.get(name, np.nan)) for name in NUMBERS},
-        "unit": unit,
-        "identified": bool(identified),
-        "reason": reason,
-    }
+    row = {"model": "before", "quantity": quantity, "parameter": parameter}
+    row |= {name: float(known.get(name, np.nan)) for name in NUMBERS}
+    return row | {"unit": unit, "identified": bool(identified), "reason": reason}

@@ -44,8 +44,7 @@ class Condition:
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """|v|, N (1 without load), F sgn v and weight of each run, shape (n,).
 
-        With too few speeds for a Stribeck curve the weights are equal, so that the coefficient is the mean
-        over these speeds whatever their scatter; the mean has the variance that it has with these weights.
+        With too few speeds for a Stribeck curve the weights are equal, with the same variance of the mean.
         """
         load = self.runs["load"].to_numpy(float) if self.has_load else np.ones(len(self.runs))
         speed, force, weight = (self.runs[name].to_numpy(float) for name in ("speed", "force", "weight"))
@@ -121,8 +120,8 @@ def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray
 
     Conditions with too few speeds for a Stribeck curve still show how the force changes from speed to speed,
     which is no scatter between runs. Where several have the same speeds, the model of each is multiplied by
-    one factor per speed and direction, which is common to all of them. Where too few have, chi-square is no
-    scatter, unless no other condition shows any.
+    one factor per speed and direction, common to all of them. Where too few have, chi-square is no scatter,
+    unless no other condition shows any.
     """
     chi2, df = (np.array([getattr(c, name) for c in conditions], float) for name in ("chi2", "df"))
     few = [k for k, c in enumerate(conditions) if c.model == VISCOUS and c.few_speeds and c.values[0] > 0]
@@ -202,7 +201,7 @@ def bound(conditions: list[Condition], rise: np.ndarray) -> None:
     if full:
         arrays = stacked([conditions[k] for k in full])
         values, chi2 = (np.array([getattr(conditions[k], name) for k in full]) for name in ("values", "chi2"))
-        fit = StribeckFit(values, chi2, stribeck.search_limits(arrays[0], arrays[3]))
+        fit = StribeckFit(values, chi2, stribeck.search_grid(arrays[0], arrays[3]))
         lows, highs = stribeck.stribeck_intervals(*arrays, fit, rise[full])
         for k, low, high in zip(full, lows, highs, strict=True):
             conditions[k].low, conditions[k].high = low, high
@@ -210,12 +209,10 @@ def bound(conditions: list[Condition], rise: np.ndarray) -> None:
         if condition.model != FULL and np.isfinite(allowed):
             _, _, force, weight = condition.arrays
             root = np.sqrt(weight)
-            low, high = stribeck.constrained_ends(
-                (condition.columns() * root[:, None])[None, None],
-                (force * root)[None, None],
-                np.array([condition.chi2 + allowed]),
-                [True] * len(condition.names),
-            )
+            columns = (condition.columns() * root[:, None])[None, None]
+            limit, nonnegative = np.array([condition.chi2 + allowed]), [True] * len(condition.names)
+            y = (force * root)[None, None]
+            low, high = stribeck.constrained_ends(columns, y, limit, nonnegative)
             condition.low, condition.high = low[0, 0], high[0, 0]
 
 
@@ -223,9 +220,8 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
     """Return per parameter whether the data determine it, and a remark."""
     verdict = _judge_form(condition)
     if condition.low is None and condition.model != FULL:
-        verdict = {
-            n: (ok, why or "no repeats and no spare run: no interval.") for n, (ok, why) in verdict.items()
-        }
+        why_not = "no repeats and no spare run: no interval."
+        verdict = {name: (known, why or why_not) for name, (known, why) in verdict.items()}
     zero = {name for name, value in zip(condition.names, condition.values, strict=True) if value == 0.0}
     if "sigma_2" in zero:
         at_zero = "at its physical limit 0: friction does not rise with speed here."
@@ -251,16 +247,12 @@ def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
         few = f"{condition.speeds} speeds in one direction: "
         few += "the Stribeck curve needs four, two of them below about 2 v_s."
         verdict |= {name: (False, few) for name in ("mu_s", "v_s")}
-        verdict["mu_c"] = (
-            True,
-            "the mean coefficient over these speeds, which are too few for a Stribeck curve.",
-        )
+        mean = "the mean coefficient over these speeds, which are too few for a Stribeck curve."
+        verdict["mu_c"] = (True, mean)
     elif condition.model == VISCOUS:
         flat = f"mu_s = mu_c is not rejected (p = {condition.flat_p:.2g}): no Stribeck curve is seen"
-        verdict |= {
-            "mu_s": (False, f"{flat}, mu_s is mu_c."),
-            "v_s": (False, f"{flat}, so v_s has no meaning."),
-        }
+        verdict["mu_s"] = (False, f"{flat}, mu_s is mu_c.")
+        verdict["v_s"] = (False, f"{flat}, so v_s has no meaning.")
         verdict["mu_c"] = (True, "of the fit without Stribeck curve; mu_s = mu_c is not rejected.")
     elif condition.low is None:
         unknown = "as many parameters as runs and no repeats: nothing shows how far to trust it."

@@ -10,21 +10,17 @@ from scipy.special import stdtr
 
 from sealfit.fit.least_squares import Separable, covariance_of, even_grid, global_optimum, profile, solve_kept
 
-# A coefficient is unbounded if the share of its column's variance that other columns do not explain is below
-# this.
+# A coefficient is unbounded if other columns explain all but this share of its column's variance.
 FREE = 1e-12
 
 
 def constrained_ends(columns, y, limit, nonnegative):
     """Return the ends of {c_j : the least sum of squares at fixed c_j, the others nonnegative, <= `limit`}.
 
-    For every active set of zeros among the others, the sum of squares is a parabola in c_j. The constrained
-    optimum at an end lies on one of them, so that the ends are the outermost feasible crossings: exact,
-    without iteration.
-
-    Columns, shape (problems, g, n, p), and y, shape (problems, g, n), are weighted; `limit` has the shape
-    (problems,). The ends have the shape (problems, g, p): NaN if the sum of squares exceeds the limit
-    everywhere, inf if c_j is unbounded.
+    For every active set of zeros the sum of squares is a parabola in c_j, and the constrained optimum at an
+    end lies on one: the ends are the outermost feasible crossings. Columns, (problems, g, n, p), and y,
+    (problems, g, n), are weighted; `limit` is (problems,). The ends, (problems, g, p), are NaN if the sum of
+    squares exceeds the limit everywhere, inf if c_j is unbounded.
     """
     nonnegative = np.asarray(nonnegative, bool)
     norm = np.sqrt(np.einsum("...np,...np->...p", columns, columns))
@@ -56,8 +52,7 @@ def _ends(gram, centre, spare, j, keep, nonnegative):
     own = gram[..., j, j] - np.einsum("...k,...k->...", pull, gram[..., :, j])
     bounded, possible = own > FREE, spare >= 0
     half = np.where(bounded & possible, np.sqrt(np.maximum(spare, 0.0) / np.where(bounded, own, 1.0)), np.nan)
-    # Smaller coefficients are rounding.
-    least = -1e-12 * np.abs(centre).max(axis=-1, keepdims=True)
+    least = -1e-12 * np.abs(centre).max(axis=-1, keepdims=True)  # smaller coefficients are rounding
     ends = []
     for away in (-half, half):
         negative = (centre - pull * away[..., None] < least) & others & nonnegative
@@ -68,15 +63,12 @@ def _ends(gram, centre, spare, j, keep, nonnegative):
 
 
 # ---------------------------------------------------------------- stribeck
-# Eq. 14 fitted to many conditions at once: F sgn(v) = N mu_s E + N mu_c (1 - E) + sigma_2 |v|, E =
-# exp(-(v/v_s)^2).
-#
-# In this form the coefficients of the three columns are the parameters. All three are nonnegative, as
-# friction dissipates energy at every speed; mu_s < mu_c is allowed. Without load, N = 1 and the coefficients
-# are F_s and F_c.
+# F sgn(v) = N mu_s E + N mu_c (1 - E) + sigma_2 |v|, E = exp(-(v/v_s)^2). The coefficients of the three
+# columns are nonnegative, as friction dissipates energy at every speed; mu_s < mu_c is allowed. Without load
+# N = 1, and the coefficients are F_s and F_c.
 
 # v_s is searched from a fifth of the slowest speed, below which E < 1e-10 at every speed, to twenty times the
-# fastest, above which 1 - E < 0.0025 is proportional to v^2.
+# fastest, above which 1 - E < 0.0025.
 SLOWEST, FASTEST = 1 / 5, 20.0
 # Grid points of v_s per decade, 1 % apart. With four or five speeds a minimum can be that narrow.
 PER_DECADE = 240
@@ -96,12 +88,7 @@ class StribeckFit:
 
     values: np.ndarray  # (problems, 4): mu_s, mu_c, v_s, sigma_2
     rss: np.ndarray  # (problems,)
-    limits: tuple[np.ndarray, np.ndarray]  # (problems,) each: lowest and highest ln v_s searched
-
-    @property
-    def grid(self) -> np.ndarray:
-        """Grid of ln v_s that was searched, shape (problems, g)."""
-        return even_grid(*self.limits, PER_DECADE)
+    grid: np.ndarray  # (problems, g): ln v_s searched
 
 
 def stribeck_basis(speed, load):
@@ -115,24 +102,19 @@ def stribeck_basis(speed, load):
     return basis
 
 
-def search_limits(speed, weight) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest ln v_s to be searched, shape (problems,); speed, weight (problems, n)."""
+def search_grid(speed, weight, per_decade: int = PER_DECADE) -> np.ndarray:
+    """Return the grid of ln v_s that is searched, shape (problems, g); speed and weight are (problems, n)."""
     used = weight > 0
     slowest = np.min(speed, axis=1, where=used, initial=np.inf)
     fastest = np.max(speed, axis=1, where=used, initial=0.0)
-    return np.log(slowest * SLOWEST), np.log(fastest * FASTEST)
+    return even_grid(np.log(slowest * SLOWEST), np.log(fastest * FASTEST), per_decade)
 
 
 def solve_stribeck(speed, load, force, weight) -> StribeckFit:
     """Return the global weighted least-squares fit of Eq. 14 to many conditions.
 
     The arguments, shape (problems, n) each, are |v| > 0 in mm/s, N and F sgn(v) in N, and 1/variance, 0 for
-    padding.
-
-    Raises
-    ------
-    FitError
-        If a value is not finite.
+    padding. FitError if a value is not finite.
 
     Examples
     --------
@@ -145,22 +127,19 @@ def solve_stribeck(speed, load, force, weight) -> StribeckFit:
     speed, load, force, weight = np.broadcast_arrays(
         *(np.asarray(x, float) for x in (speed, load, force, weight))
     )
-    limits = search_limits(speed, weight)
-    problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
-    found = global_optimum(problems, even_grid(*limits, PER_DECADE))
+    grid = search_grid(speed, weight)
+    found = global_optimum(Separable(stribeck_basis(speed, load), force, weight, PHYSICAL), grid)
     mu_s, mu_c, sigma_2 = found.coefficients.T
-    values = np.stack([mu_s, mu_c, np.exp(found.u), sigma_2], axis=1)
-    return StribeckFit(values, found.rss, limits)
+    return StribeckFit(np.stack([mu_s, mu_c, np.exp(found.u), sigma_2], axis=1), found.rss, grid)
 
 
-# ---------------------------------------------------------------- intervals
 def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
     """Return the ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2, (problems, 4) each.
 
     The interval of v_s is where the least sum of squares exceeds the minimum by at most `rise`, shape
     (problems,): t^2 times the variance of unit weight. Its end is 0 or inf if it reaches a limit of the
     search. Those of the others are unions, over these v_s, of the exact interval at that v_s with nonnegative
-    coefficients. No quadratic approximation is made, so that intervals may be asymmetric or open.
+    coefficients. Intervals may be asymmetric or open.
     """
     problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
     limit = fit.rss + rise
@@ -199,29 +178,25 @@ def _crossing(problems: Separable, grid, u_best, inside, limit, sign):
     return sign * near, open_
 
 
-# ---------------------------------------------------------------- one condition
 def tangent(speed, load, values) -> np.ndarray:
     """Return derivatives of F sgn(v) with respect to mu_s, mu_c, v_s, sigma_2 at `values`, shape (n, 4)."""
     mu_s, mu_c, v_s, _ = values
     square = (speed / v_s) ** 2
     decay = np.exp(-square)
-    return np.stack(
-        [load * decay, load * (1 - decay), load * (mu_s - mu_c) * decay * 2 * square / v_s, speed], axis=1
-    )
+    along_v_s = load * (mu_s - mu_c) * decay * 2 * square / v_s
+    return np.stack([load * decay, load * (1 - decay), along_v_s, speed], axis=1)
 
 
-def linearised(jacobian, weight, values, names, moved=None):
-    """Return the covariance at unit variance, shape (p, p), and the change of the parameters with the forces.
+def linearised(jacobian, weight, values, names, moved):
+    """Return the covariance at unit variance, shape (p, p), and the change of the parameters, shape (p, k).
 
-    `moved`, shape (n, k), are changes of the forces, and the result has shape (p, k). Without it every force
-    is 1 larger, and the result has shape (p,). A coefficient at its bound 0 is fixed: its variance and change
-    are 0.
+    `moved`, shape (n, k), are changes of the forces. A coefficient at its bound 0 is fixed: its variance and
+    change are 0.
     """
     free = np.array([name == "v_s" or value > 0 for name, value in zip(names, values, strict=True)])
-    root = np.sqrt(weight)
-    covariance, _ = covariance_of(jacobian * root[:, None], free)
+    covariance, _ = covariance_of(jacobian * np.sqrt(weight)[:, None], free)
     known = np.where(np.isfinite(covariance), covariance, 0.0)
-    return covariance, known @ (jacobian.T @ (weight if moved is None else weight[:, None] * moved))
+    return covariance, known @ (jacobian.T @ (weight[:, None] * moved))
 
 
 def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
@@ -233,14 +208,11 @@ def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
 
     .. math:: p = \frac{\kappa}{\pi} (1 + c^2/\nu)^{-\nu/2} + P(|t_\nu| > c)
 
-    `speed` and `weight`, shape (n,), are of one condition. `columns`, shape (n, 1) or (n, 2), are those of
-    the free parameters without Stribeck curve: the load, and the speed unless sigma_2 is at 0. `grid`, shape
-    (g,), is that of ln v_s. `statistic` is c^2, the fall of the sum of squares over the variance of unit
-    weight, and `df` the degrees of freedom of that variance, inf if it is known.
-
-    Hotelling 1939, Am. J. Math. 61, 440-460; Davies 1987, Biometrika 74(1), 33-43,
-    doi:10.1093/biomet/74.1.33; with estimated variance: Knowles and Siegmund 1989, Int. Stat. Rev. 57(3),
-    205-220, doi:10.2307/1403794.
+    `columns`, shape (n, 1) or (n, 2), are those of the free parameters without Stribeck curve; `grid` is of
+    ln v_s. `statistic` is c^2, the fall of the sum of squares over the variance of unit weight, and `df` the
+    degrees of freedom of that variance, inf if it is known. Hotelling 1939, Am. J. Math. 61, 440-460; Davies
+    1987, Biometrika 74(1), 33-43, doi:10.1093/biomet/74.1.33; with estimated variance: Knowles and Siegmund
+    1989, Int. Stat. Rev. 57(3), 205-220, doi:10.2307/1403794.
     """
     root = np.sqrt(weight)
     base = columns * root[:, None]
@@ -250,12 +222,10 @@ def flat_p_value(speed, columns, weight, grid, statistic, df) -> float:
     size = np.linalg.norm(curve, axis=1)
     residual = curve - (curve @ q) @ q.T
     length = np.linalg.norm(residual, axis=1)
-    clear = length > 1e-7 * np.maximum(size, 1e-300)  # shorter residuals are rounding
-    clear &= size > 1e-280
+    clear = (length > 1e-7 * np.maximum(size, 1e-300)) & (size > 1e-280)  # shorter residuals are rounding
     unit = residual[clear] / length[clear][:, None]
     chord = np.linalg.norm(np.diff(unit, axis=0), axis=1)
     kappa = float(np.sum(2 * np.arcsin(np.minimum(chord / 2, 1.0))))
     c2 = max(float(statistic), 0.0)
     tail = np.exp(-c2 / 2) if not np.isfinite(df) else (1 + c2 / df) ** (-df / 2)
-    alone = 2 * stdtr(df, -np.sqrt(c2))
-    return float(min(1.0, kappa / np.pi * tail + alone))
+    return float(min(1.0, kappa / np.pi * tail + 2 * stdtr(df, -np.sqrt(c2))))

@@ -24,8 +24,7 @@ from sealfit.ingest.strokes import speed_clusters
 POOLING_P = 0.25
 # Level at which a condition with more lack of fit than the others is widened by its own ratio.
 WORSE_P = 0.01
-# Smallest standard deviation of a run mean, as a share of the largest force. It keeps the weights of
-# identical repeats finite.
+# Smallest standard deviation of a run mean, also of identical repeats, as a share of the largest force.
 SMALLEST_SD = 1e-9
 # Smallest force in a scatter proportional to the force, as a share of the largest force.
 SMALLEST_SHARE = 0.05
@@ -53,19 +52,15 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
         raise FitError("no steady window is left to fit.", fix="Look in table quality why each was left out.")
     rows = merge_directions(rows)
     commanded = rows["speed_set_mm_s"] if "speed_set_mm_s" in rows.columns else pd.Series(np.nan, rows.index)
-    numbers = pd.DataFrame(
-        {
-            "condition": rows["condition"].astype(object),
-            "run_id": rows["run_id"].astype(object),
-            "direction": rows["direction"].astype(int),
-            "file": rows["file"].astype(object),
-            "speed": rows["speed_mm_s"].astype(float).abs(),
-            "set": commanded.astype(float).abs(),
-            "load": rows["load_N"].astype(float),
-            "force": rows["force_N"].astype(float)
-            * rows["direction"].astype(int).replace(BOTH_DIRECTIONS, 1),
-            **{name: rows[name].astype(float) for name in shifts_of(rows)},
-        }
+    direction = rows["direction"].astype(int)
+    numbers = rows[["condition", "run_id", "file"]].astype(object)
+    numbers = numbers.assign(
+        direction=direction,
+        speed=rows["speed_mm_s"].astype(float).abs(),
+        set=commanded.astype(float).abs(),
+        load=rows["load_N"].astype(float),
+        force=rows["force_N"].astype(float) * direction.replace(BOTH_DIRECTIONS, 1),
+        **{name: rows[name].astype(float) for name in shifts_of(rows)},
     )
     keys = ["condition", "run_id", "direction"]
     per_file = numbers.groupby([*keys, "file"], sort=True).mean()
@@ -74,11 +69,9 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     bad = ~(runs["speed"] > 0) | ~np.isfinite(runs["force"])
     if bad.any():
         first = runs[bad].iloc[0]
-        raise FitError(
-            f"run {first['run_id']} has speed {first['speed']:g} and force {first['force']:g} "
-            "in its steady window.",
-            fix="Leave it out of the campaign, or look at its steady window.",
-        )
+        windows = f"speed {first['speed']:g} and force {first['force']:g} in its steady window."
+        fix = "Leave it out of the campaign, or look at its steady window."
+        raise FitError(f"run {first['run_id']} has {windows}", fix=fix)
     return runs
 
 
@@ -99,8 +92,7 @@ def run_weights(runs: pd.DataFrame, scatter: RepeatScatter) -> np.ndarray:
 def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
     """Return 1/variance of run means with a scatter proportional to the friction, shape (n,), up to a factor.
 
-    The friction is that of a fit with equal weights. With the measured force the weight would depend on its
-    error, and a run whose force an offset brings near zero would dominate.
+    The fitted friction is taken: with measured forces a run that an offset brings near zero would dominate.
     """
     size = np.abs(fitted_N)
     return 1.0 / np.maximum(size, SMALLEST_SHARE * size.max(initial=0.0) or 1.0) ** 2
@@ -109,15 +101,13 @@ def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
 def more_likely(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) -> int:
     """Return the number of the most likely weights: the least n ln(chi2/df) - sum ln w, -2 log likelihood.
 
-    `chi2` is the weighted sum of squares of the whole campaign under each choice, with `df` degrees of
-    freedom.
+    `chi2` is the weighted sum of squares under each choice.
     """
     if not df > 0:
         return 0
     with np.errstate(divide="ignore"):
-        return int(
-            np.argmin([len(w) * np.log(c / df) - np.log(w).sum() for c, w in zip(chi2, weights, strict=True)])
-        )
+        both = zip(chi2, weights, strict=True)
+        return int(np.argmin([len(w) * np.log(c / df) - np.log(w).sum() for c, w in both]))
 
 
 @dataclass(frozen=True)
@@ -143,14 +133,11 @@ class UnitVariance:
 def unit_variance(chi2, df, scatter, pure_df: float) -> UnitVariance:
     """Return the factors on the variances stated by the weights, from chi-square of every condition.
 
-    With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions in which it is scatter of
-    runs (mask `scatter`), is tested against pure error. If its p-value is at most `POOLING_P`, the factor is
-    the pooled ratio, at least 1, with the pooled degrees of freedom. Else it is 1 with `pure_df`. A condition
-    whose ratio exceeds that at level `WORSE_P` gets its own ratio. Without repeats the weights are relative
-    and the pooled ratio is the variance.
-
-    Birge 1932, Phys. Rev. 40, 207; Bancroft 1944, Ann. Math. Statist. 15(2), 190-204,
-    doi:10.1214/aoms/1177731284.
+    With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions in which it is `scatter`
+    of runs, is tested against pure error. If its p-value is at most `POOLING_P`, the factor is the pooled
+    ratio, at least 1, with its degrees of freedom; else it is 1 with `pure_df`. A condition whose ratio
+    exceeds that at level `WORSE_P` gets its own. Without repeats the pooled ratio is the variance. Birge
+    1932, Phys. Rev. 40, 207; Bancroft 1944, Ann. Math. Statist. 15(2), 190-204, doi:10.1214/aoms/1177731284.
     """
     chi2, df = np.asarray(chi2, float), np.asarray(df, float)
     total, total_df = float(np.sum(chi2 * scatter)), float(np.sum(df * scatter))
@@ -165,22 +152,17 @@ def unit_variance(chi2, df, scatter, pure_df: float) -> UnitVariance:
         base, base_df = 1.0, pure_df
     with np.errstate(invalid="ignore", divide="ignore"):
         worse = (ratio > base) & (fdtrc(df, base_df, ratio / base) < WORSE_P) & (df < df.sum())
-        p = fdtrc(df, pure_df, ratio) if repeated else np.full(chi2.shape, np.nan)
-    return UnitVariance(
-        value=np.where(worse, ratio, base),
-        df=np.where(worse, df, base_df if base_df > 0 else np.nan),
-        f=ratio if repeated else np.full(chi2.shape, np.nan),
-        p=p,
-        own=worse,
-    )
+        none = np.full(chi2.shape, np.nan)
+        f, p = (ratio, fdtrc(df, pure_df, ratio)) if repeated else (none, none)
+    df = np.where(worse, df, base_df if base_df > 0 else np.nan)
+    return UnitVariance(np.where(worse, ratio, base), df, f, p, worse)
 
 
 def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
     """Return the distinct speed levels of one condition, rising, per direction: {+1: (k,), -1: (m,)}.
 
     They are commanded speeds if every run of the direction has one, else measured speeds grouped within 25 %.
-    Each direction is counted separately: an offset between slow strokes forward and fast ones backward could
-    be taken for a Stribeck curve.
+    An offset between slow strokes forward and fast ones backward could be taken for a Stribeck curve.
     """
     directions, commanded, measured = (runs[name].to_numpy() for name in ("direction", "set", "speed"))
     levels = {}
