@@ -111,8 +111,7 @@ def _squares(rest: np.ndarray) -> np.ndarray:
 def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
     """Return the derivative of `residual`, (p,) -> (n,), at `x`, shape (n, p), by fourth-order differences.
 
-    The step is 1e-4 of each parameter. It is small for a peak a hundred of its widths from the origin, and
-    rounding errors are near 1e-12 of the derivative.
+    With a step of 1e-4 of each parameter rounding errors are near 1e-12 of the derivative.
     """
     h = 1e-4 * np.where(x == 0, 1.0, np.abs(x))
     points = x + np.array([-2, -1, 1, 2])[:, None, None] * np.diag(h)
@@ -180,11 +179,10 @@ def solve_kept(gram, moment, keep):
 
 
 def least_squares_of(gram, moment, nonnegative: Sequence[bool]):
-    """Return the exact least squares with some nonnegative coefficients, by trying every active set.
+    """Return the global least squares with some nonnegative coefficients, by trying every active set.
 
     `gram`, shape (..., p, p), is B'B of the columns, scaled to unit diagonal (0 for a column of zeros), and
-    `moment`, shape (..., p), is B'y. Returns the coefficients and which columns are in the optimum, shape
-    (..., p) each. The optimum is global, as the problem is convex.
+    `moment`, shape (..., p), is B'y. Returns the coefficients and which columns are in the optimum.
     """
     nonnegative = np.asarray(nonnegative, bool)
     keep = np.ones(moment.shape, bool)
@@ -271,9 +269,9 @@ def profile(
 def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     """Return the global least-squares optimum of each problem on the range of its grid, shape (problems, g).
 
-    The grid rises, so closely that no minimum lies between two points. Every local minimum along it is
-    refined. The result is the best of them, or an end of the grid. FitError if a measured value or weight is
-    not finite, or a weight is negative.
+    Every local minimum along the grid, which rises closely enough, is refined. The result is the best of
+    them, or an end of the grid. FitError if a measured value or weight is not finite, or a weight is
+    negative.
     """
     y, weight = problems.y, problems.weight
     if not (np.all(np.isfinite(y)) and np.all(np.isfinite(weight)) and np.all(weight >= 0)):

@@ -125,10 +125,7 @@ def _numbers_of(found: pd.DataFrame, curves: list[SeriesCurve]) -> np.ndarray:
 
 
 def steady_covariance(used: pd.DataFrame, known: pd.DataFrame) -> csr_array:
-    """Return the covariance of steady values, shape (n, n); it is 0 between conditions.
-
-    `used` has their `condition`, `quantity` and `value`; `known` is table `steady_covariance`.
-    """
+    """Return the covariance of steady values, shape (n, n), from table `steady_covariance`, `known`."""
     quantity, n = used["quantity"].to_numpy(object), len(used)
     value_of = known.set_index(["condition", "parameter", "other"])["value"].to_dict()
     pairs, found = [], []
@@ -177,11 +174,11 @@ def between_scatter(values: Values) -> tuple[float, LawFit]:
 def laws_of_series(
     found: pd.DataFrame, series: Sequence[str], quantities: Sequence[str], covariance, **replicates
 ) -> LawRows:
-    """Return the rows of the laws of one rubber.
+    """Return the rows of the laws of one rubber in the order of `series` and `quantities`.
 
-    `found` has the values: `series`, `quantity`, `aging_days`, `value`, `unit`, and `moved`, their change if
-    the sensor reads one standard uncertainty too high; values of one condition are adjacent. `series` and
-    `quantities` give the order of the laws. `covariance`, shape (n, n), and `replicates` are as in `Values`.
+    `found` has `series`, `quantity`, `aging_days`, `value`, `unit`, and `moved`, the change of values if the
+    sensor reads one standard uncertainty too high; values of one condition are adjacent. `covariance`, shape
+    (n, n), and `replicates` are as in `Values`.
     """
     quantities = [name for name in quantities if (found["quantity"] == name).any()]
     curves = _curves_of(found, series, quantities)

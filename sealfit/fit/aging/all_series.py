@@ -56,11 +56,10 @@ START_POINTS = 20
 
 
 def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataFrame, csr_array]:
-    """Return mu_s and mu_c at every aged condition and the unaged rubber, and their covariance.
+    """Return mu_s and mu_c at every aged condition and the unaged rubber, and their covariance, shape (n, n).
 
-    The table has `condition`, `quantity` (mu_s, mu_c, F_s or F_c), `value`, and the condition's columns. The
-    covariance of measurement, shape (n, n), is 0 between series before the loop. Of the separate fits only
-    identified values are used. FitError if there is no row to fit.
+    The table has `condition`, `quantity` (mu_s, mu_c, F_s or F_c), `value`, and the condition's columns. Of
+    the separate fits only identified values are used. FitError if there is no row to fit.
     """
     fit = steady_fit["steady_fit"]
     rows = fit[(fit["quantity"] == "steady") & fit["aging_days"].notna()]

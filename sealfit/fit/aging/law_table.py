@@ -100,9 +100,8 @@ End = tuple[float, bool]  # of an interval of ln b, and whether it is open
 def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterval]:
     """Return the profile-likelihood intervals of every curve.
 
-    The interval of b is where the least chi-square at fixed ln b exceeds the minimum by at most the rise, t^2
-    of each quantity, shape (origins,). Those of a and c = -a ln b are the unions of their intervals over
-    these b.
+    That of b is where the least chi-square at fixed ln b rises by at most t^2 of each quantity, shape
+    (origins,). Those of a and c = -a ln b are the unions of their intervals over these b.
     """
     intervals: dict[int, CurveInterval] = {}
     for own, others in zip(fit.values.groups, likelihoods(fit), strict=True):

@@ -185,15 +185,14 @@ def _between_files(
 
 
 def peaks(cells: Cells, file: np.ndarray) -> pd.DataFrame:
-    """Return the break-away force F_ba and its ratio to the sliding force, a row per unit of evidence.
+    """Return the break-away force F_ba and its ratio to the sliding force, a row per file or lone stroke.
 
-    A unit is a file, or a stroke of a single file; `file`, shape (n,), is the number of the file in each row
-    of table `steady`. The sliding force is extrapolated to the peak along the line through the beginning of
-    steady sliding, so that warming along the stroke does not count as break-away. The position of the peak is
-    that of the mean of the other units, as the maximum of noisy samples is biased. For the test for a peak,
-    `top` is the force above sliding where the mean of all units is largest, `noise` its standard error in
-    units of that of a sample, and `places` the number of positions; `F` is the sliding force. Units with an
-    unknown value are left out.
+    `file`, shape (n,), is the number of the file in each row of table `steady`. The sliding force is
+    extrapolated to the peak along the line through the beginning of steady sliding, so that warming along the
+    stroke does not count. The position of the peak is that of the mean of the other units, as the maximum of
+    noisy samples is biased. For the test for a peak, `top` is the force above sliding where the mean of all
+    units is largest, `noise` its standard error in units of that of a sample, and `places` the number of
+    positions; `F` is the sliding force. Units with an unknown value are left out.
     """
     half = int(np.ceil(cells.count * max(SAMPLES / cells.samples, SHARE) / 2))  # of the window, in cells
     lines = np.array([astuple(part.sliding) for part in cells.parts], float)
@@ -250,10 +249,10 @@ def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: C
 
     The scatter of repeats is pooled within a condition: for the force relative to it, for the ratio as the
     force above sliding over its noise, as other errors cancel in the ratio. The variance of the force
-    includes set-up scatter, which is common to the repeats of a run: `widened` is the ratio of the variance
-    of run means to that expected from repeats, and its degrees of freedom. There is a peak if the largest
-    mean exceeds the sliding force in a t-test at 1 % for all positions of all starts of the campaign
-    (Bonferroni). Else `reason` says so, without an interval.
+    includes set-up scatter: `widened` is the ratio of the variance of run means to that expected from
+    repeats, and its degrees of freedom. There is a peak if the largest mean exceeds the sliding force in a
+    t-test at 1 % for all positions of all starts of the campaign (Bonferroni). Else `reason` says so, without
+    an interval.
     """
     logs = {name: np.log(found[name]) for name in (FORCE, RATIO, SLIDING)}
     shares = {

@@ -55,10 +55,10 @@ def fit_ramps(
 ) -> list[Ramp]:
     """Return the motion of platforms along a linear ramp or a first-order lag, whichever fits better.
 
-    A local speed is too noisy where the speed changes most; the two parameters of a ramp, beginning and
-    length, use all samples. Position and final speed are linear and solved for exactly (variable projection:
-    Kaufman 1975, BIT 15, 49-57, doi:10.1007/BF01932995). Displacements are positive along the motion;
-    `paces_mm_s` are approximate final speeds.
+    The two parameters of a ramp, beginning and length, use all samples; a local speed is too noisy. Position
+    and final speed are solved for exactly (variable projection: Kaufman 1975, BIT 15, 49-57,
+    doi:10.1007/BF01932995). Displacements are positive along the motion; `paces_mm_s` are about the final
+    speeds.
     """
     made: list[Ramp | None] = [None] * len(times_s)
     of_length: dict[int, list[int]] = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -146,21 +145,17 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
     It is a curve, too, if another series of the rubber has one, as an effect may hide it in one series.
     """
     number, names = pd.factorize(series_of)
-    key = 2 * number[rows.condition] + (rows.speed > 0)
-    order = np.argsort(key, kind="stable")
-    ends = np.searchsorted(key[order], np.arange(2 * names.size + 1))
-    levels = [tested_speeds(rows, order[first:last]).size for first, last in itertools.pairwise(ends)]
-    most = np.reshape(levels, (names.size, 2)).max(axis=1)  # of the two directions
-    three = [k for k, m in enumerate(most) if SPEEDS_FOR_STRIBECK <= m < SPEEDS_BETWEEN]
-    p_values = {k: _p_of_lines(rows, np.flatnonzero(number[rows.condition] == k)) for k in three}
     forms = {}
-    for k, (name, m) in enumerate(zip(names, most, strict=True)):
-        if m >= SPEEDS_BETWEEN:
+    for k, name in enumerate(names):
+        chosen = np.flatnonzero(number[rows.condition] == k)
+        forward = rows.speed[chosen] > 0
+        most = max(tested_speeds(rows, chosen[way]).size for way in (forward, ~forward))
+        if most >= SPEEDS_BETWEEN:
             forms[name] = "full"
-        elif k in p_values and p_values[k] < REJECTED:
+        elif most >= SPEEDS_FOR_STRIBECK and _p_of_lines(rows, chosen) < REJECTED:
             forms[name] = "interpolated"
         else:
-            forms[name] = "viscous" if m >= SPEEDS_FOR_VISCOUS else "constant"
+            forms[name] = "viscous" if most >= SPEEDS_FOR_VISCOUS else "constant"
     owners = list(zip(series_of, rows.conditions["rubber"], strict=True))
     curved = {rubber for name, rubber in owners if forms[name] in CURVED}
     return forms | {

@@ -25,9 +25,8 @@ TWO_NODES, FOUR_NODES = (
 class Term:
     """An effect bound to the channels it reads and the quantity it acts on, with fixed reference values.
 
-    In `fixed`, `shift` is the origin of the channel in each pass; `held` are the parameters, with their 95 %
-    intervals, that were estimated from the raw samples and are not fitted to bins. `smoothness` is the weight
-    of the roughness penalty of a free shape (`prior.py`), None without a penalty.
+    In `fixed`, `shift` is the origin of the channel in each pass; `held` are parameters, with intervals, that
+    were estimated from the raw samples. `smoothness` is the weight of the roughness penalty of a free shape.
     """
 
     effect: Effect
@@ -60,11 +59,11 @@ class Term:
         return {**given, **self.fixed}
 
     def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
-        """Return (weight, inputs) at the quadrature nodes of each row.
+        """Return (weight, inputs) at the quadrature nodes of each row, a mean over the samples of a bin.
 
-        A row is the mean over the samples of a bin. The mean of a sine has a closed form. Another nonlinear
-        shape along the stroke is averaged by Gauss-Legendre quadrature, over a uniform distribution with the
-        variance of the n samples. All other shapes are evaluated at the bin mean.
+        The mean of a sine has a closed form. Another nonlinear shape along the stroke is averaged by
+        Gauss-Legendre quadrature, over a uniform distribution with the variance of the samples. Others are
+        evaluated at the mean.
         """
         return rows.cache.once(("nodes", self.shape_key), lambda: self._nodes(rows))
 
@@ -285,8 +284,8 @@ def _blocks(declared: Declared, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 def loads_of(model: Model, rows: Rows, friction: np.ndarray | None = None) -> np.ndarray:
     """Return the change of the force per unit of each kind of random effect, shape (n, kinds).
 
-    That of a gain is friction, the force without added forces; where the model may be far off, another
-    `friction` can be given, shape (n,). That of v_s is per unit of its logarithm.
+    That of a gain is `friction`, shape (n,), by default the model's; that of v_s is per unit of its
+    logarithm.
     """
     state = _ForceParts(model, rows)
     slopes, friction = state.slopes(), state.friction if friction is None else friction

@@ -28,9 +28,8 @@ class Groups:
         """Return the groups of `codes`: per level the group of each row, contiguous, finest level first."""
         starts, numbers = {}, {}
         for level, code in codes.items():
-            change = np.flatnonzero(np.r_[True, code[1:] != code[:-1]][: code.size])  # no rows: no groups
-            starts[level] = change
-            numbers[level] = np.repeat(np.arange(change.size), np.diff(np.r_[change, code.size]))
+            first = np.r_[True, code[1:] != code[:-1]][: code.size]  # no rows: no groups
+            starts[level], numbers[level] = np.flatnonzero(first), np.cumsum(first) - 1
         return cls(starts, numbers)
 
     def sums(self, values: np.ndarray, level: str) -> np.ndarray:

@@ -173,9 +173,8 @@ def descend(
     """Return the model of least penalised whitened sum of squares at fixed scatter, by Levenberg-Marquardt.
 
     The start, `model`, is moved inside the bounds. `centre`, shape (model.size,), is the mean of the prior.
-    `loads` of the random effects, shape (n, kinds), by default the model's at the start, are fixed, so that
-    all steps minimise the same function. The descent ends when the sum of squares falls by less than
-    `tolerance`.
+    `loads`, shape (n, kinds), by default the model's at the start, are fixed, so that all steps minimise the
+    same function. The descent ends when the sum of squares falls by less than `tolerance`.
     """
     precision = precision_of(model)
     low, high = bounds_of(model, rows)

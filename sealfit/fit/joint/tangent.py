@@ -179,7 +179,7 @@ class Tangent:
         unit = unit.with_values(project_out(unit.values))
         layout = self.layout
         shared = (layout.places >= 0).sum(axis=0) > 1
-        border = np.column_stack([unit._column(k) for k in np.flatnonzero(shared)]) if shared.any() else None
+        border = unit.columns(shared).toarray() if shared.any() else None
         most = 1.0 if border is None else max(1.0, float(np.linalg.norm(border, 2)))  # columns have length 1
         parts = []
         for index, rows in zip(layout.index, layout.rows, strict=True):
@@ -202,12 +202,6 @@ class Tangent:
         border = own.project_out(own.project_out(border))  # the second projection removes rounding errors
         left, spread, _ = np.linalg.svd(border, full_matrices=False)
         return own.append(left[:, spread > tolerance * most])
-
-    def _column(self, number: int) -> np.ndarray:
-        """Return one column, shape (n,)."""
-        place = self.layout.places[self.layout.block, number]
-        values = np.take_along_axis(self.values, np.maximum(place, 0)[:, None], axis=1)[:, 0]
-        return np.where(place >= 0, values, 0.0)
 
 
 class OwnColumns:

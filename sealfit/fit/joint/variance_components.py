@@ -59,8 +59,7 @@ def reml(
 ) -> tuple[float, tuple[Component, ...]]:
     """Return half the restricted deviance and the variance components of group means, by REML.
 
-    `jacobian`, shape (m, p), is the mean tangent of the model; `kinds` are the level and kind of the
-    components, finest level first, and `start` their starting variances.
+    `jacobian`, shape (m, p), is the model's mean tangent; `kinds` are levels and kinds, finest level first.
     """
     total = max(float(np.var(means.residual)), float(np.mean(means.variance)), 1e-20)
     square = np.maximum(np.mean(means.loads**2, axis=0), 1e-24)

@@ -24,9 +24,9 @@ from sealfit.fit.steady.condition import (
 )
 from sealfit.fit.steady.stribeck import NAMES, linearised
 from sealfit.fit.steady.uncertainty import (
+    SMALLEST_SHARE,
     UnitVariance,
     more_likely,
-    proportional_weights,
     run_means,
     run_weights,
     unit_variance,
@@ -100,27 +100,25 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], RepeatScatt
     solve(conditions)
     if not scatter.df > 0:
         conditions = _more_likely_weights(conditions)
-    first = _unit_variance(conditions, scatter)
+    first = unit_variance(*scatter_of_runs(conditions), scatter.df)
     for condition, value, df in zip(conditions, first.value, first.df, strict=True):
         if condition.model == FULL:
             drop_flat_curve(condition, value, df)
-    return conditions, scatter, _unit_variance(conditions, scatter)
+    return conditions, scatter, unit_variance(*scatter_of_runs(conditions), scatter.df)
 
 
 def _more_likely_weights(even: list[Condition]) -> list[Condition]:
     """Return conditions with equal weights or scatter proportional to friction, the more likely ones."""
     sizes = np.cumsum([len(c.runs) for c in even])[:-1]
-    weight = proportional_weights(np.concatenate([c.model_force() for c in even]))
+    # The fitted friction is taken: with measured forces a run that an offset brings near 0 would dominate.
+    size = np.abs(np.concatenate([c.model_force() for c in even]))
+    weight = 1.0 / np.maximum(size, SMALLEST_SHARE * size.max(initial=0.0) or 1.0) ** 2
     parts = zip(even, np.split(weight, sizes), strict=True)
     other = [replace(c, runs=c.runs.assign(weight=own)) for c, own in parts]
     solve(other)
     chi2 = [sum(c.chi2 for c in conditions) for conditions in (even, other)]
     chosen = more_likely(chi2, [np.ones(weight.size), weight], sum(c.df for c in even))
     return (even, other)[chosen]
-
-
-def _unit_variance(conditions: list[Condition], scatter: RepeatScatter) -> UnitVariance:
-    return unit_variance(*scatter_of_runs(conditions), scatter.df)
 
 
 def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
@@ -142,7 +140,7 @@ def _rows(
     covariance, changes = linearised(condition.jacobian(), weight, condition.values, condition.names, moved)
     shift, effects = changes[:, 0], changes[:, 1:]
     covariance = covariance * variance.value + effects @ effects.T
-    # What is smaller is rounding.
+    # Smaller shifts are rounding.
     shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)
     judged = judge(condition)
     spelled = {name: name if condition.has_load else FORCES.get(name, name) for name in NAMES}
@@ -150,14 +148,15 @@ def _rows(
         row = dict(zip(("identified", "reason"), judged[name], strict=True))
         if name in condition.names:
             j = condition.names.index(name)
+            value = condition.values[j]
             low, high = (None, None) if condition.low is None else (condition.low[j], condition.high[j])
             open_below = name == "v_s" and low == 0.0
-            if effects.any() and low is not None:
+            if effects.any() and low is not None:  # the half-widths are added in quadrature
                 reach = stdtrit(variance.df, 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
-                low, high = _widened(condition.values[j], low, high, reach)
-            # At its limit: not known with error zero.
-            stuck = condition.values[j] == 0.0
-            row |= {"value": condition.values[j], "se": None if stuck else np.sqrt(covariance[j, j])}
+                low = max(value - float(np.hypot(value - low, reach)), 0.0)
+                high = value + float(np.hypot(high - value, reach))
+            se = None if value == 0.0 else np.sqrt(covariance[j, j])  # at its limit: not known with error 0
+            row |= {"value": value, "se": se}
             row |= {"lo95": None if open_below else low, "hi95": high, "u_sys": abs(shift[j])}
         row |= {"quantity": "steady", "parameter": spelled[name], "unit": unit_of[name]}
         yield STEADY_FIT, table_row(**row)
@@ -174,11 +173,6 @@ def _rows(
         row["identified"] = judged[name][0]
         for source, value in (("sensor", shift[j]), *enumerate(effects[j], start=1)):
             yield STEADY_SHIFT, {**row, "source": str(source), "value": value}
-
-
-def _widened(value: float, low: float, high: float, reach: float) -> tuple[float, float]:
-    """Return the ends of an interval with a half-width added in quadrature on each side, not below 0."""
-    return max(value - float(np.hypot(value - low, reach)), 0.0), value + float(np.hypot(high - value, reach))
 
 
 def _statistics(

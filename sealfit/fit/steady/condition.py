@@ -55,8 +55,7 @@ class Condition:
     @property
     def shifts(self) -> np.ndarray:
         """Change of F sgn v per run along principal directions of the effects' uncertainty, shape (n, k)."""
-        names = shifts_of(self.runs)
-        return self.runs[names].to_numpy(float) if names else np.zeros((len(self.runs), 0))
+        return self.runs[shifts_of(self.runs)].to_numpy(float)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -118,10 +117,9 @@ def make_condition(name: str, runs: pd.DataFrame) -> Condition:
 def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return chi-square of run means, its degrees of freedom, and whether it is scatter, (conditions,) each.
 
-    Conditions with too few speeds for a Stribeck curve still show how the force changes from speed to speed,
-    which is no scatter between runs. Where several have the same speeds, the model of each is multiplied by
-    one factor per speed and direction, common to all of them. Where too few have, chi-square is no scatter,
-    unless no other condition shows any.
+    Conditions with too few speeds for a Stribeck curve also show how the force changes from speed to speed.
+    Where several have the same speeds, the model of each is multiplied by one factor per speed and direction,
+    common to all. Where too few have, chi-square is no scatter, unless no other condition shows any.
     """
     chi2, df = (np.array([getattr(c, name) for c in conditions], float) for name in ("chi2", "df"))
     few = [k for k, c in enumerate(conditions) if c.model == VISCOUS and c.few_speeds and c.values[0] > 0]

@@ -136,10 +136,9 @@ def solve_stribeck(speed, load, force, weight) -> StribeckFit:
 def stribeck_intervals(speed, load, force, weight, fit: StribeckFit, rise):
     """Return the ends of the profile-likelihood intervals of mu_s, mu_c, v_s, sigma_2, (problems, 4) each.
 
-    The interval of v_s is where the least sum of squares exceeds the minimum by at most `rise`, shape
-    (problems,): t^2 times the variance of unit weight. Its end is 0 or inf if it reaches a limit of the
-    search. Those of the others are unions, over these v_s, of the exact interval at that v_s with nonnegative
-    coefficients. Intervals may be asymmetric or open.
+    That of v_s is where the least sum of squares exceeds the minimum by at most `rise`, shape (problems,):
+    t^2 times the variance of unit weight. Its end is 0 or inf if it reaches a limit of the search. Those of
+    the others are unions, over these v_s, of the exact interval at that v_s with nonnegative coefficients.
     """
     problems = Separable(stribeck_basis(speed, load), force, weight, PHYSICAL)
     limit = fit.rss + rise

@@ -39,10 +39,10 @@ NEEDED = (
 def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     """Return one row per condition, run and direction: mean of its files, each the mean of its strokes.
 
-    Rows of table `steady` with `used` false are left out. The two directions of a file are merged. The
-    columns are `condition`, `run_id`, `direction`, `speed` (|v|), `set` (commanded |v|, NaN where unknown),
-    `load` (NaN where unknown), `force` (F sgn v) and `files`, sorted by the first three; and the columns of
-    `SHIFT`. FitError if a column is missing, no row is used, or a run has speed 0.
+    The two directions of a file are merged. The columns are `condition`, `run_id`, `direction`, `speed`
+    (|v|), `set` (commanded |v|) and `load`, NaN where unknown, `force` (F sgn v) and `files`, sorted by the
+    first three; and the columns of `SHIFT`. FitError if a column is missing, no row is used, or a run has
+    speed 0.
     """
     missing = [name for name in NEEDED if name not in steady.columns]
     if missing:
@@ -87,15 +87,6 @@ def run_weights(runs: pd.DataFrame, scatter: RepeatScatter) -> np.ndarray:
     force = runs["force"].abs().to_numpy(float)
     floor = SMALLEST_SD * float(force.max()) or 1.0
     return runs["files"].to_numpy(float) / np.maximum(scatter.sd_N(force), floor) ** 2
-
-
-def proportional_weights(fitted_N: np.ndarray) -> np.ndarray:
-    """Return 1/variance of run means with a scatter proportional to the friction, shape (n,), up to a factor.
-
-    The fitted friction is taken: with measured forces a run that an offset brings near zero would dominate.
-    """
-    size = np.abs(fitted_N)
-    return 1.0 / np.maximum(size, SMALLEST_SHARE * size.max(initial=0.0) or 1.0) ** 2
 
 
 def more_likely(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float) -> int:
