@@ -122,8 +122,7 @@ def central_jacobian(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray
 def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return (J'J)^-1, shape (..., p, p), and its rank; undetermined parameters have infinite variance.
 
-    J, shape (..., n, p), is the derivative of the weighted residual. Parameters not in `free`, shape
-    (..., p), are fixed: their variance is 0.
+    J, shape (..., n, p), is of weighted residuals. Parameters not in `free`, (..., p), have variance 0.
     """
     n, p = jacobian.shape[-2:]
     free = np.ones(p, bool) if free is None else free
@@ -282,11 +281,8 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     inner = rss[:, 1:-1]
     problem, k = np.nonzero((inner <= rss[:, :-2]) & (inner <= rss[:, 2:]))
 
-    def solved(u, problem):
-        return profile(problems, u[:, None], problem.astype(int), refine=2)
-
     def rss_at(u, problem):
-        return solved(u, problem)[0][:, 0]
+        return profile(problems, u[:, None], problem.astype(int), refine=2)[0][:, 0]
 
     bracket = tuple(grid[problem, k + step] for step in range(3))
     stops = {"xatol": CLOSE, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
@@ -294,7 +290,7 @@ def global_optimum(problems: Separable, grid: np.ndarray) -> BatchFit:
     every = np.arange(len(problems.y))
     problem = np.concatenate([problem, every])
     u = np.concatenate([valley, grid[every, np.argmin(rss, axis=1)]])
-    rss, coefficients = (found[:, 0] for found in solved(u, problem))
+    rss, coefficients = (found[:, 0] for found in profile(problems, u[:, None], problem, refine=2))
     order = np.lexsort([rss, problem])
     best = order[np.unique(problem[order], return_index=True)[1]]
     return BatchFit(u[best], coefficients[best], rss[best])

@@ -221,10 +221,7 @@ def _rows(values: Values, curves: list[SeriesCurve], fitted: list[str], moved: n
 
 
 def aging_curves(laws: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Return table `aging_curves`: laws of series up to the last tested day, with 95 % bands of their means.
-
-    `laws` are tables `aging_fit` and `aging_covariance`.
-    """
+    """Return table `aging_curves`: laws of series up to the last tested day, with 95 % bands of the mean."""
     tables, fit, covariance = [], laws["aging_fit"], laws["aging_covariance"]
     of_law = dict(iter(covariance.groupby(["series", "quantity"])))
     for series, own in fit.groupby("series", sort=False):

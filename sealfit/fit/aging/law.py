@@ -358,11 +358,10 @@ def _rescan(found: LawFit) -> np.ndarray | None:
 
 
 def paule_mandel(chi2: Callable[[float], float], df: float, residual: np.ndarray) -> float:
-    """Return the relative scatter that reduces chi-square to its degrees of freedom; 0 if it is not larger.
+    """Return the relative scatter that reduces chi-square, a function of it, to its degrees of freedom.
 
-    `chi2` is chi-square as a function of the scatter, with which it falls; `residual` are the relative
-    residuals, at whose RMS the search starts. Paule and Mandel 1982, J. Res. NBS 87(5), 377-385,
-    doi:10.6028/jres.087.022.
+    It is 0 if chi-square is not larger; the search starts at the RMS of the relative residuals. Paule and
+    Mandel 1982, J. Res. NBS 87(5), 377-385, doi:10.6028/jres.087.022.
     """
     if df < 1 or not chi2(0.0) > df:  # also if chi-square is NaN
         return 0.0

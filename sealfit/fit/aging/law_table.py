@@ -53,10 +53,7 @@ def elsewhere(fit: LawFit, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def likelihoods(fit: LawFit) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the likelihood of mu_0 from other groups: R, shape (g, m + 1, m), and r, (g, m + 1), of each.
-
-    Their chi-square is |R (mu_0 - fitted) + r|^2.
-    """
+    """Return R, (g, m + 1, m), and r, (g, m + 1): others' chi-square is |R (mu_0 - fitted) + r|^2."""
     found = []
     for square in elsewhere(fit, fit.residuals):
         share, axes = np.linalg.eigh(square)

@@ -71,8 +71,7 @@ def lifetime(
     """Return the `DaysToThreshold` of rubber aged at a temperature and compression.
 
     The temperature in degrees Celsius and the height in percent in use are needed if the tests varied them.
-    RequestError if one is missing that the law needs, given though the tests did not vary it, or out of the
-    range of use.
+    RequestError if one is missing, given though the tests did not vary it, or out of the range of use.
     """
     place = _place(law, temperature_C, compression_ratio_pct)
     days = _days(law, law.x, goal, place)
@@ -215,9 +214,9 @@ def temperature_for(
     """Return the temperature of use at which the lifetime is a number of years, and its 95 % interval.
 
     It is inf in degrees Celsius if the lifetime is longer at all temperatures searched, -inf if shorter. The
-    interval contains the temperatures whose lifetime interval contains the years (Fieller's method); an end
-    that was not found is infinite. RequestError if the rubber was aged at one temperature only, or the years
-    are not positive.
+    interval has the temperatures whose lifetime interval contains the years (Fieller's method); an end that
+    was not found is infinite. RequestError for rubber aged at one temperature only, or years that are not
+    positive.
     """
     if not 0 < years < np.inf:
         raise RequestError(f"--years {years:g} is no time to last.", fix="Give a number above 0.")

@@ -39,8 +39,7 @@ FAR_OFF = 0.001
 class Means:
     """Means of one property of one rubber over specimens and batches, by condition.
 
-    Standard deviations are nan if not determined. Degrees of freedom are Satterthwaite's, 0 without
-    replicates.
+    Standard deviations are nan if unknown. Degrees of freedom are Satterthwaite's, 0 without replicates.
     """
 
     table: pd.DataFrame  # a row per condition: series, condition, its columns, value, and n, its specimens

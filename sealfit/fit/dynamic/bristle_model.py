@@ -162,8 +162,8 @@ class Rises:
     def _columns(self, sigma_0: float, *, slopes: bool) -> list[np.ndarray]:
         """Return the columns at sigma_0, and with `slopes` their derivatives with respect to log sigma_0.
 
-        The shape of each is (2, strokes, 2, rows): the first plus tau times the second are the force from
-        relaxed bristles, and that of a start of 1 N.
+        They are (2, strokes, 2, rows): the first plus tau times the second are the force from relaxed
+        bristles, and that of a start of 1 N.
         """
         slid = sigma_0 * self.step / self.between
         kept = np.exp(-slid)

@@ -56,9 +56,8 @@ def fit_ramps(
     """Return the motion of platforms along a linear ramp or a first-order lag, whichever fits better.
 
     The two parameters of a ramp, beginning and length, use all samples; a local speed is too noisy. Position
-    and final speed are solved for exactly (variable projection: Kaufman 1975, BIT 15, 49-57,
-    doi:10.1007/BF01932995). Displacements are positive along the motion; `paces_mm_s` are about the final
-    speeds.
+    and final speed, near `paces_mm_s`, are solved for exactly (variable projection: Kaufman 1975, BIT 15,
+    49-57, doi:10.1007/BF01932995). Displacements are positive along the motion.
     """
     made: list[Ramp | None] = [None] * len(times_s)
     of_length: dict[int, list[int]] = {}
@@ -294,10 +293,9 @@ def _begun(stroke: Along, ramp: Ramp | None) -> StrokeStart | None:
 
 
 def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance and speed up to steady sliding by a Savitzky-Golay filter of second order.
+    """Return distance and speed up to steady sliding, smoothed over a width that depends on the noise.
 
-    Its width depends on the noise. Savitzky and Golay 1964, Anal. Chem. 36(8), 1627-1639,
-    doi:10.1021/ac60214a047.
+    Savitzky and Golay 1964, Anal. Chem. 36(8), 1627-1639, doi:10.1021/ac60214a047; of second order.
     """
     half = _half_width(stroke) if stroke.noisy else 1
     rows = slice(0, stroke.until + half + 1)  # all rows that the filter needs

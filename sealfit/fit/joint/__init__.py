@@ -81,7 +81,7 @@ class Fitted:
     def at_limit(self) -> np.ndarray:
         """Whether each fitted number is a sigma_2 of 0 that the data would make negative, shape (p,).
 
-        It does not count as a direction of the model, as the fit cannot follow the residual along it.
+        The fit cannot follow the residual along it, so that it is no direction of the model.
         """
         found = np.zeros(self.model.size, dtype=bool)
         quantities = [parameter.quantity for parameter in self.model.declared.parameters]
@@ -179,10 +179,7 @@ def _alternately(model: Model, rows: Rows, scatter: Scatter | None, centre: np.n
 
 
 def _misses_levels(fitted: Fitted) -> bool:
-    """Whether least squares without the scatter of specimens would leave a much smaller error.
-
-    If an effect changes the curves of specimens, all of the error of their levels may be taken for scatter.
-    """
+    """Whether least squares without the scatter of specimens would leave a much smaller error."""
     parts = [part for part in fitted.scatter.components if part.level == "specimen"]
     if not any(part.variance > 0 and part.kind not in LEVELS_OF_FORCE for part in parts):
         return False

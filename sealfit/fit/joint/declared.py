@@ -125,10 +125,7 @@ def _drops(number_s: np.ndarray, number_c: np.ndarray, rows: Rows) -> dict[tuple
 
 
 def series_of_curve(conditions, aging: bool) -> np.ndarray:
-    """Return the series whose v_s and sigma_2 each condition uses, shape (conditions,).
-
-    Unaged rubber belongs to the series of its rubber if there is exactly one.
-    """
+    """Return the series whose v_s each condition uses; unaged rubber uses the only one of its rubber."""
     series = conditions["series"].to_numpy(dtype=object).copy()
     if aging:
         for rubber in conditions["rubber"].unique():
@@ -140,10 +137,7 @@ def series_of_curve(conditions, aging: bool) -> np.ndarray:
 
 
 def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
-    """Return the form of the speed dependence that the speeds of each series determine.
-
-    It is a curve, too, if another series of the rubber has one, as an effect may hide it in one series.
-    """
+    """Return the form of the speed dependence of each series; a curve, if one of the same rubber has one."""
     number, names = pd.factorize(series_of)
     forms = {}
     for k, name in enumerate(names):

@@ -61,9 +61,8 @@ class Term:
     def nodes(self, rows: Rows) -> list[tuple[float, dict[str, np.ndarray]]]:
         """Return (weight, inputs) at the quadrature nodes of each row, a mean over the samples of a bin.
 
-        The mean of a sine has a closed form. Another nonlinear shape along the stroke is averaged by
-        Gauss-Legendre quadrature, over a uniform distribution with the variance of the samples. Others are
-        evaluated at the mean.
+        The mean of a sine has a closed form; another nonlinear shape along the stroke is averaged over a
+        uniform distribution with the variance of the samples; others are evaluated at the mean.
         """
         return rows.cache.once(("nodes", self.shape_key), lambda: self._nodes(rows))
 
@@ -215,11 +214,9 @@ class Model:
 
     def geometric_means(self) -> dict[str, float]:
         """Return the mean over series of each declared quantity whose logarithm is fitted."""
-        logs: dict[str, list[float]] = {}
-        for log, p in zip(self.theta.tolist(), self.declared.parameters, strict=True):
-            if p.quantity in LOGARITHMIC:
-                logs.setdefault(p.quantity, []).append(log)
-        return {quantity: float(np.exp(np.mean(own))) for quantity, own in logs.items()}
+        quantities = [p.quantity for p in self.declared.parameters]
+        means = pd.Series(self.theta, quantities).groupby(level=0).mean()
+        return {name: float(np.exp(means[name])) for name in LOGARITHMIC if name in means}
 
     def with_term(self, term: Term, values: Mapping[str, float]) -> Model:
         """Return the model with one more term."""
@@ -284,8 +281,7 @@ def _blocks(declared: Declared, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 def loads_of(model: Model, rows: Rows, friction: np.ndarray | None = None) -> np.ndarray:
     """Return the change of the force per unit of each kind of random effect, shape (n, kinds).
 
-    That of a gain is `friction`, shape (n,), by default the model's; that of v_s is per unit of its
-    logarithm.
+    That of a gain is `friction`, by default the model's; that of v_s is per unit of its logarithm.
     """
     state = _ForceParts(model, rows)
     slopes, friction = state.slopes(), state.friction if friction is None else friction

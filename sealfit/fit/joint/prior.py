@@ -109,10 +109,7 @@ def penalised(normal: np.ndarray, gradient: np.ndarray, penalty: np.ndarray) -> 
 
 
 def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
-    """Return the model with the smoothness of its free shapes estimated by REML, one after the other.
-
-    `normal` and `gradient` are those of the whitened tangent and residual, without prior.
-    """
+    """Return the model with the smoothness of its free shapes estimated by REML, one after the other."""
     for number, term in enumerate(model.terms):
         if term.smoothness is None:
             continue

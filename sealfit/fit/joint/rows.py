@@ -240,8 +240,7 @@ class Rows:
 def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame | None = None) -> Rows:
     """Return table `bins` as sorted arrays with nested groups.
 
-    `has_aging` is whether the config's condition has `aging_days`. `conditions` are those of the campaign of
-    which these bins are a part.
+    `has_aging` is whether conditions have `aging_days`; `conditions` are those of the whole campaign.
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
     run = nesting_run(table, table["record"])
@@ -382,8 +381,7 @@ def point_rows(
 ) -> Rows:
     """Return the points of a prediction as `Rows`, one group per point.
 
-    `table`, shape (n, ...), has `speed_mm_s` and all channels that the model reads; `condition`, shape (n,),
-    are places in `conditions`.
+    `table`, shape (n, ...), has `speed_mm_s` and all channels that the model reads.
     """
     n = len(table)
     every = np.arange(n)

@@ -205,10 +205,9 @@ class Tangent:
 
 
 class OwnColumns:
-    """A few columns per specimen, zero outside its rows: those of different specimens are orthogonal.
+    """A few columns per specimen, `code`, zero outside its rows: those of different specimens are orthogonal.
 
-    `code`, shape (n,), is the specimen of each row, and `loads`, shape (n,) or (n, k), are the values there.
-    Columns that others of the specimen contain do not count.
+    `loads`, shape (n,) or (n, k), are their values. Columns that others of the specimen contain do not count.
     """
 
     def __init__(self, code: np.ndarray, loads: np.ndarray) -> None:

@@ -57,10 +57,7 @@ def reml(
     kinds: Sequence[tuple[str, str]],
     start: Sequence[float] | None = None,
 ) -> tuple[float, tuple[Component, ...]]:
-    """Return half the restricted deviance and the variance components of group means, by REML.
-
-    `jacobian`, shape (m, p), is the model's mean tangent; `kinds` are levels and kinds, finest level first.
-    """
+    """Return half the restricted deviance and the variance components, finest level first, by REML."""
     total = max(float(np.var(means.residual)), float(np.mean(means.variance)), 1e-20)
     square = np.maximum(np.mean(means.loads**2, axis=0), 1e-24)
     unit = np.array([total / square[KINDS.index(kind)] for _, kind in kinds])
@@ -89,10 +86,7 @@ def reml(
 
 
 class RestrictedLikelihood:
-    """Half the restricted deviance of group means, and its gradient, as functions of the variances.
-
-    `basis`, shape (m, p), has orthonormal columns that span the model's tangent.
-    """
+    """Half the restricted deviance of group means, and its gradient, as functions of the variances."""
 
     def __init__(self, means: GroupMeans, basis: Tangent, kinds: Sequence[tuple[str, str]]) -> None:
         groups, self.variance = means.groups, means.variance

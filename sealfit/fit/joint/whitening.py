@@ -77,11 +77,7 @@ class Scatter:
 
 
 class Between:
-    """Whitening of a few numbers per stroke with independent noise, under the variance components.
-
-    `variance`, shape (m,), is each number's own noise; `loads`, shape (m, kinds), are their changes per unit
-    of each kind.
-    """
+    """Whitening of a few numbers per stroke with independent noise, under the variance components."""
 
     def __init__(
         self, variance: np.ndarray, loads: np.ndarray, groups: Groups, components: Sequence[Component]
@@ -147,10 +143,7 @@ class Whitening:
         self.logdet = self.between.logdet + float(2 * np.log(sd).sum() + (n - 2 * m) * np.log(scatter.shape))
 
     def normal(self, tangent: Tangent, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return C' V^-1 C, shape (p, p), and C' V^-1 r, shape (p,), of a tangent C.
-
-        The columns of C are not whitened for this; `residual`, shape (n,), is whitened already.
-        """
+        """Return C' V^-1 C, (p, p), and C' V^-1 r, (p,), of a tangent C and a residual whitened already."""
         scaled, numbers = tangent.values * self.unit[:, None], self.take @ tangent.values
         between, kept = self.between(numbers), numbers / self.root
         rows, strokes = tangent.layout, tangent.layout.of(self.twice)
