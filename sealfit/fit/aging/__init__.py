@@ -115,15 +115,6 @@ def _curves_of(found: pd.DataFrame, series: Sequence[str], quantities: Sequence[
     return curves
 
 
-def _numbers_of(found: pd.DataFrame, curves: list[SeriesCurve]) -> np.ndarray:
-    """Return the number of each value's curve, shape (n,); -1 for unaged rubber, `WITHOUT_LAW` for none."""
-    place = {(c.series, c.quantity): c.place for c in curves if c.place >= 0}
-    keys = zip(found["series"], found["quantity"], strict=True)
-    own = np.array([place.get(key, WITHOUT_LAW) for key in keys], int)
-    has_law = found["quantity"].isin({quantity for _, quantity in place}).to_numpy()
-    return np.where((found["aging_days"] == 0).to_numpy() & has_law, -1, own)
-
-
 def steady_covariance(used: pd.DataFrame, known: pd.DataFrame) -> csr_array:
     """Return the covariance of steady values, shape (n, n), from table `steady_covariance`, `known`."""
     quantity, n = used["quantity"].to_numpy(object), len(used)
@@ -187,7 +178,12 @@ def laws_of_series(
         return [row for curve in curves for row in law_table.without_law(curve)], []
     days, value, moved = (found[name].to_numpy(float) for name in ("aging_days", "value", "moved"))
     origin = np.array([quantities.index(name) for name in found["quantity"]], int)
-    number = _numbers_of(found, curves)
+    # The number of each value's curve; -1 for unaged rubber, `WITHOUT_LAW` for none.
+    place = {(c.series, c.quantity): c.place for c in curves if c.place >= 0}
+    keys = zip(found["series"], found["quantity"], strict=True)
+    number = np.array([place.get(key, WITHOUT_LAW) for key in keys], int)
+    has_law = found["quantity"].isin(fitted).to_numpy()
+    number = np.where((found["aging_days"] == 0).to_numpy() & has_law, -1, number)
     kept = number > WITHOUT_LAW
     values = Values(days, value, origin, number, covariance, **replicates).part(kept)
     return _rows(values, curves, fitted, moved[kept])

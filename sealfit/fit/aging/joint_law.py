@@ -104,11 +104,6 @@ class Aged:
         """Reference temperature and compression, the middle of the tested ones, by the coefficient's name."""
         return {name: float(np.median(np.unique(at[self.days > 0]))) for name, at in self.known.items()}
 
-    def away(self, name: str, middle: float) -> np.ndarray:
-        """Return the factor of a coefficient in ln k relative to a temperature or compression, shape (n,)."""
-        of = DRIVERS[name][1]
-        return np.where(self.days > 0, of(middle) - of(self.known[name]), 0.0)
-
     def series(self) -> np.ndarray:
         """Return the number of each value's series, shape (n,); -1 for unaged specimens."""
         number = np.where(self.days > 0, 0, -1)
@@ -196,24 +191,24 @@ class JointLaw:
 
     def factors(self, aged: Aged, x: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the factors of temperature and compression on time and on the loss, shape (..., n) each."""
-        k = self.rate(aged, x)
+        x, logarithm = self.x if x is None else x, np.zeros(aged.days.size)
+        for name, away in self.away(aged).items():
+            logarithm = logarithm + x[..., self.names.index(name), None] * away
+        k = np.exp(np.clip(logarithm, -50, 50))
         return (k, np.ones_like(k)) if self.acts_on == "rate" else (np.ones_like(k), k)
 
     def own(self, x: np.ndarray) -> list[np.ndarray]:
         """Return the parameters of the shape, shape (..., 1) each."""
         return [np.exp(x[..., 2 + k, None]) for k in range(len(self.loss.parameters))]
 
-    def rate(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
-        """Return k at the conditions, shape (..., n)."""
-        x, logarithm = self.x if x is None else x, np.zeros(aged.days.size)
-        for name, away in self.away(aged).items():
-            logarithm = logarithm + x[..., self.names.index(name), None] * away
-        return np.exp(np.clip(logarithm, -50, 50))
-
     def away(self, aged: Aged) -> dict[str, np.ndarray]:
         """Return the factors of E and kappa, if varied, in ln k at the conditions, shape (n,) each."""
-        varied = self.names[2 + len(self.loss.parameters) :]
-        return {name: aged.away(name, self.aged.middle[name]) for name in varied}
+        found = {}
+        for name in self.names[2 + len(self.loss.parameters) :]:
+            of = DRIVERS[name][1]
+            away = of(self.aged.middle[name]) - of(aged.known[name])
+            found[name] = np.where(aged.days > 0, away, 0.0)
+        return found
 
     def slope(self, aged: Aged, x: np.ndarray | None = None) -> np.ndarray:
         """Return the derivatives with respect to x, shape (p, n), or (..., p, n) for x of shape (..., p)."""

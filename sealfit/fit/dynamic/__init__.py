@@ -13,7 +13,7 @@ from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.fit.dynamic.bristle_model import Cells, RisingStroke, StribeckCurve, over_strokes
 from sealfit.fit.dynamic.presliding import AT, Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
-from sealfit.fit.dynamic.starts import Along, StrokeStart, starts_of, strokes_along, whole_strokes
+from sealfit.fit.dynamic.starts import StrokeStart, starts_of, strokes_along, whole_strokes
 from sealfit.fit.joint.rows import nesting_run, records
 from sealfit.fit.steady import SteadyFit, condition_keys, covariance_matrix, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces
@@ -176,7 +176,10 @@ def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
         traces = traces.read(OF_TRACES, coded=["file"])
     file = pd.factorize(steady["file"])[0]
     table = steady.assign(file_number=file).reset_index(drop=True)
-    along = _less_effects(strokes_along(traces, table), table)
+    along = strokes_along(traces, table)
+    if "effects_start_N" in table:  # the effects' force at the start is subtracted
+        size = (table["effects_start_N"] * table["direction"]).tolist()
+        along = [replace(stroke, force_N=stroke.force_N - size[stroke.row]) for stroke in along]
     starts = {start.row: start for start in starts_of(along)}
     wholes = {whole.row: whole for whole in whole_strokes(along)}
     begun = steady.iloc[list(starts)]
@@ -201,14 +204,6 @@ def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
             if ran:
                 tables[3].append(peaks(Cells(ran), file).assign(**at))
     return [_together(parts) for parts in tables]
-
-
-def _less_effects(strokes: Sequence[Along], steady: pd.DataFrame) -> Sequence[Along]:
-    """Return strokes minus the effects' force at their start, if table `steady` has it."""
-    if "effects_start_N" not in steady:
-        return strokes
-    size = (steady["effects_start_N"] * steady["direction"]).tolist()
-    return [replace(stroke, force_N=stroke.force_N - size[stroke.row]) for stroke in strokes]
 
 
 def _mean_start(cells: Cells, models: Sequence[np.ndarray] | None) -> pd.DataFrame:
