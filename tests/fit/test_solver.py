@@ -58,7 +58,7 @@ def test_no_v_s_of_a_fine_search_does_better(kind):
     npt.assert_allclose(fit.rss, np.sum(rest**2, axis=1), rtol=1e-9)
     for k in range(0, PROBLEMS, 50):
         scan = []
-        for v_s in np.exp(np.linspace(fit.limits[0][k], fit.limits[1][k], 1500)):
+        for v_s in np.exp(np.linspace(*fit.grid[k, [0, -1]], 1500)):
             decay = np.exp(-((speed[k] / v_s) ** 2))
             columns = np.stack([load[k] * decay, load[k] * (1 - decay), speed[k]], axis=1) * root[k][:, None]
             size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -78,7 +78,7 @@ def test_no_other_solver_does_better_from_the_truth(kind):
         def residual(p, x=x, y=y, root=root):
             return root * (model(x, *p) - y)
 
-        low, high = np.exp([fit.limits[0][k], fit.limits[1][k]])
+        low, high = np.exp(fit.grid[k, [0, -1]])
         start = np.clip(truth[k], [0, 0, low * 1.001, 0], [5, 5, high * 0.999, np.inf])
         with np.errstate(all="ignore"):
             other = least_squares(residual, start, bounds=([0, 0, low, 0], [np.inf, np.inf, high, np.inf]))
