@@ -407,5 +407,8 @@ def condition_keys(names: Names, table: RunsTable | None, header: Collection[str
     write = f"Write a {RUNS_CSV} with" if table is None else f"Add to {table.file}"
     notes.guess("condition", ["state"], "nothing tells conditions apart")
     notes.guess("files.columns.state", "one", "the same for all files")
-    notes.doubt("condition", "nothing says what differs between the files: all are taken as one condition.",
-                f"{write} temperature_C, compression_ratio_pct and aging_days.")  # fmt: skip
+    notes.doubt(
+        "condition",
+        "nothing says what differs between the files: all are taken as one condition.",
+        f"{write} temperature_C, compression_ratio_pct and aging_days.",
+    )

@@ -128,15 +128,26 @@ def build_report(tables: Tables, closure: Mapping | None, provenance: Mapping, c
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
     html = TEMPLATES.get_template("template.html").render(
-        style=Markup(_text("style.css")), script=Markup(_text("report.js")), runs=Markup(runs),
+        style=Markup(_text("style.css")),
+        script=Markup(_text("report.js")),
+        runs=Markup(runs),
         script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(),
-        plots=plots, images=images, most_channels=MOST_CHANNELS,
-        tables=tables, closure=closure, config=config, units=config.units,
-        unit=config.units.unit("force"), force=config.units.quantity("force"),
-        names=ConditionNames.of(config), name=name_of(provenance, config), provenance=provenance,
+        plots=plots,
+        images=images,
+        most_channels=MOST_CHANNELS,
+        tables=tables,
+        closure=closure,
+        config=config,
+        units=config.units,
+        unit=config.units.unit("force"),
+        force=config.units.quantity("force"),
+        names=ConditionNames.of(config),
+        name=name_of(provenance, config),
+        provenance=provenance,
         most_inputs=MOST_INPUTS,
-        fitted=_fitted(tables, config), **opening,
-    )  # fmt: skip
+        fitted=_fitted(tables, config),
+        **opening,
+    )
     return Report(html, figures)
 
 

@@ -191,10 +191,16 @@ def compose(plot: Plot, kind: type[Figure] = Figure) -> Figure:
         for ax in axes:
             ax.remove()
         legend = figure.legend(
-            handles=[_handle(key) for key in plot.legend], loc="outside upper left", title=plain(plot.title),
-            title_fontproperties={"weight": "bold", "size": 10}, ncols=entries, handlelength=1.8,
-            columnspacing=1.4, labelspacing=0.35, fontsize=8,
-        )  # fmt: skip
+            handles=[_handle(key) for key in plot.legend],
+            loc="outside upper left",
+            title=plain(plot.title),
+            title_fontproperties={"weight": "bold", "size": 10},
+            ncols=entries,
+            handlelength=1.8,
+            columnspacing=1.4,
+            labelspacing=0.35,
+            fontsize=8,
+        )
         legend.set_alignment("left")
         return figure
 

@@ -239,12 +239,17 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
     for number, law in enumerate(laws):
         errors = left_out(law) if number < HELD_OUT_LAWS else {}
         head = {
-            "law": law.loss.name, "way": law.acts_on if best.aged.drivers() else "", "form": law.loss.form,
-            "rank": number + 1, "rival": law in rivals, "criterion": law.bic - best.bic,
-            "scatter_rel": law.scatter, "lack_of_fit_p": law.lack_of_fit_p(),
+            "law": law.loss.name,
+            "way": law.acts_on if best.aged.drivers() else "",
+            "form": law.loss.form,
+            "rank": number + 1,
+            "rival": law in rivals,
+            "criterion": law.bic - best.bic,
+            "scatter_rel": law.scatter,
+            "lack_of_fit_p": law.lack_of_fit_p(),
             "heldout_series": errors.get("series", np.nan),
             "heldout_last_day": errors.get("last_day", np.nan),
-        }  # fmt: skip
+        }
         units = {"mu_0": unit, "a": unit, "E": "kJ/mol", "kappa": "1/%"}
         units |= dict(zip(law.loss.parameters, law.loss.units, strict=True))
         for name, value, low, high, known in law.parameters():
@@ -253,10 +258,15 @@ def _law_rows(laws: Sequence[JointLaw], unit: str) -> Iterator[dict]:
     apart = _separate(best)
     if apart is not None:
         yield {
-            "law": SEPARATE, "way": "", "form": "mu_0 - a ln(1 + t/b), a and b of each series",
-            "rank": len(laws) + 1, "rival": False, "criterion": apart[0] - best.bic,
-            "heldout_last_day": apart[1], "identified": True,
-        }  # fmt: skip
+            "law": SEPARATE,
+            "way": "",
+            "form": "mu_0 - a ln(1 + t/b), a and b of each series",
+            "rank": len(laws) + 1,
+            "rival": False,
+            "criterion": apart[0] - best.bic,
+            "heldout_last_day": apart[1],
+            "identified": True,
+        }
 
 
 def _separate(law: JointLaw) -> tuple[float, float] | None:

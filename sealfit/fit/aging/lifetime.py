@@ -301,16 +301,23 @@ def answer(
         tested = law.aged.temperature_C[law.aged.days > 0]
         low, high = float(tested.min()), float(tested.max())
         return found | {
-            "years": years, "temperature_C": _finite(celsius), "temperature_ci95": finite_ends(ends),
+            "years": years,
+            "temperature_C": _finite(celsius),
+            "temperature_ci95": finite_ends(ends),
             "always": None if np.isfinite(celsius) else "longer" if celsius > 0 else "shorter",
-            "extrapolated": not low <= celsius <= high, "tested_C": [low, high], "sought_C": list(SPAN_C),
-        }  # fmt: skip
+            "extrapolated": not low <= celsius <= high,
+            "tested_C": [low, high],
+            "sought_C": list(SPAN_C),
+        }
     life = lifetime(law, goal, temperature_C, compression_ratio_pct)
     found |= {
-        "threshold": life.threshold, "days": _finite(life.days), "ci95": finite_ends((life.low, life.high)),
-        "extrapolated": life.extrapolated, "beyond_tests": _finite(life.beyond),
+        "threshold": life.threshold,
+        "days": _finite(life.days),
+        "ci95": finite_ends((life.low, life.high)),
+        "extrapolated": life.extrapolated,
+        "beyond_tests": _finite(life.beyond),
         "outside": list(life.outside),
-    }  # fmt: skip
+    }
     if resample and 0 < life.days < FOREVER:
         found["ci95_resampled"] = finite_ends(resampled(law, goal, temperature_C, compression_ratio_pct))
     return found

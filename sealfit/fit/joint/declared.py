@@ -168,11 +168,18 @@ def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     nearest = np.abs(speed[:, None] - tested_speeds(rows, chosen)).argmin(axis=1)
     repeat = rows.table["repeat"].to_numpy()[chosen]
-    table = pd.DataFrame({
-        "file": rows.codes("file")[chosen], "direction": np.sign(rows.speed[chosen]),
-        "condition": rows.condition[chosen], "repeat": repeat, "slow": nearest == 0, "middle": nearest == 1,
-        "slope": speed / load, "mu": np.abs(rows.force[chosen]) / load,
-    })  # fmt: skip
+    table = pd.DataFrame(
+        {
+            "file": rows.codes("file")[chosen],
+            "direction": np.sign(rows.speed[chosen]),
+            "condition": rows.condition[chosen],
+            "repeat": repeat,
+            "slow": nearest == 0,
+            "middle": nearest == 1,
+            "slope": speed / load,
+            "mu": np.abs(rows.force[chosen]) / load,
+        }
+    )
     files = table.groupby(["file", "direction", "condition", "slow", "middle"], as_index=False).mean()
     of_level = ("condition", "repeat", "direction")
     levels = np.hstack([pd.get_dummies(files[name], dtype=float) for name in of_level])

@@ -270,11 +270,21 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     pace = table["speed_bin_mm_s"].to_numpy(dtype=float) if "speed_bin_mm_s" in table else measured
     load = table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table))
     return Rows(
-        table=table, order=order, groups=groups, force=table["force_N"].to_numpy(dtype=float),
-        speed=speed, pace=pace * speed / measured, load=load, days=days, condition=condition,
-        conditions=conditions, has_load=has_load, has_aging=has_aging,
-        weight=1.0 / per_file / (files.max() + 1), filled=fill_missing(table, groups),
-    )  # fmt: skip
+        table=table,
+        order=order,
+        groups=groups,
+        force=table["force_N"].to_numpy(dtype=float),
+        speed=speed,
+        pace=pace * speed / measured,
+        load=load,
+        days=days,
+        condition=condition,
+        conditions=conditions,
+        has_load=has_load,
+        has_aging=has_aging,
+        weight=1.0 / per_file / (files.max() + 1),
+        filled=fill_missing(table, groups),
+    )
 
 
 def set_speeds(speed: np.ndarray, run: np.ndarray) -> np.ndarray:
@@ -388,8 +398,17 @@ def point_rows(
     days = conditions["aging_days"].to_numpy(dtype=float)[condition] if has_aging else np.zeros(n)
     speed = table["speed_mm_s"].to_numpy(dtype=float)
     return Rows(
-        table=table, order=every, groups=Groups.of({level: every for level in LEVELS}), force=np.zeros(n),
-        speed=speed, pace=speed, load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(n),
-        days=days, condition=np.asarray(condition), conditions=conditions, has_load=has_load,
-        has_aging=has_aging, weight=np.full(n, 1.0 / max(n, 1)),
-    )  # fmt: skip
+        table=table,
+        order=every,
+        groups=Groups.of({level: every for level in LEVELS}),
+        force=np.zeros(n),
+        speed=speed,
+        pace=speed,
+        load=table["load_N"].to_numpy(dtype=float) if has_load else np.ones(n),
+        days=days,
+        condition=np.asarray(condition),
+        conditions=conditions,
+        has_load=has_load,
+        has_aging=has_aging,
+        weight=np.full(n, 1.0 / max(n, 1)),
+    )

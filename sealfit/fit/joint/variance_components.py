@@ -75,10 +75,13 @@ def reml(
     first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, LEAST_START)
     # The parameters are standard deviations: a zero component has its minimum at 0, in logarithms at -inf.
     best = minimize(
-        objective, np.minimum(np.sqrt(first), 0.6 * high), jac=True, method="L-BFGS-B",
+        objective,
+        np.minimum(np.sqrt(first), 0.6 * high),
+        jac=True,
+        method="L-BFGS-B",
         bounds=[(0.0, most) for most in high],
         options={"maxiter": 200, "ftol": 1e-10},  # so that rounding in the residual changes no estimate
-    )  # fmt: skip
+    )
     share = best.x**2
     variances = np.where(share > LEAST, unit * share, 0.0)
     parts = zip(kinds, variances.tolist(), strict=True)

@@ -63,10 +63,18 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
         for direction, points in line.points.groupby("direction"):
             marker, face = ("o", line.colour) if direction > 0 else ("<", "white")
             drawn, *_ = ax.errorbar(
-                points["speed"], points["force"], points["sd"].fillna(0.0), color=line.colour, fmt=marker,
-                markersize=3.4, markerfacecolor=face, markeredgewidth=0.9, elinewidth=0.8,
-                capsize=0.0 if dense else 1.5, rasterized=dense,
-            )  # fmt: skip
+                points["speed"],
+                points["force"],
+                points["sd"].fillna(0.0),
+                color=line.colour,
+                fmt=marker,
+                markersize=3.4,
+                markerfacecolor=face,
+                markeredgewidth=0.9,
+                elinewidth=0.8,
+                capsize=0.0 if dense else 1.5,
+                rasterized=dense,
+            )
             if not dense:
                 explain(drawn, [_of_run(row, line.label, units) for row in points.to_dict("records")])
     if log:
@@ -165,9 +173,12 @@ def run_points(steady: pd.DataFrame) -> pd.DataFrame:
     run = ["condition", "run_id", "direction"]
     files = rows.groupby([*run, "file"], sort=False)[["speed", "force"]].mean().reset_index()
     found = files.groupby(run, sort=False).agg(
-        speed=("speed", "mean"), force=("force", "mean"), sd=("force", "std"), n=("force", "size"),
+        speed=("speed", "mean"),
+        force=("force", "mean"),
+        sd=("force", "std"),
+        n=("force", "size"),
         files=("file", lambda own: ", ".join(style.spread(list(own), MOST_FILES))),
-    )  # fmt: skip
+    )
     return found.reset_index()
 
 
