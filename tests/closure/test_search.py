@@ -373,7 +373,7 @@ def test_a_step_in_time_is_found_in_a_few_files_that_repeat_well():
     found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     assert found[0].channels == ("elapsed_h",)
     assert found[0].p_value < 1e-6
-    assert min(c.p_value for c in found if c.columns.shape[1] > 1) > 0.005
+    assert min(c.p_value for c in found if c.columns.shape[1] > 1) > 0.001
 
 
 def test_a_speed_effect_shows_where_sigma_2_could_take_it_up_only_below_zero():
