@@ -29,14 +29,20 @@ def aging_law(days, *, mu_0, a, b):
 
     Parameters
     ----------
-    days, mu_0, a, b : float or ndarray, shape (n,)
-        Aging time t in days, at least 0; value of the unaged rubber; loss per factor e of time, same unit;
-        time at which the loss sets in, in days.
+    days : float or ndarray, shape (n,)
+        Aging time t in days, at least 0.
+    mu_0, a, b : float or ndarray
+        Value of the unaged rubber; loss per factor e of time, same unit; time at which the loss sets in, in
+        days.
+
+    Raises
+    ------
+    ParameterError
+        If any `b` is not positive or any time is negative.
 
     Notes
     -----
-    ParameterError if any `b` is not positive or any time is negative. Wu et al. 2020, Polymers 12(1), 102,
-    doi:10.3390/polym12010102, Eq. 15.
+    Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102, Eq. 15.
 
     Examples
     --------
@@ -50,7 +56,10 @@ def aging_law(days, *, mu_0, a, b):
 def aging_constant(a, b):
     """Return the constant of Eq. 15 for the identifiable law, c = -a ln b, in the unit of `a`.
 
-    ParameterError if any `b` (in days) is not positive.
+    Raises
+    ------
+    ParameterError
+        If any `b` (in days) is not positive.
 
     Examples
     --------
@@ -61,12 +70,19 @@ def aging_constant(a, b):
     return -np.asarray(a, float) * np.log(b)
 
 
-# Shapes of the loss of friction over aging time, mu_0 - a phi(t) with phi(0) = 0: Eq. 15 and its rivals.
-# `stretched` has a limit, as the relaxation of glassy or cross-linked networks: Kohlrausch 1854, Ann. Phys.
-# 167, 56-82, doi:10.1002/andp.18541670103. `power` has n = 1/2 for diffusion: Findley, Lai & Onaran 1976,
-# Creep and Relaxation of Nonlinear Viscoelastic Materials, chapter 2. `induction` has no loss before the
-# stabiliser is consumed: Celina 2013, Polym. Degrad. Stab. 98(12), 2419-2429,
-# doi:10.1016/j.polymdegradstab.2013.06.024.
+# ---------------------------------------------------------------- losses
+# Shapes of the loss of friction over aging time: Eq. 15 and its rivals.
+#
+# All are :math:`\mu(t) = \mu_0 - a\, \varphi(t)` with :math:`\varphi(0) = 0`:
+#
+# - ``log``, Eq. 15: :math:`\ln(1 + t/b)`. Wu et al. 2020, Polymers 12(1), 102, doi:10.3390/polym12010102.
+# - ``stretched``: :math:`1 - e^{-(t/\tau)^\beta}`, with the limit :math:`\mu_0 - a`, as in the relaxation of
+#   glassy or cross-linked networks. Kohlrausch 1854, Ann. Phys. 167, 56-82, doi:10.1002/andp.18541670103.
+# - ``power``: :math:`t^n` with t in days; n = 1/2 for diffusion. Findley, Lai & Onaran 1976, Creep and
+#   Relaxation of Nonlinear Viscoelastic Materials, chapter 2.
+# - ``induction``: :math:`\ln(1 + \max(t - t_i, 0)/b)`, no loss before the stabiliser is consumed. For
+#   induction periods of elastomers: Celina 2013, Polym. Degrad. Stab. 98(12), 2419-2429,
+#   doi:10.1016/j.polymdegradstab.2013.06.024.
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ import pytest
 from scipy.integrate import quad
 
 from sealfit.errors import ParameterError
-from sealfit.physics import PRESSURES, Contact, exponential
+from sealfit.physics import PRESSURES, Contact
+from sealfit.physics.lugre import exponential
 
 uniform, sine, _, parabolic = PRESSURES.values()
 
