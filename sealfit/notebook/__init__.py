@@ -42,8 +42,10 @@ def run(
 
     Parameters
     ----------
-    campaign, out, config : str or Path
-        The campaign's folder, the folder of results (created if missing), and the rig config (TOML).
+    campaign, out : str or Path
+        The campaign's folder, and the folder of results; that one is created if it is not there.
+    config : str or Path, optional
+        Rig config (TOML).
     workers : int, optional
         Processes to use; default: all cores.
     effects_folder : str or Path, optional
@@ -51,7 +53,10 @@ def run(
     **options
         `force`, `strict`, `scheduler` and `progress` of `sealfit.pipeline.run`.
 
-    SealfitError for whatever the user has to fix: the message says where, what and how.
+    Raises
+    ------
+    SealfitError
+        Whatever the user has to fix: the message says where, what and how.
     """
     one_thread()
     options.setdefault("progress", progress.for_notebook())
@@ -72,9 +77,23 @@ def fit_properties(
 ) -> Results:
     """Fit the aging laws of properties of specimens, as `sealfit fit-aging --values` does.
 
-    `values` is a CSV, Excel or Parquet file with a row per specimen, `properties` are its columns of
-    properties (by default the only one there is), and `batch` is that of the specimens' batch. `options` are
-    `force` and `progress` of `sealfit.pipeline.fit_properties`. All else is as for `run`.
+    Parameters
+    ----------
+    values : str or Path
+        CSV, Excel or Parquet file with a row per specimen.
+    out, config
+        As `run`.
+    properties : sequence of str
+        Columns of the properties; by default the only one there is.
+    batch : str
+        Column that names the batch of a specimen.
+    **options
+        `force` and `progress` of `sealfit.pipeline.fit_properties`.
+
+    Raises
+    ------
+    SealfitError
+        Whatever the user has to fix: the message says where, what and how.
     """
     one_thread()
     options.setdefault("progress", progress.for_notebook())
@@ -86,8 +105,17 @@ def fit_properties(
 def open(out: str | Path, effects_folder: str | Path | None = None) -> Results:
     """Return the results in a folder that `sealfit.run` or the command line made.
 
-    `effects_folder` has your own effects, if the loop was closed with some: Python is run from it for
-    predictions. OutError if there is no such folder, or it holds no results.
+    Parameters
+    ----------
+    out : str or Path
+        The folder of results.
+    effects_folder : str or Path, optional
+        Folder of your own effects, if the loop was closed with some: Python is run from it for predictions.
+
+    Raises
+    ------
+    OutError
+        If there is no such folder, or it holds no results.
     """
     one_thread()
     return Results(out, effects_folder)
@@ -110,9 +138,10 @@ def _stored(table: str, meaning: str) -> property:
 class Results:
     """What sealfit found in a campaign: tables, plots, predictions and lifetimes.
 
-    Everything is read when it is asked for. StaleError says which command brings up to date what is missing
-    or stale. `attrs["units"]` of every table has the unit of a column. Parameters and laws are those of the
-    answer: with the loop's effects taken out, where it added some.
+    Everything is read when it is asked for. If it is missing, or the campaign, the config or the program has
+    changed since, StaleError says which command brings it up to date. `attrs["units"]` of every table has the
+    unit of a column. Parameters and laws are those of the answer: with the loop's effects taken out, where it
+    added some.
     """
 
     def __init__(self, out: str | Path, effects_folder: str | Path | None = None):
@@ -127,7 +156,10 @@ class Results:
     effect_parameters = _of_closure(frames.effect_parameters)
     scatter = _of_closure(frames.scatter)
     sensitivity = _of_closure(frames.sensitivity)
-    effect_curves = _stored("shapes", "A row per effect, channel and place: its value, with the 95 % band.")
+    effect_curves = _stored(
+        "shapes",
+        "A row per effect, channel and place along it: what the effect does there, with its 95 % band.",
+    )
 
     # ------------------------------------------------------------ fits
     @property
@@ -150,17 +182,31 @@ class Results:
 
     # ------------------------------------------------------------ data
     runs = _stored("runs", "A row per stroke, with all that is known of its file and run.")
-    quality = _stored("quality", "A row per finding: where, what, what was done about it, and how to fix it.")
+    quality = _stored(
+        "quality", "A row per finding in the data: where, what, what was done about it, and how to fix it."
+    )
     steady = _stored("steady", "A row per stroke: means over its steady window.")
     bins = _stored("bins", "A row per bin of a steady window: what the joint model is fitted to.")
 
     def residuals(self, model: str = "after") -> pd.DataFrame:
-        """Return a row per bin: measured minus model; `model` is "after" or "before", else RequestError."""
+        """Return a row per bin: measured minus model, fitted and held out; `model` is "after" or "before".
+
+        Raises
+        ------
+        RequestError
+            If there is no such model.
+        """
         commands.require_model(model)
         return self.table(f"residuals_{model}")
 
     def traces(self, condition: str | None = None) -> pd.DataFrame:
-        """Return a row per sample, of one condition if it is given; RequestError if it was not tested."""
+        """Return a row per sample of every trace, or of those of one condition, as table `runs` spells it.
+
+        Raises
+        ------
+        RequestError
+            If no such condition was tested; the fix names the nearest.
+        """
         return self._of_condition("traces", condition)
 
     def mean_traces(self, condition: str | None = None) -> pd.DataFrame:
@@ -168,7 +214,13 @@ class Results:
         return self._of_condition("traces_mean", condition)
 
     def table(self, name: str) -> pd.DataFrame:
-        """Return any table of OUT, with `attrs["meaning"]` of its columns; RequestError if there is none."""
+        """Return any table of OUT as it is stored, with `attrs["meaning"]` of its columns.
+
+        Raises
+        ------
+        RequestError
+            If there is no such table; the fix names the nearest, or all.
+        """
         return self._table(self._current(_step_of(name)), name)
 
     # ------------------------------------------------------------ what follows
@@ -182,8 +234,16 @@ class Results:
     def predict(self, points: pd.DataFrame | Mapping[str, Sequence]) -> pd.DataFrame:
         """Return the points with the force, before and after, and 95 % intervals, as `sealfit predict` does.
 
-        `points` has the condition columns, signed `speed_mm_s`, and what else the model needs. RequestError
-        if a column is missing that the model needs, or is there twice.
+        Parameters
+        ----------
+        points : DataFrame, or mapping of column names to values
+            The condition columns, signed `speed_mm_s`, and what else the model needs; a message says what is
+            missing.
+
+        Raises
+        ------
+        RequestError
+            If a column is missing that the model needs, or is there twice.
         """
         from sealfit.closure.prediction_csv import points_of
 
@@ -200,11 +260,23 @@ class Results:
         temperature_C: float | None = None,
         **options: object,
     ) -> Lifetime:
-        """Return the days until mu_s, mu_c, F_s, F_c or a property reaches a threshold.
+        """Return the days until a quantity reaches a threshold, as `sealfit lifetime` does.
 
-        Life ends at the value `threshold`, or when `loss_pct` percent of the start are lost. `temperature_C`
-        of use is needed where several were tested. `options` are `compression_ratio_pct`, `years` (find the
-        temperature that lasts so long), `law` and `model`. RequestError if it does not fit the campaign.
+        Parameters
+        ----------
+        quantity : str
+            mu_s, mu_c, F_s, F_c, or a property.
+        threshold, loss_pct : float
+            Value at which life ends, or percent of the start that may be lost: one of the two.
+        temperature_C : float, optional
+            Temperature of use, in degrees Celsius; needed where several were tested.
+        **options
+            `compression_ratio_pct`, `years` (find the temperature that lasts so long), `law` and `model`.
+
+        Raises
+        ------
+        RequestError
+            If the request does not fit the campaign.
         """
         asked = commands.LifetimeRequest(quantity, threshold, loss_pct, temperature_C, **options)
         return Lifetime(commands.lifetime(self.out, asked))

@@ -39,8 +39,12 @@ class Plots:
     - starts: the mean force over the distance slid from rest, and the model's
     - traces_mean: some of the averaged traces
 
-    StaleError if the results are missing or stale, when a figure is asked for. RequestError if these results
-    have nothing to draw in it.
+    Raises
+    ------
+    StaleError
+        If the results are missing or stale, when a figure is asked for.
+    RequestError
+        If these results have nothing to draw in it.
     """
 
     def __init__(self, answered: Callable[[], Store]):
@@ -58,6 +62,8 @@ class Plots:
         store = self._answered()
         plots = draw_all(*answered(*reported(store)), store.config)
         if name not in plots:
-            what = f"these results have nothing to draw in the figure '{name}'."
-            raise RequestError(what, fix=f"They have: {', '.join(plots)}.")
+            raise RequestError(
+                f"these results have nothing to draw in the figure '{name}'.",
+                fix=f"They have: {', '.join(plots)}.",
+            )
         return compose(plots[name], ShownFigure)
