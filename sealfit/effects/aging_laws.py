@@ -36,10 +36,12 @@ ON_COEFFICIENTS = (
 def arrhenius_aging(inputs, *, A, E):
     r"""Arrhenius acceleration of aging with temperature: of the loss a, or of the time b of its onset.
 
-    Oxidation, scission and cross-linking of network bonds have a rate proportional to :math:`e^{-E / R T}`,
-    T in kelvin. A share A of the aging is of that kind, the rest independent of temperature. On a, the rate
-    of the loss, E is positive. On b, a time, E is negative, and A = 1 shifts the curve of Eq. 15 along the
-    logarithm of time (time-temperature superposition).
+    Oxidation, scission and cross-linking of network bonds have an activation energy E, and a rate
+    proportional to :math:`e^{-E / R T}`, T in kelvin. A share A of the aging is of that kind; the rest is
+    assumed to be independent of temperature. A = 1 is Arrhenius' law, a factor
+    :math:`e^{E / R\, (1 / T_{ref} - 1 / T)}`. On a, the rate of the loss, E is positive. On b, a time, E is
+    negative, and A = 1 shifts the curve of Eq. 15 along the logarithm of time (time-temperature
+    superposition). Unaged rubber does not change.
 
     Two temperatures determine one parameter, three distinguish A and E; for a small exponent only A E is
     determined. The declared model has a separate a and b for each series. The effect can be seen only if one
@@ -64,10 +66,13 @@ def arrhenius_aging(inputs, *, A, E):
 def compression_factor(inputs, *, A):
     r"""Compression during aging: it changes aging, or friction after aging.
 
-    Strain changes which bonds form and break (compression set), and the surface has less contact with air. c
-    is the height in per cent of the original height, so that 80 % gives A / 5. On mu it also changes the
-    friction of unaged rubber with a compression. An effect on a or b can be seen only if one series contains
-    several heights.
+    A seal ages under compression. Strain changes which bonds form and break (compression set), and the
+    surface has less contact with air. c is the height in per cent of the original height, and A the relative
+    change per full compression, so that 80 % gives A / 5. On a or b it changes aging; on mu it also changes
+    the friction of unaged rubber with a compression.
+
+    The declared model has a separate a and b for each series. An effect on a or b can be seen only if one
+    series contains several heights.
     """
     return A * (100.0 - np.asarray(inputs["compression_ratio_pct"], dtype=float)) / 100.0
 
@@ -89,8 +94,9 @@ def compression_factor(inputs, *, A):
 def aging_floor(inputs, *, A, t_f):
     r"""Aging with a floor: after some day the coefficient falls less than by the logarithm.
 
-    Eq. 15 has no limit, but aging ends when the reactants are consumed. As a change of mu_s or mu_c, A = a
-    stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t well beyond b.
+    Eq. 15 has no limit, but aging ends when the reactants are consumed. After a day t_f the fall is reduced.
+    As a change of mu_s or mu_c, A = a stops the fall of :math:`\mu_0 - a \ln(1 + t / b)` altogether for t
+    well beyond b, and a smaller A slows it. As a factor on mu, A is relative to mu.
     """
     return A * np.log(np.maximum(np.asarray(inputs["aging_days"], dtype=float) / t_f, 1.0))
 
@@ -138,8 +144,9 @@ def aging_induction(inputs, *, A, t_i):
 def aging_delay(inputs, *, A, t_i, b):
     r"""Aging with a delay: Eq. 15 starts at a day t_i.
 
-    The effect is the difference of the delayed law and the declared one, which starts at day 0. If A is the a
-    of the declared law (relative to mu, for a factor) and b its b, the law with the effect is Eq. 15 with
+    Antioxidants delay oxidation until they are consumed. The declared law starts at day 0, so the effect is
+    the difference of the two laws, which is zero at day 0 and vanishes as :math:`A t_i / t`. If A is the a of
+    the declared law (relative to mu, for a factor) and b its b, the law with the effect is Eq. 15 with
     :math:`t - t_i` for t. `aging_induction` is a smooth delay.
     """
     days = np.maximum(np.asarray(inputs["aging_days"], dtype=float), 0.0)
@@ -167,7 +174,9 @@ ONSET = Parameter("t_0", "{x}", 1.0, (1e-4, 1e5), "aging time at which the chang
 def stribeck_speed_aging(inputs, *, A, t_0):
     r"""Stribeck velocity that changes with age; the declared model has one for all days.
 
-    Hardened rubber conforms less to roughness and relaxes more slowly.
+    v_s is the speed of the transition from boundary friction to a film or a molecular time scale. Hardened
+    rubber conforms less to roughness and relaxes more slowly, which changes v_s. As for the coefficients, the
+    change is a logarithm of time.
     """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)
 
@@ -184,5 +193,8 @@ def stribeck_speed_aging(inputs, *, A, t_0):
     worked=({"aging_days": 9.0}, {"A": -0.02, "t_0": 1.0}, -0.02 * 2.302585092994046),
 )
 def viscosity_aging(inputs, *, A, t_0):
-    """Aging ends with its reactants. As a change of mu_s or mu_c, A = a stops the fall of Eq. 15."""
+    r"""Viscous coefficient that changes with age; the declared model has one for all days.
+
+    The remaining lubricant and the damping of the rubber change with age, and sigma_2 with them.
+    """
     return A * np.log1p(not_negative(inputs["aging_days"]) / t_0)

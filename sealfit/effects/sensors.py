@@ -42,10 +42,12 @@ IN_TIME = (("mu", "multiply"), ("force", "add"), ("force", "multiply"))
 def ripple(inputs, *, A, lambda_, phi):
     r"""Ripple along the rig's position, due to a screw, a guide or a periodic track.
 
-    It is an added force, the same in both directions, if the drive strains the sensor (a lead screw with a
-    pitch error, a bent shaft, an eccentric coupling), and a factor on friction if the pressure or the surface
-    of the contact is periodic along the track. A harmonic is a further ripple of half or a third of the
-    wavelength. x_ref is 0, or near the positions of a rig that counts from far away.
+    A lead screw with a pitch error, a bent shaft or an eccentric coupling gives a force that is periodic in
+    the rig's coordinate. The wavelength is the pitch, or an integer fraction of it for a screw of several
+    starts. It is an added force, the same in both directions, if the drive strains the sensor, and a factor
+    on friction if the pressure or the surface of the contact is periodic along the track. A harmonic is a
+    further ripple of half or a third of the wavelength. Positions beyond the tested ones are extrapolated in
+    phase. x_ref is 0, or near the positions of a rig that counts from far away.
     """
     x = np.asarray(inputs["displacement_mm"], dtype=float) - reference(inputs, CHANNEL, 0.0)
     return A * np.sin(2 * np.pi * x / lambda_ + phi) * sine_attenuation(inputs, "displacement_mm", lambda_)
@@ -63,7 +65,11 @@ def ripple(inputs, *, A, lambda_, phi):
     worked=({"time_s": 20.0}, {"A": 0.02}, 0.4),
 )
 def drift(inputs, *, A):
-    r"""Drift of the force channel along a file: a strain-gauge bridge or its amplifier warming up."""
+    r"""Drift of the force channel along a record: a strain-gauge bridge or its amplifier warming up.
+
+    A is the rate. The added force does not depend on the direction of motion. Time is that of the file, so
+    that the drift restarts with every file.
+    """
     return A * np.asarray(inputs["time_s"], dtype=float)
 
 
@@ -81,8 +87,9 @@ def drift(inputs, *, A):
 def zero_offset(inputs, *, A):
     r"""Zero offset of the force channel: a constant added force, the same in both directions.
 
-    Strokes in one direction do not distinguish it from friction that is independent of speed, so that it
-    reads the direction.
+    It is the half-sum of forward and backward force. Strokes in one direction do not distinguish it from
+    friction that is independent of speed, so that it reads the direction. An offset within the sensor's
+    accuracy is not significant.
     """
     return A * np.ones_like(np.asarray(inputs["direction"], dtype=float))
 
@@ -105,7 +112,8 @@ def zero_offset(inputs, *, A):
 def offset_slope(inputs, *, A, B):
     r"""Zero offset of the force that changes with a channel, the same in both directions.
 
-    An error of a piston's area adds that error times the pressure to the measured friction. Another cause is
+    The force on a piston is pressure times area, so that an error dA of the area adds dA p to the measured
+    friction. A is then the error of the area, and B that error times the reference pressure. Another cause is
     an amplifier whose zero depends on the room temperature.
     """
     return A * deviation(inputs, CHANNEL) + B
@@ -129,8 +137,9 @@ def offset_slope(inputs, *, A, B):
 def asymmetry(inputs, *, A):
     r"""Direction asymmetry: a parameter that differs between the two directions.
 
-    Friction of a lip seal, a misaligned sample or a polished track depends on the direction. A is relative to
-    the mean of the two directions, or in its unit for an added change.
+    Friction of a lip seal, a misaligned sample or a polished track depends on the direction d, +1 or -1. A is
+    the forward value minus the backward one, relative to their mean, or in its unit for an added change. The
+    mean of the two directions does not change.
     """
     return A * np.asarray(inputs["direction"], dtype=float) / 2
 
@@ -149,9 +158,10 @@ def asymmetry(inputs, *, A):
 def campaign_drift(inputs, *, A):
     r"""Drift along the campaign: a slow change over the days of testing.
 
-    It may be due to a track that polishes, a sensor that ages, or rubber that goes on aging in air. t is the
-    time since the campaign's first file. A drift along the order of runs is `linear` in `run_order`. If tests
-    follow the calendar of aging it is not distinguishable from the aging law.
+    It may be due to a track that polishes, a sensor that ages, or rubber that goes on aging in the
+    laboratory's air. t is the time since the campaign's first file. A is the change per time, relative for
+    friction, in N for the zero. A drift along the order of runs is `linear` in `run_order`. If tests follow
+    the calendar of aging it is not distinguishable from the aging law.
     """
     return A * np.asarray(inputs["elapsed_h"], dtype=float)
 
@@ -216,6 +226,10 @@ def _shows_days(hours: np.ndarray) -> bool:
     shown_by=_shows_days,
 )
 def day_and_night(inputs, *, A, t_max):
-    """Difference of the directions, relative to their mean, or in its unit for an added change."""
+    r"""Change with the time of day: laboratory, drive and oil are warmer in the afternoon than at night.
+
+    t is the time since the campaign's first file. With files in working hours only it describes the change
+    within them and must not be used for the night.
+    """
     hours = np.asarray(inputs["elapsed_h"], dtype=float) - t_max
     return A * np.cos(2 * np.pi * hours / DAY_H)

@@ -48,11 +48,12 @@ REVIEW = (
     worked=({"repeat": 3.0}, {"A": -0.1, "n_0": 2.0}, -0.1 * 0.6321205588285577),
 )
 def conditioning(inputs, *, A, n_0):
-    r"""Conditioning over repeats n (Mullins): the first repeat differs most, later ones settle.
+    r"""Conditioning over repeats (Mullins): the first repeat differs most, later ones settle.
 
-    Filled rubber softens on its first deformations, most in the first, and reaches a steady state after some
-    10. Softer rubber has another contact area and hysteresis. The exponential has a limit, unlike a logarithm
-    (`log`); three repeats hardly distinguish the two.
+    Filled rubber softens on its first deformations and keeps what it lost: stress falls most in the first
+    cycle and reaches a steady state after some 10. Softer rubber changes contact area and hysteresis, so
+    friction changes along with it. n is the repeat. The exponential has a limit, as conditioning ends, unlike
+    a logarithm (`log`); three repeats hardly distinguish the two.
     """
     before = np.maximum(np.asarray(inputs["repeat"], dtype=float) - 1, 0.0)
     return -A * np.expm1(-before / n_0)
@@ -76,9 +77,10 @@ def conditioning(inputs, *, A, n_0):
 def run_in(inputs, *, A, n_0):
     r"""Run-in over strokes: the contact changes over the first strokes of a record and settles.
 
-    Sliding smooths the rubber's skin, spreads a film or clears it away. n is the stroke in its file, so it
-    restarts in every file; a change that lasts from file to file is a drift along the campaign, and one from
-    repeat to repeat is conditioning.
+    Sliding smooths the rubber's skin, spreads a film or clears it away; friction starts high or low and
+    approaches a steady value stroke by stroke. n is the stroke in its file. It restarts in every file; a
+    change that lasts from file to file is a drift along the campaign, and one from repeat to repeat is
+    conditioning.
     """
     before = np.maximum(np.asarray(inputs["stroke"], dtype=float) - 1, 0.0)
     return -A * np.expm1(-before / n_0)
@@ -100,9 +102,10 @@ def run_in(inputs, *, A, n_0):
     worked=({"rest_s": 18.0}, {"A": 0.02, "t_0": 2.0}, 0.02 * 2.302585092994046),
 )
 def rest_strengthening(inputs, *, A, t_0):
-    r"""Strengthening at rest: contacts creep and bonds form. A is 0.01 to 0.05 for most solids.
+    r"""Strengthening at rest: static friction grows with the time of stationary contact.
 
-    It needs a column `rest_s`.
+    Contacts creep and bonds form during rest: the static coefficient grows with the logarithm of the time at
+    rest. A is 0.01 to 0.05 for most solids. It needs a column `rest_s`.
     """
     return A * np.log1p(not_negative(inputs["rest_s"]) / t_0)
 
@@ -126,6 +129,9 @@ def load_exponent(inputs, *, A):
     \propto N^n` and :math:`\mu = \mu_{ref} (N / N_{ref})^{n - 1}` with n between 2/3 and 1. The first order
     in n - 1 is fitted, as A is then a linear parameter. The neglected term is :math:`\frac12 A^2 \ln^2(N /
     N_{ref})`, 0.7 % of friction at A = -1/6 and twice the load; `power` is the full curve.
+
+    If the local coefficient depends on the local pressure, :math:`\mu(p) \propto p^{n - 1}`, the exponent is
+    the same, and the pressure distribution gives a constant factor on mu.
     """
     return A * log_ratio(inputs, "load_N")
 
@@ -149,13 +155,16 @@ def load_exponent(inputs, *, A):
 def stribeck_exponent(inputs, *, A, v_s, n):
     r"""Stribeck exponent other than 2: friction falls with speed more gradually or abruptly than declared.
 
-    A wide distribution of contact strengths gives n near 1 or below; the sudden formation of a film gives n
-    well above 2. The effect is the difference of two decays. With A = mu_s - mu_c and the declared v_s, the
-    curve with it is exactly :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`. As a factor on mu, A is
-    relative to mu, and this is an approximation for small changes of mu around v_s.
+    The declared curve falls from mu_s to mu_c as a Gaussian of the speed, by convention. A wide distribution
+    of contact strengths gives n near 1 or below; the sudden formation of a film gives n well above 2. The
+    effect is the difference of the two decays, which is zero at rest, at v_s, far above v_s, and everywhere
+    for n = 2. With A = mu_s - mu_c and the declared v_s, the curve with the effect is exactly
+    :math:`\mu_c + (\mu_s - \mu_c) e^{-(|v| / v_s)^n}`. As a factor on mu, A is relative to mu, and this is an
+    approximation for small changes of mu around v_s.
 
     Three parameters here and four of the declared curve need seven speeds in one direction, several on each
-    side of v_s. Near n = 2 only the product A (2 - n) is determined.
+    side of v_s. Near n = 2 the shape is :math:`A (2 - n) r^2 \ln r\, e^{-r^2}` with :math:`r = |v| / v_s`, so
+    that only the product A (2 - n) is determined.
     """
     ratio = np.abs(np.asarray(inputs["speed_mm_s"], dtype=float)) / v_s
     return A * (np.exp(-(ratio**n)) - np.exp(-(ratio**2)))
@@ -173,9 +182,11 @@ def stribeck_exponent(inputs, *, A, v_s, n):
     worked=({"speed_mm_s": -50.0, "speed_mm_s_ref": 5.0}, {"A": 0.03}, 0.03 * 2.302585092994046),
 )
 def log_rate(inputs, *, A):
-    r"""Logarithmic rate dependence: the stress of contacts that break by thermal activation; not at rest.
+    r"""Logarithmic rate dependence: friction that changes by the same amount for every factor of the speed.
 
-    A is positive if the breaking of bonds dominates, negative if the age of the contacts does.
+    The stress of contacts that break by thermal activation is proportional to the logarithm of the rate. A is
+    positive if the breaking of bonds dominates (strengthening with rate), negative if the age of the contacts
+    does. It is not defined at rest.
     """
     return A * np.log(positive(np.abs(inputs["speed_mm_s"])) / reference(inputs, "speed_mm_s", 1.0))
 
@@ -197,8 +208,11 @@ def log_rate(inputs, *, A):
 def power_viscous(inputs, *, A, n):
     r"""Viscous friction by a power of the speed: shear-thinning grease, or a film that thickens with speed.
 
-    A shear-thinning film has n < 1. A hydrodynamic film, as under a seal lip, has a thickness proportional to
-    the root of the speed and n near 1/2. At n = 1 it is not distinguishable from the declared sigma_2 v.
+    The drag of a Newtonian film of constant thickness is the declared sigma_2 v. That of a shear-thinning
+    film is proportional to :math:`|v|^n` with n < 1. A hydrodynamic film, as under a seal lip, has a
+    thickness proportional to the root of the speed and n near 1/2.
+
+    A is the force at the reference speed. At n = 1 it is not distinguishable from sigma_2 v.
     """
     speed = np.asarray(inputs["speed_mm_s"], dtype=float)
     return A * np.sign(speed) * (np.abs(speed) / reference(inputs, "speed_mm_s", 1.0)) ** n
@@ -225,7 +239,8 @@ def grosch_peak(inputs, *, A, v_p, w):
     r"""Viscoelastic peak over log speed (Grosch): rubber friction has a maximum where its loss has one.
 
     Deformation by asperities and molecular adhesion dissipate most at different rates. Each gives a bell over
-    the logarithm of the speed, shifted by temperature (WLF). The height of a peak beyond the tested speeds is
+    the logarithm of the speed, shifted by temperature (WLF). A is the height of the bell, relative to the
+    Stribeck curve or as an added coefficient of friction. The height of a peak beyond the tested speeds is
     not determined.
     """
     decades = np.log10(positive(np.abs(inputs["speed_mm_s"])) / v_p)
@@ -244,5 +259,9 @@ def grosch_peak(inputs, *, A, v_p, w):
     worked=({"humidity_pct": 35.0, "humidity_pct_ref": 55.0}, {"A": -0.001}, 0.02),
 )
 def humidity(inputs, *, A):
-    """Water from the air weakens adhesion and lubricates; under another name the effect is `linear`."""
+    r"""Humidity of the laboratory: a film of water between rubber and track.
+
+    Water from the air weakens adhesion and lubricates at speed. Over the humidities of a laboratory the
+    effect is about linear. It needs a column `humidity_pct`; for another name the effect is `linear`.
+    """
     return A * deviation(inputs, "humidity_pct")

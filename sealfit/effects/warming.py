@@ -30,7 +30,8 @@ def warming_time(inputs, *, A, tau):
     r"""Warming by sliding, along time: friction falls as the contact warms, and approaches a limit.
 
     A body of heat capacity C that loses heat by conductance G, heated by the power P of friction, warms as
-    :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. A is negative if friction rises
+    :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. Rubber friction falls with
+    temperature above its peak (Grosch 1963), to first order in proportion. A is negative if friction rises
     with temperature. Time is that of the stroke or the file; before 0 the contact is cold. The power is
     assumed to be the same in every run; in `warming_power` it is proportional to speed and load.
     """
@@ -55,9 +56,10 @@ def warming_time(inputs, *, A, tau):
 def warming_distance(inputs, *, A, s_0):
     r"""Warming by sliding, along distance: friction falls with the work of friction, and approaches a limit.
 
-    At one normal force the heat up to a distance s is mu N s at any speed. If the contact loses heat to cold
-    track in proportion to the distance slid, the temperature approaches its limit over a distance instead of
-    a time. Two speeds are needed to distinguish it from `warming_time`.
+    At one normal force the heat up to a distance s is the work of friction, mu N s, at any speed. If the
+    contact warms a fixed mass and loses heat to cold track in proportion to the distance slid, the
+    temperature approaches its limit over a distance instead of a time. Two speeds are needed to distinguish
+    it from `warming_time`.
     """
     distance = np.maximum(np.asarray(inputs["distance_mm"], dtype=float), 0.0)
     return A * np.expm1(-distance / s_0)
@@ -85,9 +87,10 @@ def warming_distance(inputs, *, A, s_0):
 def warming_power(inputs, *, A, tau):
     r"""Warming by the power of friction: as `warming_time`, but fast and heavily loaded runs warm more.
 
-    The power is :math:`P = \mu N |v|`, so the limit of the warming follows load times speed. A is well below
-    1: the form is linear in the temperature, and P is computed without the fall of mu. Several speeds or
-    loads are needed to distinguish it from `warming_time`.
+    The power that friction turns into heat is :math:`P = \mu N |v|`, so the limit :math:`P / G` of a lumped
+    body's warming follows load times speed, and the share of friction lost follows it to first order. A is
+    well below 1: the form is linear in the temperature, and P is computed without the fall of mu. Several
+    speeds or loads are needed to distinguish it from `warming_time`.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     return A * _relative(inputs, "load_N") * _relative(inputs, "speed_mm_s") * np.expm1(-time / tau)
@@ -118,10 +121,11 @@ def _relative(inputs, name: str) -> np.ndarray:
 def warming_conduction(inputs, *, A):
     r"""Warming limited by conduction into the rubber: friction falls with the root of speed times distance.
 
-    The surface of a half-space under a constant flux q warms by :math:`2 q \sqrt{t / (\pi k \rho c)}` in a
-    time t. The flux of friction is :math:`q \propto \mu p |v|`, and :math:`t = s / |v|`, so that
-    :math:`\Delta T \propto p \sqrt{|v| s}`. This is for one load, `warming_conduction_load` for several. It
-    is valid until the warm layer reaches the back of the sample, and for a loss well below 1.
+    Rubber is a poor conductor: during a stroke heat enters a thin layer only. The surface of a half-space
+    under a constant flux q warms by :math:`2 q \sqrt{t / (\pi k \rho c)}` in a time t. The flux of friction
+    is :math:`q \propto \mu p |v|`, and :math:`t = s / |v|`, so that :math:`\Delta T \propto p \sqrt{|v| s}`.
+    This is for one load, `warming_conduction_load` for several. It is valid until the warm layer reaches the
+    back of the sample, and for a loss well below 1.
     """
     return -A * _root_of_speed_times_distance(inputs)
 
@@ -153,7 +157,8 @@ def _root_of_speed_times_distance(inputs) -> np.ndarray:
 def warming_conduction_load(inputs, *, A):
     r"""Warming limited by conduction into the rubber, at several loads: `warming_conduction` times the load.
 
-    The contact area is constant: the pressure is proportional to the load. A is small against 1.
+    The flux of friction is :math:`q \propto \mu p |v|`. For a constant contact area the pressure p is
+    proportional to the load. A is small against 1.
     """
     return -A * _relative(inputs, "load_N") * _root_of_speed_times_distance(inputs)
 
@@ -171,5 +176,10 @@ def warming_conduction_load(inputs, *, A):
     worked=({"lab_temperature_C": 25.0, "lab_temperature_C_ref": 22.0}, {"A": -0.004}, -0.012),
 )
 def lab_temperature(inputs, *, A):
-    """Temperature of the room, not of aging; under another name the effect is `linear`."""
+    r"""Laboratory temperature: friction follows the room, a few per mille for each degree.
+
+    Above its peak over speed, rubber friction falls with temperature. Over the few degrees of a laboratory
+    the effect is about linear. It needs a column `lab_temperature_C`, which is not the aging temperature; for
+    another name the effect is `linear`.
+    """
     return A * deviation(inputs, "lab_temperature_C")

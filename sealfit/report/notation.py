@@ -146,21 +146,9 @@ GREEK = {
     "tau": "τ", "phi": "φ", "chi": "χ", "psi": "ψ", "omega": "ω",
 }  # fmt: skip
 _SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])(?:_?([0-9]+)|_([A-Za-z0-9]{{1,4}}))?")
-_SLOTS = (
-    "speed_set_mm_s",
-    "displacement_from_mm",
-    "displacement_to_mm",
-    "displacement_mm",
-    "distance_mm",
-    "speed_mm_s",
-    "force_N",
-    "load_N",
-    "time_s",
-    "aging_days",
-    "temperature_C",
-    "compression_ratio_pct",
-    *CALENDAR,
-)
+_SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displacement_mm", "distance_mm",
+          "speed_mm_s", "force_N", "load_N", "time_s", "aging_days", "temperature_C",
+          "compression_ratio_pct", *CALENDAR)  # fmt: skip
 
 
 def symbol_html(name: str) -> Markup:
