@@ -301,5 +301,11 @@ def _example_traces(store: Store, runs: pd.DataFrame) -> dict[str, pd.DataFrame]
     return {"traces_mean": means, "traces": strokes.merge(store.read("traces", names, where={"file": files}))}
 
 
-_EACH = (_ingest, _fit_steady, _fit_aging, _fit_dynamic, _close_loop, _report)
-_WORK: dict[str, Callable[[Store, Staged, Options, Silent], Counted]] = dict(zip(STEPS, _EACH, strict=True))
+_WORK: dict[str, Callable[[Store, Staged, Options, Silent], Counted]] = {
+    "ingest": _ingest,
+    "fit-steady": _fit_steady,
+    "fit-aging": _fit_aging,
+    "fit-dynamic": _fit_dynamic,
+    "close-loop": _close_loop,
+    "report": _report,
+}
