@@ -352,10 +352,8 @@ def compressed(cells: Sequence[str], theirs: str, notes: Notes) -> bool:
     numbers = [number for cell in cells if cell and (number := as_number(cell)) is not None]
     if not numbers or max(numbers) >= HEIGHT_FROM:
         return False
-    key, evidence = (
-        "runs.compute.compression_ratio_pct",
-        "the height that is left, in percent of the original",
-    )
+    key = "runs.compute.compression_ratio_pct"
+    evidence = "the height that is left, in percent of the original"
     fix = "If it is the height that was left, name it compression_ratio_pct, and delete this line."
     reason = f"up to {max(numbers):g} % in '{theirs}' are taken as how much the rubber was compressed."
     notes.doubt(key, reason, fix)
