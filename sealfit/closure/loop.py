@@ -166,17 +166,22 @@ class _HeldOut:
 
     @property
     def repeats(self) -> bool:
-        """Whether the search is repeated in each fold: with few runs the effects are only refitted there."""
+        """Whether the search is repeated in each fold.
+
+        With few runs a fold has too little power; the effects of the full campaign are then refitted in each
+        fold.
+        """
         return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
 
     def forces(
         self, selection: Selection, say: Callable[[str], None]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[Model] | None]:
-        """Return each row's force before and after, fitted without its group; where determined; the models.
+        """Return each row's force before and after, by fits without its group, and the models.
 
-        A force is NaN if its row was never held out. The models are those of the repeated searches, or None.
-        A repeated search has as many rounds as the full campaign needed for its last effect: with less power
-        it would go on for many rounds with small effects that it refuses.
+        A force is NaN if its row was never held out. The third array is true where the rows not held out
+        determine both forces. The models are those of the repeated searches; None if the search is not
+        repeated. A repeated search has as many rounds as the full campaign needed for its last effect: with
+        less power it would go on for many rounds with small effects that it refuses.
         """
         if not (selection.added and self.repeats):
             before, determined = self.refitted(selection.before)
@@ -215,7 +220,10 @@ class _HeldOut:
 def _searched(
     part: Subsample, samples: pd.DataFrame, context: Context, start: StartingFit, rounds: int, test: Rows
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Model]:
-    """Search without the test rows' strokes; return their forces, where determined, and the model after."""
+    """Return the forces before and after at the test rows, where both are determined, and the model after.
+
+    The search is repeated without the strokes of these rows.
+    """
     fine = _without(part.rows, test) if part.coarse is not part.rows else None
     seen = samples[~samples["stroke_id"].isin(test.table["stroke_id"])]
     train = _without(part.coarse, test)

@@ -42,7 +42,10 @@ def propose(
     effects: Mapping[str, Effect],
     also: Sequence[Proposal] = (),
 ) -> list[Proposal]:
-    """Return jointly refitted proposals, and `also` further ones, for `significant` sorted candidates."""
+    """Return jointly refitted proposals for the channels that explain most of the residual, best first.
+
+    The `significant` candidates are sorted, strongest first. `also` are further proposals.
+    """
     contenders = _contenders(significant)
     forms = [(*form, c) for c in contenders for form in terms_of(c, channels, fitted, effects)]
     forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # the order of exact equals
@@ -94,7 +97,10 @@ def named_among(fitted: Fitted, found: Sequence[Proposal]) -> list[Proposal]:
 
 
 def _contenders(significant: Sequence[Candidate]) -> Iterator[Candidate]:
-    """Yield the candidates that explain nearly as much as the strongest, or a constant offset, each once."""
+    """Yield the candidates that explain nearly as much as the strongest, each once.
+
+    A constant offset comes first: a form that starts at zero would contain it.
+    """
     offset = (c for c in significant if c.key == ZERO_OFFSET)  # a form that starts at zero would contain it
     best = next(offset, significant[0]) if significant else None
     seen = set()

@@ -122,9 +122,15 @@ ROWS = 4  # Rows per stroke at which forces are compared.
 def next_runs(
     selection: Selection, config: Config, effects: Mapping[str, Effect], outliers: Sequence[OutlierFile] = ()
 ) -> list[dict]:
-    """Return the runs to repeat, those that would distinguish effects from rivals or would show aliases.
+    """Return the runs that would distinguish effects from rivals, and those that would show aliases.
 
-    Each is a dict of `why`, a text, and `conditions`, the condition and the channels of one run.
+    The runs of files that were left out come first: they are to be repeated. Then there is a run for each
+    effect, which would distinguish it from its nearest rival, and a run for each alias, which would show it.
+
+    Returns
+    -------
+    list of dict
+        `why`, a text, and `conditions`: the condition and the channels of one run.
     """
     wanted = [_run_to_repeat(one, config) for one in outliers]
     for item in selection.added:
@@ -282,7 +288,10 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
 
 
 def _followed(rows: Rows, channels: Sequence[str]) -> dict[str, str]:
-    """Return the channels, but for days, whose order is that of an earlier one, and which that is."""
+    """Return the channels whose order is that of an earlier one, and which that is.
+
+    Days are no such channel: what was confounded with them in the campaign is to be separated.
+    """
     found: dict[str, str] = {}
     numeric = [n for n in channels if n not in ("direction", AGING) and rows.unsigned(n).dtype.kind == "f"]
     ranks = {name: pd.Series(rows.unsigned(name)).rank() for name in numeric}

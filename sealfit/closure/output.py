@@ -250,7 +250,8 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
 
     The residual is divided by the force's derivative with respect to the shape, by weighted least squares in
     groups of the first channel's values (Larsen and McCleary 1972, Technometrics 14(3), 781-790). Standard
-    errors are from whole files, or from the strokes of a single one. All periods are shifted onto the drawn.
+    errors are from whole files, or from the strokes of a single one. Of a periodic effect all periods are
+    shifted onto those that are drawn.
     """
     rows, parts = after.rows, []
     units = rows.codes("file" if rows.groups.starts["file"].size > 1 else "stroke")
@@ -287,10 +288,7 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
 def _along(
     term: Term, parameters: Mapping[str, float], rows: Rows, first: str
 ) -> tuple[dict, np.ndarray, list | None]:
-    """Return inputs along one of a term's channels, and its values or categories.
-
-    Others are at the mean, a second channel at its 90 % quantile, but for a surface; or a category.
-    """
+    """Return inputs along one of a term's channels, others at their means, and its values or categories."""
     values = rows.unsigned(first)
     if values.dtype.kind != "f":
         labels = [str(c) for c in np.unique(values)]

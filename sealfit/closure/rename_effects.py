@@ -39,8 +39,8 @@ class Renaming:
     ) -> tuple[Fitted, list[AcceptedEffect]]:
         """Return a fit and its effects, each but the last renamed given all others.
 
-        If one that keeps its name has no gain on held-out data given the others, it or a later one is
-        removed: the one that explains least.
+        An effect that keeps its name was confirmed while others were missing. If it has no gain on held-out
+        data given the others, it or a later one is removed: the one that explains least.
         """
         for item in added[:-1]:
             number = next((k for k, a in enumerate(added) if a is item), None)
@@ -91,9 +91,9 @@ class Renaming:
     ) -> AcceptedEffect | None:
         """Return one effect that fits as well as an earlier and a new one; None if there is none.
 
-        In place of two forms of one channel that are no physical effects its number of parameters is free. A
-        surface in place of two such forms must lower the held-out error more; in place of a physical effect
-        its BIC must be smaller.
+        Two forms of one channel that are no physical effects are one shape: then the single effect only has
+        to fit as well, whatever its number of parameters. A surface in place of two such forms must lower the
+        held-out error more; in place of a physical effect its BIC must be smaller.
         """
         names = self._channel(earlier), self._channel(new)
         effects = [item.proposal.term.effect for item in (earlier, new)]

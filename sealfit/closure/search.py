@@ -166,7 +166,8 @@ def search_pairs(
 ) -> list[Candidate]:
     """Return candidates of pairs, with p-values adjusted over single channels and pairs, strongest first.
 
-    Of the campaign's own columns `MOST_PAIRED` are paired, which explain most alone: `singles` are sorted.
+    Of the campaign's own columns those that explain least alone (`singles` are sorted) are left out beyond
+    `MOST_PAIRED`.
     """
     own = set(open_columns(tests.fitted.rows.table))
     ranked = list(dict.fromkeys(c.channels[-1] for c in singles if c.channels[-1] in own))

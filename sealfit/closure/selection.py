@@ -83,9 +83,9 @@ def select_effects(
 ) -> Selection:
     """Add effects until no channel explains the residual, and return the result.
 
-    Of rows merged along their strokes the `fine` ones are for ripples. The samples are those of
-    `steady_samples`. From a `start` the declared model needs no search. The search of a fold ends after
-    `rounds`; what is left is not determined then.
+    The rows are merged along their strokes if there are many; ripples are then fitted to the `fine` ones, and
+    fixed. The samples are those of `steady_samples`. From a `start` the declared model needs no search. The
+    search of a fold ends after `rounds`; what is left is not determined then.
     """
     loop = _LoopState(rows, samples, context, fine, start)
     last_round = context.config.loop.max_rounds + 2 if rounds is None else rounds
@@ -292,7 +292,8 @@ class _LoopState:
 def _inconsistent_channels(candidates: Sequence[Candidate], alpha: float) -> set[str]:
     """Return the significant channels whose slopes are not consistent between two to four specimens.
 
-    The strongest candidate on mu or the force decides: on a wrong quantity an effect differs by specimen.
+    Their strongest candidate on mu or the force decides: on a wrong quantity the same effect differs by
+    specimen.
     """
     known = [c for c in candidates if c.p_value <= alpha and c.target in MAIN_TARGETS]
     strongest = {c.channels[-1]: c for c in reversed(known)}  # they are sorted, strongest evidence first
@@ -320,8 +321,10 @@ def _pending_candidates(masked: Sequence[MaskedPair], candidates: Sequence[Candi
 def _related_candidates(significant: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
     """Return further candidates that may explain the same structure as the significant ones.
 
-    These are the same channel on other quantities; time, distance and position for each other; and conditions
-    that explain half of what the calendar does, which is correlated with them.
+    The same channel on other quantities is one: the fits decide on which it acts. So are the channels along
+    strokes: time, distance and position are the same there but for the speed. Conditions that explain half of
+    what the calendar does on the same quantity are others: they are tested one after the other, so the
+    calendar is correlated with them, and a dozen specimens may give too little evidence.
     """
     found = []
     keys = {c.key for c in significant}

@@ -122,7 +122,10 @@ def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, 
 
 
 def least_share(fitted: Fitted, left: np.ndarray) -> np.ndarray:
-    """Return the smallest effect of whitened columns, (n, m), in any specimen, a share of the force (m,)."""
+    """Return the smallest effect of whitened columns, shape (n, m), in any specimen, shape (m,).
+
+    It is the RMS as a share of the force; 0 if specimens differ in sign.
+    """
     sums = fitted.rows.groups.sums
     leverage, slopes = _slopes_of_specimens(fitted, left)
     size_N = np.sqrt(sums((left / fitted.whitening.unit[:, None]) ** 2, "specimen"))

@@ -171,7 +171,11 @@ def _dialect(lines: list[str], block: _Block) -> Dialect:
 
 
 def _header_cells(line: str, delimiter: str, width: int) -> list[str]:
-    """Return the cells of a header line; names with blanks, above columns of blanks, are two blanks apart."""
+    """Return the cells of a header line.
+
+    A mark of comment in a cell of its own is left out; names with blanks in them, above columns of blanks,
+    are those that two blanks part.
+    """
     cells = _cells_of(line, delimiter)
     if len(cells) == width + 1 and cells[0] in ("#", "%", "//", ";"):  # a mark of comment
         return cells[1:]

@@ -193,9 +193,10 @@ def beside_table(names: Names, table: RunsTable) -> Names:
 
 
 def suited_to(names: Names, roles: Roles) -> Names:
-    """Return the names as the columns of traces ask for it: with rpm as the speed of a rotation.
+    """Return the names as the columns of traces ask for it.
 
-    Beside a torque the one load in names is matched only: their ratio is no friction coefficient.
+    Where these hold an angle or a rotational speed, rpm in names are the speed. Where they hold a torque, the
+    one load in names is matched only: their ratio is no friction coefficient.
     """
     ours = {part.ours: part for part in names.parts}
     rotates = roles.dimension("speed" if roles.displacement is None else "displacement")

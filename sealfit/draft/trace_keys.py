@@ -232,7 +232,10 @@ def _rotation(angle: Unit, source: str, notes: Notes) -> None:
 
 
 def _clock_or_rate(found: Found, notes: Notes) -> str | None:
-    """Add the first column of times of day, or the header's rate; return its name, or None without either."""
+    """Add the first column of times of day, or the header's rate; None if there is neither.
+
+    The name of the column is returned, which may be empty.
+    """
     one = found.dialect
     for i, cell in enumerate(split_line(one.first, one.delimiter)):
         if i not in one.numbers and seconds_of_day([cell]) is not None:
@@ -296,7 +299,7 @@ def _channel(column: TraceColumn, taken: set[str]) -> str:
 
 
 def settled_units(roles: Roles, notes: Notes) -> dict[str, Unit]:
-    """Return the units of the roles' columns, without torques and angles; what is assumed is a doubt."""
+    """Return the unit of each role's column; what files do not say is assumed, with a doubt."""
     units = {}
     for role, slot in SLOTS.items():
         column = getattr(roles, role)

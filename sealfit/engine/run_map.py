@@ -78,8 +78,7 @@ def run_map(
     """Yield `function(item)` for every item, in the order of the items.
 
     With one worker, one item, or inside a worker, the work is done here; otherwise in `workers` new
-    processes, or on the cluster of `on_cluster`. Results do not depend on where. WorkerError if a process
-    dies before it has answered (killed, or out of memory), or the cluster gives up.
+    processes, or on the cluster of `on_cluster`, several items at a time. Results do not depend on where.
 
     Parameters
     ----------
@@ -88,9 +87,15 @@ def run_map(
         ends the map and is raised here.
     items : iterable
         What to map over; each item is sent to a process, so keep it small.
-    workers, together : int
-        Processes to use, which has no meaning on a cluster; items that are sent to one at once, by default as
-        many as keep the cost of sending low.
+    workers : int
+        Processes to use, at least 1; has no meaning on a cluster.
+    together : int, optional
+        Items that are sent to a process at once; by default as many as keep the cost of sending low.
+
+    Raises
+    ------
+    WorkerError
+        If a process dies before it has answered (killed, or out of memory), or the cluster gives up.
     """
     items = items if isinstance(items, Sequence) else list(items)
     cluster = _cluster.get()

@@ -234,9 +234,10 @@ class BatchFit:
 
 @dataclass(frozen=True)
 class Separable:
-    """Least-squares problems with one nonlinear parameter each; `basis(u, rows)` returns the columns of some.
+    """Least-squares problems with one nonlinear parameter each.
 
-    They have the shape (r, g, n, p) for the problems `rows`, shape (r,), at u, shape (r, g).
+    `basis(u, rows)` returns the columns, shape (r, g, n, p), of the problems `rows`, shape (r,), at u, shape
+    (r, g).
     """
 
     basis: Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -276,7 +276,10 @@ def with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
 
 
 def _without_inertia(trace: Trace, mass: float) -> Trace:
-    """Return the trace with the force less mass times acceleration, as rising displacement counts."""
+    """Return the trace with the force less mass times acceleration of the measured displacement.
+
+    Both count in the direction of rising displacement, as the force of friction does.
+    """
     if not mass or len(trace.line) < 3:
         return trace
     time_s, displacement, force = (trace.columns[name] for name in SLOTS)

@@ -94,12 +94,24 @@ def ingest_campaign(
     on_file: Callable[[int, int], None] | None = None,
     place: Place | None = None,
 ) -> Ingested:
-    """Return the tables of a campaign: a folder with runs.csv, or with files that the config's glob finds.
+    """Return the tables of a campaign.
 
-    The tables do not depend on the number of `workers`. `on_file` is called as files have been read with
-    their number so far, and the number of files to be read. In `place` the tables of samples are stored, so
-    that they need not fit into memory; only what is not there yet is read. CampaignError for faults that
-    concern the whole campaign, or where not one stroke can be used.
+    Parameters
+    ----------
+    campaign : Path
+        Folder with runs.csv, or with files that the config's glob finds.
+    workers : int
+        Processes; the tables do not depend on it.
+    on_file : callable, optional
+        Called as files have been read with their number so far, and the number of files to be read.
+    place : Place, optional
+        Where the tables of samples are to be stored, so that they need not fit into memory; only what is not
+        there yet is read.
+
+    Raises
+    ------
+    CampaignError
+        For faults that concern the whole campaign, or where not one stroke can be used.
     """
     campaign = Path(campaign)
     place = place or Place()

@@ -214,7 +214,10 @@ def numeric_names(settings: TraceFormat) -> set[str]:
 
 
 def force_inputs(config: Config) -> set[str]:
-    """Return the columns that `force_N` is computed from and no channels; none with `drop_columns`."""
+    """Return the columns that `force_N` is computed from and that are no channels; none with `drop_columns`.
+
+    An effect of one of them would give the force back that was computed from it.
+    """
     settings = config.trace
     if settings.drop_columns is not None:
         return set()

@@ -118,8 +118,8 @@ def of_its_kind(name: str, value: float) -> float | str:
 def to_values(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
     """Return the columns as numbers or as labels, and faults of cells that are neither.
 
-    Numbers are columns whose names say so, condition columns and channels with numbers in more than half of
-    the cells, and any with numbers in all.
+    A column of numbers is one whose name says so, one of the config's condition columns or a channel where
+    more than half of the cells are numbers, and any where all are.
     """
     made = {name: _column(name, cells, entries, config) for name, cells in columns.items()}
     faults = [fault for _, found in made.values() for fault in found]
@@ -201,7 +201,10 @@ def out_of_range(entries: list[Entry], columns: Columns) -> list[Fault]:
 
 
 def swapped_columns(entries: list[Entry], columns: Columns) -> list[Fault]:
-    """Return that unaged rubber of no aged condition has 100 °C and compression, as if these were swapped."""
+    """Return that unaged rubber has 100 degrees and a compression other than 100, as if these were swapped.
+
+    Day 0 may have temperature and compression of an aged condition: nobody reads them there.
+    """
     none = [None] * len(entries)
     days, *others = (columns.get(name, none) for name in ("aging_days", *_AGED_ONLY))
     pairs = list(zip(*others, strict=True))
@@ -252,8 +255,9 @@ def add_runs(
     """Return the columns with a `run_id` for every file, and what is to be said of it.
 
     Where none is given there is one per condition, commanded speed, load (of several) and (named) specimen.
-    Without a commanded speed, files share a run within 5 % of the `measured` one, in `unit`, with several
-    speeds each (nan), or as strokes there and back of one record, as the column `stroke` tells them.
+    Without a commanded speed it is that `measured`, in `unit` (nan where one is commanded): files within 5 %
+    share a run. So do files with several speeds each (nan), and strokes there and back of one record, a file
+    each, as the column `stroke` tells them.
     """
     none = [None] * len(conditions)
     given = columns.get("run_id", none)

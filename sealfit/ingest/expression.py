@@ -67,10 +67,20 @@ class Expression:
 
 @lru_cache(maxsize=256)
 def parse(text: str, *, condition: bool = False) -> Expression:
-    """Return the checked expression in `text`: a number, or with `condition` what is true or false.
+    """Return the checked expression in `text`.
 
-    A comparison in a number counts 1 where it holds, else 0. ConfigError if the text is no expression, or
-    holds a piece that is not allowed.
+    Parameters
+    ----------
+    text : str
+        For example `"-torque_pct * 9.84 / 100"`; with `condition`, `"load_N > 4.9 and time_s < 60"`.
+    condition : bool
+        Whether it must be a condition; a comparison in a number counts 1 where it holds and 0 where it does
+        not.
+
+    Raises
+    ------
+    ConfigError
+        If the text is no expression, or holds a piece that is not allowed; the message names that piece.
 
     Examples
     --------

@@ -50,9 +50,10 @@ def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
 
 
 def cut_files(campaign: Path, texts: Sequence[str]) -> frozenset[str]:
-    """Return those of some text files that do not end with a line end although most do: copies broken off.
+    """Return those of some text files that do not end with a line end although most do.
 
-    The part of a number is a number. Of a program that writes no last line end, all files lack it.
+    A copy that was broken off ends anywhere, and the part of a number is a number. Some programs write no
+    line end after the last line; all of their files lack it.
     """
     lacking = [file for file in texts if not _ends_a_line(os.path.join(campaign, file))]
     return frozenset(lacking if len(lacking) <= MOST_CUT * len(texts) else ())

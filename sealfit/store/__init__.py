@@ -55,7 +55,8 @@ class Store:
     def open(cls, out: Path, effects: Path | None = None) -> Store:
         """Return the results in `out`, for reading; `effects` is the folder that --effects-folder names.
 
-        OutError, whose fix names the likeliest folder, if `out` holds none. Else as `own_effects_folder`.
+        OutError, whose fix names the likeliest folder, if `out` holds no results. ConfigError if `effects`
+        may not be run, as `own_effects_folder`.
         """
         if (out / COMPLETE).exists():
             with held(out):  # which moves its files
@@ -86,8 +87,10 @@ class Store:
         """Hold `out` as its only writer and give the store; without `campaign`, one that already has results.
 
         `source` is the config that the command line names, `effects` the folder that --effects-folder names,
-        `properties` what is asked of a table of properties in `campaign`. OutError as `held`, or if `out` has
-        the results of another campaign.
+        `properties` what is asked of a table of properties in `campaign`.
+
+        OutError if `out` is a file, a folder that sealfit did not make, the results of another campaign, in
+        use by another process, or cannot be written.
         """
         if campaign is None:
             cls.open(out, effects)  # raises if there are no results
@@ -177,7 +180,10 @@ class Store:
         return order[: order.index(step) + 1]
 
     def is_whole(self, file: str, done: manifest.Done) -> bool:
-        """Whether a file is what its step wrote; it is read once, and parts of large tables if touched."""
+        """Whether a file is what its step wrote; it is read once by this process.
+
+        Parts of large tables are read only if they were touched since state.json was written.
+        """
         if file_size(f"{self.out}/{file}") != done.files[file]:
             return False
         if file not in done.checksums or (file.endswith(PARQUET) and "/" in file and not self._touched(file)):
@@ -288,7 +294,10 @@ class Store:
     # ------------------------------------------------------------ writing
     @contextlib.contextmanager
     def step(self, name: str) -> Iterator[Staged]:
-        """Give a place for the files of a step, which are moved at the end; OutError leaves OUT as it was."""
+        """Give a place for the files of step `name`; all are moved when the block ends without an error.
+
+        OutError if the disk is full or refuses; OUT then holds what it held before.
+        """
         began = time.monotonic()
         staged = Staged(self.out, self.config.units, name)
         try:

@@ -70,7 +70,11 @@ def _mark(status: os.stat_result, sha256: str | None) -> Fingerprint:
 
 
 def changes(folder: Path, known: Fingerprints, files: Files) -> dict[str, Fingerprint]:
-    """Return the fingerprints of new and changed trace files; read if size or time is another."""
+    """Return the current fingerprints of a campaign's trace files that are new or differ from those `known`.
+
+    A file is read only if its size or a time differ from those known. New ones are those that the glob of
+    `files` finds.
+    """
     place, changed = os.path.join(folder, ""), []
     for file, mark in known.items():
         try:

@@ -33,18 +33,30 @@ LawRows = tuple[list[dict], list[dict]]
 
 
 def fit_series(steady_fit: SteadyFit, config: Config) -> dict[str, pd.DataFrame]:
-    r"""Return tables `aging_fit` and `aging_covariance` of the aging laws of series, mu_0 shared by a rubber.
+    r"""Fit the aging law to every series, mu_0 shared by all series of a rubber.
 
     .. math:: \mu(t) = \mu_0 - a \ln(1 + t / b), \quad c = -a \ln b
 
-    All series and both quantities of a rubber are fitted together by generalised least squares, to the
-    identified values of the steady fits, whose table has the column `aging_days`. The covariance is that of
-    mu_s and mu_c in the steady fits plus the scatter between specimens, estimated from the residuals.
+    All series and both quantities of a rubber are fitted together by generalised least squares. The
+    covariance is that of mu_s and mu_c in the steady fits plus the scatter between specimens, estimated from
+    the residuals.
 
-    `aging_fit` has mu_0, a, b, c per series and quantity, and "statistics" rows, whose `parameter` starts
-    with the quantity ("mu_s:chi2"); `aging_covariance` is that of mu_0, a and ln b. They are empty without
-    `aging_days` in the condition or without aged rubber.
+    Parameters
+    ----------
+    steady_fit : dict of DataFrame
+        The fits of the conditions, with the column `aging_days`; only identified values are used.
+    config : Config
+        Names the condition columns.
 
+    Returns
+    -------
+    dict of DataFrame
+        Table `aging_fit`: per series and quantity mu_0, a, b, c, and "statistics" rows, whose `parameter`
+        starts with the quantity ("mu_s:chi2"); and table `aging_covariance` of mu_0, a and ln b. Empty
+        without `aging_days` in the condition or without aged rubber.
+
+    Notes
+    -----
     Intervals of a, b and c are profile-likelihood intervals, that of mu_0 is from the curvature, with
     Student's t. The degrees of freedom are values minus parameters of the quantity, as specimens are the unit
     of evidence. `u_sys` is the change of the fit if the sensor's error changes all steady values together.

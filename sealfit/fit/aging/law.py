@@ -151,10 +151,10 @@ class Values:
 class EqualGroups:
     """Groups of values and of their curves, of one size each and independent given mu_0.
 
-    A group is a series with its correlated quantities, an unaged condition, or, if batches correlate them,
-    several. `rows`, shape (g, n), and `curves`, (g, w), are its values and curves, ascending. Its p
-    parameters are all mu_0, then a, then ln b of its curves; `places`, shape (g, p), are their places among
-    all parameters, and `bounds`, shape (2, g, p), their limits.
+    A group is a series with its correlated quantities, an unaged condition, or, if batches correlate
+    conditions, several of them. `rows`, shape (g, n), and `curves`, (g, w), are its values and curves,
+    ascending. Its p parameters are all mu_0, then a, then ln b of its curves; `places`, shape (g, p), are
+    their places among all parameters, and `bounds`, shape (2, g, p), their limits.
     """
 
     def __init__(self, values: Values, rows: np.ndarray, curves: np.ndarray) -> None:
@@ -195,7 +195,10 @@ class EqualGroups:
         return (x[self.places] > self.bounds[0]) & (x[self.places] < self.bounds[1])
 
     def eliminated(self, x: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Return whitened derivatives by mu_0 and a column, (g, n), less those by a and b, (g, m + 1, n)."""
+        """Return whitened derivatives with respect to mu_0 and a column, a and b eliminated, (g, m + 1, n).
+
+        `x`, shape (all,), are all parameters; `column`, shape (g, n), is any whitened column.
+        """
         _, slope = self.at(x)
         columns = np.concatenate([slope[:, : self.m], column[:, None]], axis=1)
         if not self.width:
@@ -274,7 +277,11 @@ def _polished(values: Values, start: np.ndarray) -> LawFit:
 
 
 class _Eliminating(Linear):
-    """Products for one problem, with derivatives by groups; a step is by a Schur complement of mu_0."""
+    """Products for one problem, whose derivatives are a list by groups.
+
+    A step eliminates a and b group by group, solves the remaining equations of mu_0 (Schur complement), and
+    substitutes back.
+    """
 
     def __init__(self, groups: list[EqualGroups]) -> None:
         self.groups = groups

@@ -39,9 +39,10 @@ NO_SCATTER = (
 
 
 def elsewhere(fit: LawFit, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return what other groups add to the normal matrix of mu_0 and a whitened column, (g, m + 1, m + 1).
+    """Return what all other groups contribute to the normal matrix of mu_0 and a whitened column.
 
-    `columns`, shape (g, n) each, and the results are by `values.groups`.
+    `columns`, shape (g, n) each, and the results, shape (g, m + 1, m + 1) each, are by `values.groups`. a and
+    b of the other groups are eliminated. Groups are independent, and their contributions add.
     """
     pairs = zip(fit.values.groups, columns, strict=True)
     rows = [own.eliminated(fit.x, column) for own, column in pairs]
@@ -53,7 +54,10 @@ def elsewhere(fit: LawFit, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def likelihoods(fit: LawFit) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return R, (g, m + 1, m), and r, (g, m + 1): others' chi-square is |R (mu_0 - fitted) + r|^2."""
+    """Return the likelihood of mu_0 from the other groups, by `values.groups`.
+
+    It is R, shape (g, m + 1, m), and r, (g, m + 1): their chi-square is |R (mu_0 - fitted) + r|^2.
+    """
     found = []
     for square in elsewhere(fit, fit.residuals):
         share, axes = np.linalg.eigh(square)

@@ -108,17 +108,31 @@ def fit_dynamic(
     *,
     workers: int = 1,
 ) -> dict[str, pd.DataFrame]:
-    """Return tables `dynamic_fit` and `dynamic_curves`: sigma_0 and sigma_1 of Eqs. 1 to 7 by condition.
+    """Fit sigma_0 and sigma_1 of Eqs. 1 to 7 to the pre-sliding part of every condition's strokes.
 
-    They are fitted to the pre-sliding part of its strokes. `traces` is table `traces`, or its stored
-    partitions, which are read one at a time; rows of `steady` with `used` false are left out; a Stribeck
-    curve that is not identified in `steady_fit` is flat.
+    Parameters
+    ----------
+    traces : DataFrame or sequence of StoredTraces
+        Table `traces`, or its stored partitions, which are read one at a time.
+    steady : DataFrame
+        Table `steady` or `steady_after`; rows with `used` false are left out.
+    steady_fit : dict of DataFrame
+        Its fits, with the Stribeck curve of each condition; a curve that is not identified is flat.
+    config : Config
+        Names the condition columns, the units and the sensor's accuracy.
+    workers : int
+        Number of processes.
 
-    In `dynamic_fit` `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed and
-    direction: the force, and its ratio to the sliding force), "largest" (likewise: ratio of the largest force
-    in the strokes to the sliding force) or "statistics". `dynamic_curves` has the mean starts, measured and
-    fitted.
+    Returns
+    -------
+    dict of DataFrame
+        Tables `dynamic_fit`, with the condition columns, and `dynamic_curves`, the mean starts, measured and
+        fitted. In `dynamic_fit` `quantity` is "dynamic" (sigma_0, sigma_1), "break_away" (per commanded speed
+        and direction: the force, and its ratio to the sliding force), "largest" (likewise: ratio of the
+        largest force in the strokes to the sliding force) or "statistics".
 
+    Notes
+    -----
     The unit of evidence is the file for the length of the rise and the run for the level of the force; it is
     the stroke if there is only one file or run. Intervals of sigma_0 are symmetric in its logarithm. `u_sys`
     assumes one unknown error of |force| for all samples.
@@ -226,9 +240,10 @@ def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
 def _evidence(
     starts: Sequence[StrokeStart], steady: pd.DataFrame, curve: StribeckCurve
 ) -> list[RisingStroke]:
-    """Return the starts of a condition with units of evidence and their ratio to the curve.
+    """Return the starts of a condition with their units of evidence and their ratio to the curve.
 
-    It is that of the loads, or of the sliding forces if the curve is not determined, by rows of `steady`.
+    The ratio is that of the loads, or of the sliding forces if the curve is not determined. `steady` has the
+    row of each start.
     """
     size = steady["load_N" if curve.known else "size_N"].to_numpy(float)
     known = size[~np.isnan(size)]

@@ -168,7 +168,8 @@ def _between_files(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the cluster-robust covariance of estimates, shape (p, p), and degrees of freedom, shape (p,).
 
-    It is the jackknife over files (CR3). `inverse` is that of J'J; `file` has the number of strokes' files.
+    It is the jackknife over files (CR3). The degrees of freedom depend on the leverages of the files.
+    `inverse` is that of J'J, and `file`, shape (strokes,), the number of each stroke's file.
     """
     files, p = int(file.max()) + 1, len(inverse)
     if files < 2:
@@ -185,14 +186,17 @@ def _between_files(
 
 
 def peaks(cells: Cells, file: np.ndarray) -> pd.DataFrame:
-    """Return the break-away force F_ba and its ratio to the sliding force, a row per file or lone stroke.
+    """Return the break-away force F_ba and its ratio to the sliding force, per unit of evidence.
 
-    `file`, shape (n,), is the number of the file in each row of table `steady`. The sliding force is
-    extrapolated to the peak along the line through the beginning of steady sliding, so that warming along the
-    stroke does not count. The position of the peak is that of the mean of the other units, as the maximum of
-    noisy samples is biased. For the test for a peak, `top` is the force above sliding where the mean of all
-    units is largest, `noise` its standard error in units of that of a sample, and `places` the number of
-    positions; `F` is the sliding force. Units with an unknown value are left out.
+    A unit is a file, or a stroke of a single file; `file`, shape (n,), is the number of the file in each row
+    of table `steady`. The sliding force is extrapolated to the peak along the line through the beginning of
+    steady sliding, so that warming along the stroke does not count as break-away. The position of the peak is
+    taken from the mean of the other units, and the force of a start is read there, as the maximum of noisy
+    samples is biased. For the test for a peak, `top` is the force above sliding where the mean of all units
+    is largest, `noise` its standard error in units of that of a sample, and `places` the number of positions;
+    `F` is the sliding force.
+
+    The table has one row per unit; units with an unknown value are left out.
     """
     half = int(np.ceil(cells.count * max(SAMPLES / cells.samples, SHARE) / 2))  # of the window, in cells
     lines = np.array([astuple(part.sliding) for part in cells.parts], float)
@@ -232,7 +236,11 @@ def peaks(cells: Cells, file: np.ndarray) -> pd.DataFrame:
 
 
 def _highest(above: np.ndarray, hits: np.ndarray) -> int:
-    """Return the cell in which the mean of sums of the force above sliding, of `hits` samples, is largest."""
+    """Return the cell in which the mean force above sliding of strokes is largest.
+
+    `above` and `hits`, shape (strokes, cells), are the sum of the force above sliding over a window about
+    each cell, and the number of cells in the sum.
+    """
     total, count = above.sum(axis=0), hits.sum(axis=0)
     sure = count > count.max() / 2  # means of fewer cells are too noisy
     return int(np.argmax(np.where(sure, total / np.maximum(count, 1), -np.inf)))

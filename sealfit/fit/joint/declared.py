@@ -59,12 +59,13 @@ class Declared:
 
 
 def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
-    """Return the declared model that these conditions and speeds determine; the result is cached.
+    """Return the declared model that these conditions and speeds determine.
 
     A series needs four speeds in one direction for Eq. 14, or three at which friction is not a straight line
     ("interpolated"), and two for the viscous term. Two will do if another series of its rubber has a curve.
-    Eq. 15 needs three days, the unaged day included. Speeds are counted within one direction: an offset
-    between directions could be taken for a Stribeck curve. A part of a campaign takes its model, `as_in`.
+    Eq. 15 needs three days, the unaged day included. Parameters that are not determined are left out. Speeds
+    are counted within one direction: an offset between directions could be taken for a Stribeck curve. The
+    result is cached. A part of a campaign with the same conditions takes the model of the campaign, `as_in`.
     """
     return rows.cache.once(("declared",), lambda: _declare(rows) if as_in is None else declare(as_in))
 
@@ -160,10 +161,11 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
 def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
     """Return the p-value of F tests on file means that friction at three speeds is a line that rises.
 
-    A curve through three speeds leaves few degrees of freedom for other effects. As in the declared model the
-    slope is not negative and shared by all conditions, each of which has its own level. The curve adds
-    curvature that all share, and may add a slope of each condition (mu_s less mu_c). Repeats and directions
-    may differ by the same in all runs. The result is 0, and the curve is taken, without a degree of freedom.
+    A curve through three speeds leaves few degrees of freedom for other effects, so a line is kept if it is
+    not rejected. As in the declared model its slope is not negative and shared by all conditions, each of
+    which has its own level. The curve adds curvature that all share, and may add a slope of each condition
+    (mu_s less mu_c). Repeats may differ, each by the same in all runs: seals run in. So may the directions.
+    Without a degree of freedom there is no test; it is 0 then, and the curve is taken.
     """
     speed, load = np.abs(rows.speed[chosen]), rows.load[chosen]
     nearest = np.abs(speed[:, None] - tested_speeds(rows, chosen)).argmin(axis=1)

@@ -290,8 +290,10 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
 def set_speeds(speed: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Return signed speeds of rows, shape (n,), with all strokes of one setting of a run at their mean.
 
-    To the noise of measured speeds a slope would be fitted that is too small (regression dilution: Fuller
-    1987, *Measurement Error Models*, section 1.1, doi:10.1002/9780470316665). `run` numbers each row's run.
+    `run`, shape (n,), is the number of each row's run. Measured speeds of one setting differ by the noise of
+    the position, and the force does not follow it. If the forces of these strokes are more alike than the
+    runs, the slope of the Stribeck curve would be fitted to that noise and be too small (regression dilution:
+    Fuller 1987, *Measurement Error Models*, section 1.1, doi:10.1002/9780470316665).
     """
     size = np.abs(speed)
     order = np.lexsort((size, run))

@@ -35,7 +35,8 @@ CONVERGED = 1e-4
 def start_model(rows: Rows, *, together: bool = False) -> Model:
     """Return the declared model with v_s and b from a global search and the rest from exact least squares.
 
-    With `together`, all series start from one v_s and one sigma_2, against a few noisy runs.
+    With `together`, all series start from one v_s and one sigma_2, which a few noisy runs cannot make far
+    wrong.
     """
     declared = declare(rows)
     theta = np.zeros(len(declared.parameters))
@@ -270,7 +271,10 @@ def _best_on_grid(model: Model, rows: Rows, scatter: Scatter, group: list[int]) 
 
 
 def _split_by_action(model: Model, rows: Rows, group: list[int]) -> tuple[Rows, ...]:
-    """Return rows of specimens on which declared parameters act, and the others, if both have rows."""
+    """Return rows on which declared parameters act, and the others; all rows if one part is empty.
+
+    Rows of one specimen are correlated and stay together.
+    """
     conditions = np.any([np.isin(numbers, group) for numbers in model.declared.index.values()], axis=0)
     specimen = rows.codes("specimen")
     acts = (np.bincount(specimen, conditions[rows.condition]) > 0)[specimen]

@@ -205,9 +205,10 @@ class Tangent:
 
 
 class OwnColumns:
-    """A few columns per specimen, `code`, zero outside its rows: those of different specimens are orthogonal.
+    """A few columns per specimen, zero outside its rows: those of different specimens are orthogonal.
 
-    `loads`, shape (n,) or (n, k), are their values. Columns that others of the specimen contain do not count.
+    `code`, shape (n,), is the specimen of each row, and `loads`, shape (n,) or (n, k), the values of its
+    columns there. Columns of zeros, and those that others of the specimen contain, do not count.
     """
 
     def __init__(self, code: np.ndarray, loads: np.ndarray) -> None:
@@ -230,7 +231,8 @@ class OwnColumns:
 def blocks_of(sets: Sequence[frozenset[int]], size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return blocks that contain sets of columns, and each set's block; one block if a set has most columns.
 
-    The blocks have the column at each place, shape (blocks, k), or `size`, all columns, if it is empty.
+    The blocks have the column at each place, shape (blocks, k), or `size`, the number of columns, if the
+    place is empty. The number of each set's block has the shape (sets,).
     """
     kept: list[frozenset[int]] = []
     home: dict[frozenset[int], int] = {}

@@ -51,23 +51,41 @@ SteadyFit = Mapping[str, pd.DataFrame]
 
 
 def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
-    r"""Return tables `steady_fit`, `steady_covariance`, `steady_shift` of Eq. 14 fitted to all conditions.
+    r"""Fit Eq. 14 to every condition, and mark the parameters that its speeds determine.
 
     .. math:: F\,\mathrm{sgn}\,v = N [\mu_c + (\mu_s - \mu_c) e^{-(v/v_s)^2}] + \sigma_2 |v|
 
-    Run means of both directions are fitted together, weighted by the pooled scatter of repeats; rows of
-    `steady` with `used` false are left out. mu_s, mu_c and sigma_2 are not negative; mu_s < mu_c is allowed
-    and reported. Without load the forces F_s and F_c are fitted. The config names the condition columns, the
-    units and the sensor's accuracy. FitError if there is no row to fit.
+    Run means of both directions are fitted together, weighted by the pooled scatter of repeats. mu_s, mu_c
+    and sigma_2 are not negative; mu_s < mu_c is allowed and reported. Without load the forces F_s and F_c are
+    fitted.
 
-    In `steady_fit` `quantity` is "steady" (one row per parameter) or "statistics". In `steady_shift` `source`
-    is "sensor" (change of the parameter if the sensor reads every |force| one standard uncertainty too high)
-    or, if effects were subtracted from the forces, the number of a principal direction of their uncertainty,
-    from 1 (included in the covariance and common to all conditions).
+    Parameters
+    ----------
+    steady : DataFrame
+        Table `steady`; rows with `used` false are left out.
+    config : Config
+        Names the condition columns, the units and the sensor's accuracy.
 
+    Returns
+    -------
+    dict of DataFrame
+        Tables `steady_fit`, `steady_covariance` and `steady_shift`, with the condition columns. In
+        `steady_fit` `quantity` is "steady" (one row per parameter) or "statistics". In `steady_shift`
+        `source` is "sensor" (change of the parameter if the sensor reads every |force| one standard
+        uncertainty too high; `u_sys` is its magnitude) or, if effects were subtracted from the forces, the
+        number of a principal direction of the effects' uncertainty, from 1 (it is included in the covariance
+        and the intervals, and common to all conditions).
+
+    Raises
+    ------
+    FitError
+        If there is no row to fit.
+
+    Notes
+    -----
     Intervals are profile-likelihood intervals with Student's t. `u_sys` assumes one unknown error of |force|
-    for all samples. A zero offset of the sensor has opposite signs in the two directions and changes the
-    parameters by no more; the loop tests for it.
+    for all samples, which no averaging reduces. A zero offset of the sensor has opposite signs in the two
+    directions and changes the parameters by no more; the loop tests for it.
     """
     conditions, scatter, variance = solve_conditions(steady)
     keys = condition_keys(steady, config)

@@ -172,7 +172,8 @@ def refused(tables: Tables, closure: Mapping, config: Config) -> Plot | None:
 def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     """Return the mean residuals at each commanded speed and direction, as rows of table `channels`.
 
-    Measured speeds stand for others to two digits. Intervals are from the strokes' means.
+    Where no speed was commanded, measured ones that agree to two digits are one. Intervals are from the
+    strokes' means.
     """
     found, stroke = {}, ["run_id", "file", "stroke"]
     for stage, residuals in (("before", before), ("after", after)):
