@@ -363,7 +363,7 @@ def test_a_step_in_time_is_found_in_a_few_files_that_repeat_well():
     """A spline of four columns does not follow a step, and what it leaves hides it in 20 files."""
 
     def recalibrated(table, force):
-        return force * np.where(table["elapsed_h"] > 30.0, 0.98, 1.0)
+        return force * np.where(table["elapsed_h"] > 30.0, 0.982, 1.0)
 
     bins = make_bins(
         bins=8, temperatures=(60.0,), days=(8.0,), speeds=np.geomspace(1.0, 60.0, 10), repeats=1,
@@ -373,7 +373,7 @@ def test_a_step_in_time_is_found_in_a_few_files_that_repeat_well():
     found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
     assert found[0].channels == ("elapsed_h",)
     assert found[0].p_value < 1e-6
-    assert min(c.p_value for c in found if c.columns.shape[1] > 1) > 0.001
+    assert min(c.p_value for c in found if c.columns.shape[1] > 1) > 0.005
 
 
 def test_a_speed_effect_shows_where_sigma_2_could_take_it_up_only_below_zero():
