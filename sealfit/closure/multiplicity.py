@@ -10,7 +10,7 @@ import numpy as np
 
 from sealfit.closure import small_sample_test
 from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES, UNEQUAL_RUNS
-from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of_score, score_statistic
+from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of_score, to_orthonormal
 from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, slope_log_p
 from sealfit.fit.joint import Fitted
 
@@ -91,7 +91,7 @@ def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
     by_units = defaultdict(lambda: defaultdict(list))
     for test_result in results:
         units, df = test_result.scores.shape
-        by_units[units][df].append(test_result.scores)
+        by_units[units][df].append(test_result.scores @ to_orthonormal(test_result.scores))
     least = np.zeros(flips)
     for units, by_df in by_units.items():
         scores = np.column_stack([own for scores in by_df.values() for own in scores])
@@ -100,10 +100,10 @@ def _least(results: Sequence[ScoreTestResult], rng: np.random.Generator, flips: 
         totals = np.concatenate([rng.choice([-1.0, 1.0], size=(n, units)) @ scores for n in counts])
         first = 0
         for df, scores in by_df.items():
-            most = np.zeros(flips)  # the largest T has the smallest p-value where units and df are the same
-            for own in scores:
-                most = np.maximum(most, score_statistic(totals[:, first : first + df], own))
-                first += df
+            own = totals[:, first : first + df * len(scores)].reshape(flips, -1, df)
+            first += df * len(scores)
+            # The largest T has the smallest p-value where units and df are the same.
+            most = np.einsum("fck,fck->fc", own, own).max(axis=1)
             least = np.minimum(least, log_p_of_score(most, df, units))
     return least
 

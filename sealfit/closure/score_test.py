@@ -46,6 +46,8 @@ from sealfit.fit.joint.tangent import OwnColumns, Tangent
 OWN = 1e-6
 # A direction of the tangent space with a smaller singular value lies in the specimens' own columns.
 RANK = 1e-9
+# Scores depend on the others if an eigenvalue of their cross product is a smaller share of the largest one.
+DEPENDENT = 1e-10
 
 
 class ScoreTestResult(NamedTuple):
@@ -223,7 +225,8 @@ class ScoreTests:
         left = (left @ u[:, keep] / np.sqrt(s[keep]))[:, : max(1, units // 5)]
         scores = fitted.rows.groups.sums(left * fitted.unit_residual(level)[:, None], level)
         total = left.T @ fitted.white_residual
-        log_p = float(log_p_of_score(score_statistic(total[None, :], scores)[0], left.shape[1], units))
+        statistic = np.sum((total @ to_orthonormal(scores)) ** 2)
+        log_p = float(log_p_of_score(statistic, left.shape[1], units))
         jackknife = 0.0
         if units >= criteria.JACKKNIFE_UNITS:
             explained, against_units = _log(chdtrc(left.shape[1], total @ total)), 0.0
@@ -277,10 +280,14 @@ def _inverse_of(size: np.ndarray, axes: np.ndarray) -> np.ndarray:
     return (axes * shrink[:, None, :]) @ axes.transpose(0, 2, 1)
 
 
-def score_statistic(totals: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return T for each row of `totals`, shape (m, k) -> (m,)."""
-    inverse = np.linalg.pinv(scores.T @ scores, rcond=1e-10, hermitian=True)
-    return ((totals @ inverse) * totals).sum(axis=1)
+def to_orthonormal(scores: np.ndarray) -> np.ndarray:
+    """Return the transform, shape (k, k), of scores, shape (units, k), to orthonormal ones.
+
+    T is the squared length of the transformed sum. Scores that depend on the others become zero.
+    """
+    size, axes = np.linalg.eigh(scores.T @ scores)
+    kept = size > DEPENDENT * size[-1]
+    return axes * np.where(kept, 1 / np.sqrt(np.where(kept, size, 1.0)), 0.0)
 
 
 def log_p_of_score(t: np.ndarray, df: int, units: int) -> np.ndarray:

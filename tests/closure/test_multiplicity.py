@@ -16,7 +16,7 @@ from sealfit.closure.multiplicity import (
     adjust_small_sample,
     critical_many,
 )
-from sealfit.closure.score_test import Candidate, ScoreTestResult, log_p_of_score, score_statistic
+from sealfit.closure.score_test import Candidate, ScoreTestResult, log_p_of_score, to_orthonormal
 from sealfit.closure.small_sample_test import ContrastTest, SmallSampleTest, slope_log_p
 from sealfit.closure.small_sample_test import log_p_of_numbers as small_sample_log_p
 
@@ -24,11 +24,15 @@ NOWHERE = -1e-9  # log of a p-value of 1
 TARGET = ("mu", "multiply")
 
 
+def statistic(total, scores):
+    return float(np.sum((total @ to_orthonormal(scores)) ** 2))
+
+
 def scored(scores):
     """A score test of columns whose units have these scores, shape (units, k)."""
     total = scores.sum(axis=0)
     units, df = scores.shape
-    t = float(score_statistic(total[None, :], scores)[0])
+    t = statistic(total, scores)
     return ScoreTestResult(
         float(total @ total), df, units, float(log_p_of_score(np.array([t]), df, units)[0]), scores=scores
     )
@@ -41,10 +45,12 @@ def alike(units):
 
 def test_the_statistic_is_the_squared_sum_over_the_sum_of_squares():
     scores = np.array([[1.0], [2.0], [-1.0], [4.0]])
-    assert score_statistic(np.array([[6.0]]), scores) == pytest.approx([36 / 22])
+    assert statistic(np.array([6.0]), scores) == pytest.approx(36 / 22)
     # Columns that share no unit: the sum of both.
     apart = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 2.0], [0.0, 4.0]])
-    assert score_statistic(np.array([[2.0, 6.0]]), apart) == pytest.approx([4 / 2 + 36 / 20])
+    assert statistic(np.array([2.0, 6.0]), apart) == pytest.approx(4 / 2 + 36 / 20)
+    # A column twice counts once.
+    assert statistic(np.array([6.0, 6.0]), np.hstack([scores, scores])) == pytest.approx(36 / 22)
 
 
 @pytest.mark.parametrize("units", [5, 8])
