@@ -383,5 +383,5 @@ def _best(before: Fitted, term: Term) -> Fitted:
         height = float(left @ before.white_residual) / size if size > 0 else 0.0
         start = {**effect.start(), amplitude: height, number: day}
         model = before.model.with_term(term, {p.name: start[p.name] for p in effect.parameters})
-        found.append(reestimated(before.refitted(model)))
-    return min(found, key=lambda f: f.deviance)
+        found.append(before.refitted(model))
+    return reestimated(min(found, key=lambda f: f.deviance))
