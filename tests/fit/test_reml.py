@@ -101,6 +101,24 @@ def test_reml_recovers_scatter_of_files_runs_and_specimens():
     npt.assert_allclose(np.mean(found, axis=0), [0.01, 0.2, 0.02], rtol=0.15)
 
 
+def test_no_component_stays_at_zero_that_is_none():
+    """Forces over two decades, where a descent from large components makes small ones zero."""
+    codes = nested(2, 6, 5)
+    kinds = [("file", "offset"), ("file", "gain"), ("run", "offset"), ("run", "gain"), ("specimen", "gain")]
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        force = np.tile(np.geomspace(0.5, 50, 6), 5)[codes["run"]]
+        sd = 10 ** rng.uniform(-3.5, -1, 5) * [10, 1, 10, 1, 1]
+        residual = rng.normal(0, 0.02, 60)
+        for size, (level, kind) in zip(sd, kinds, strict=True):
+            drawn = rng.normal(0, size, codes[level].max() + 1)[codes[level]]
+            residual += drawn * (force if kind == "gain" else 1.0)
+        means = GroupMeans(residual, np.full(60, 0.02**2), loads_of(force), Groups.of(codes))
+        tangent = Tangent.dense(np.column_stack([np.ones(60), force]))
+        found, from_truth = (reml(means, tangent, kinds, start)[0] for start in (None, sd**2))
+        assert found == pytest.approx(from_truth, abs=0.1)
+
+
 def test_reml_counts_the_degrees_of_freedom_that_the_model_took():
     # 40 groups of one, 20 of whose means the model owns: the plain mean square would be half the variance.
     rng = np.random.default_rng(5)

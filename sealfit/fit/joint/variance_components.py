@@ -34,6 +34,11 @@ LEAST_START = 0.03
 MOST_GAIN = 0.5
 # A component below this share of the residual variance counts as zero.
 LEAST = 1e-5
+# A component of zero is no minimum if half the restricted deviance falls by more than this per share of the
+# residual variance. Of 290 estimates in seven campaigns three had such a component, and fell by 1.1 to 76.
+FALLS = 1.0
+# Largest number of starts of an estimate.
+STARTS = 3
 # Largest component, as a multiple of the residual variance, which may be small with many parameters.
 MOST_SHARE = 30.0
 
@@ -74,14 +79,21 @@ def reml(
     high = np.sqrt(np.clip(most, LEAST, MOST_SHARE))
     first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, LEAST_START)
     # The parameters are standard deviations: a zero component has its minimum at 0, in logarithms at -inf.
-    best = minimize(
-        objective,
-        np.minimum(np.sqrt(first), 0.6 * high),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(0.0, most) for most in high],
-        options={"maxiter": 200, "ftol": 1e-10},  # so that rounding in the residual changes no estimate
-    )
+    # The gradient at 0 is 0, minimum or not; if it is none, the component starts again at a small value.
+    sd = np.minimum(np.sqrt(first), 0.6 * high)
+    for _ in range(STARTS):
+        best = minimize(
+            objective,
+            sd,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(0.0, most) for most in high],
+            options={"maxiter": 200, "ftol": 1e-10},  # so that rounding in the residual changes no estimate
+        )
+        falls = (best.x**2 <= LEAST) & (likelihood(unit * best.x**2)[1] * unit < -FALLS)
+        if not falls.any():
+            break
+        sd = np.where(falls, np.sqrt(2 * LEAST), best.x)
     share = best.x**2
     variances = np.where(share > LEAST, unit * share, 0.0)
     parts = zip(kinds, variances.tolist(), strict=True)
