@@ -15,7 +15,7 @@ from sealfit.effects import aging_laws
 from sealfit.errors import FitError
 from sealfit.fit.aging.law import paule_mandel
 from sealfit.fit.joint.prior import covariance_of
-from sealfit.fit.joint.whitening import log_determinant, whitening_of
+from sealfit.fit.joint.whitening import blockwise, log_determinant, whitening_of
 from sealfit.fit.least_squares import levenberg_marquardt
 from sealfit.physics.aging_laws import LOSSES, Loss
 
@@ -27,6 +27,8 @@ TINY = 1e-280
 ROUNDING = 1e-12
 # Largest number of series that are left out in turn: it determines their RMS error to a tenth.
 MOST_LEFT_OUT = 50
+# Number of sets of values that are drawn anew.
+RESAMPLES = 500
 # Fewest degrees of freedom of a law that is compared with others that leave more.
 SPARE = 2
 
@@ -223,6 +225,15 @@ class JointLaw:
     def tested_days(self) -> np.ndarray:
         """Return the aging times in days, scaled to the master curve if the rate changes, shape (n,)."""
         return self.aged.days * self.factors(self.aged)[0]
+
+    @cached_property
+    def resamples(self) -> np.ndarray:
+        """Parameters of fits to values drawn anew, shape (RESAMPLES, p): a parametric bootstrap."""
+        mean = self.at(self.aged)
+        covariance = self.aged.covariance(self.scatter, mean)
+        normal = np.random.default_rng(1).standard_normal((RESAMPLES, mean.size))
+        values = mean + normal @ blockwise(np.linalg.cholesky, covariance).T
+        return solved_many(self, whitening_of(covariance), values)
 
     def parameters(self) -> Iterator[tuple[str, float, float, float, bool]]:
         """Yield name, value, ends of the 95 % interval (NaN: no bound), and whether the values determine it.

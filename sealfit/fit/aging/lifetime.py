@@ -10,8 +10,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtri, stdtr
 
 from sealfit.errors import RequestError
-from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw, solved_many
-from sealfit.fit.joint.whitening import blockwise, whitening_of
+from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw
 from sealfit.fit.least_squares import central_jacobian
 
 # The lifetime t of a joint law solves :math:`a\, k^w \varphi(k^{1-w} t) = \mu_0 - \mu^*`. Its interval is
@@ -32,8 +31,8 @@ USES = {
 }
 # Range of lifetimes in days. A law has no meaning beyond it.
 AT_ONCE, FOREVER = 1e-9, 1e9
-# Number of drawn lifetimes, ends of their 95 % interval, and the method of quantiles: they may be inf.
-DRAWS, ENDS, OF_DRAWS = 500, (0.025, 0.975), "inverted_cdf"
+# Ends of the 95 % interval of drawn lifetimes, and the method of quantiles: they may be inf.
+ENDS, OF_DRAWS = (0.025, 0.975), "inverted_cdf"
 
 
 @dataclass(frozen=True)
@@ -200,12 +199,8 @@ def resampled(
 
 
 def _drawn(law: JointLaw, goal: Goal, place: Aged) -> np.ndarray:
-    """Return lifetimes in days of fits to values drawn anew, shape (DRAWS,)."""
-    mean = law.at(law.aged)
-    covariance = law.aged.covariance(law.scatter, mean)
-    normal = np.random.default_rng(1).standard_normal((DRAWS, mean.size))
-    drawn = mean + normal @ blockwise(np.linalg.cholesky, covariance).T
-    return np.array([_days(law, x, goal, place) for x in solved_many(law, whitening_of(covariance), drawn)])
+    """Return lifetimes in days of fits to values drawn anew, shape (RESAMPLES,)."""
+    return np.array([_days(law, x, goal, place) for x in law.resamples])
 
 
 def temperature_for(
