@@ -21,7 +21,7 @@ from sealfit.closure.forms import main_effects_identifiable, surface_term
 from sealfit.closure.linearised import Proposal, linearised
 from sealfit.closure.naming import deviance_under, named_among, propose
 from sealfit.closure.score_test import Candidate, ScoreTests
-from sealfit.closure.search import MAIN_TARGETS, candidate_of, channel_candidates, search_pairs
+from sealfit.closure.search import MAIN_TARGETS, NOT_IN_PAIRS, candidate_of, channel_candidates, search_pairs
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.rows import ALONG
 
@@ -135,11 +135,12 @@ class Renaming:
     def _surfaces(self, without: Fitted, *parts: Proposal) -> list[Proposal]:
         """Return the likeliest surfaces of two channels of which effects may be parts, not refitted yet.
 
-        Time, distance and position are alternatives of each other. No surface differs between directions.
+        Time, distance and position are alternatives of each other. No surface differs between directions, and
+        none changes with the calendar, as no pair does.
         """
         names = {name for p in parts for name in p.term.channels}
         along = set(ALONG) if names & set(ALONG) else set()
-        near = [c for c in self.channels.values() if c.numeric and c.name in (names | along) - {"direction"}]
+        near = [c for c in self.channels.values() if c.numeric and c.name in (names | along) - NOT_IN_PAIRS]
         targets = dict.fromkeys((*MAIN_TARGETS, *(p.term.target for p in parts)))
         p_value = min(p.p_value for p in parts)
         found = []

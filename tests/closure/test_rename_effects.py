@@ -216,6 +216,17 @@ def test_a_surface_takes_the_place_of_two_curves_unless_they_add_up(effect, foun
     assert {name for term in terms for name in term.channels} == set(TWO)
 
 
+def test_no_surface_changes_with_the_calendar():
+    def changes(table, force):
+        oil, hours = (table[name].to_numpy() for name in ("oil_ppm", "elapsed_h"))
+        return force * (1 + 0.05 * np.sin(0.25 * (oil + hours)))
+
+    columns = {name: TWO["oil_ppm"] for name in ("oil_ppm", "elapsed_h")}
+    bins = make_bins(4, repeats=3, bins=3, noise_N=0.1, effect=changes, run_channels=columns)
+    terms = in_place_of(bins, curve("oil_ppm"), curve("elapsed_h"))
+    assert all(term.effect.id != "surface" for term in terms)
+
+
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_of_an_unconfirmed_effect_and_a_later_one_the_one_that_explains_least_goes(order, monkeypatch):
     def oil_only(table, force):
