@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +13,7 @@ from sealfit.effects.contract import (
     PHASE,
     PHASES,
     SECOND,
+    Effect,
     Parameter,
     amplitude,
     closed_form,
@@ -332,17 +334,7 @@ def bilinear_shape(first: Callable, second: Callable, inputs, *, A, B=0.0, C=0.0
     return A * u * w + B * u + C * w
 
 
-def _bilinear(of_a: str, of_b: str, of_c: str) -> tuple[Parameter, ...]:
-    """Return the parameters of a product with each channel alone, which have these units."""
-    return (
-        amplitude("A", of_a, 0.01, "slope of a slope"),
-        amplitude("B", of_b, 0.0, "slope in the first channel"),
-        amplitude("C", of_c, 0.0, "slope in the second channel"),
-    )
-
-
 product = partial(closed_form, reads=(CHANNEL, SECOND), reference="{x} = {x_ref} or {z} = {z_ref}")
-bilinear = partial(closed_form, reads=(CHANNEL, SECOND), reference="{x} = {x_ref} and {z} = {z_ref}")
 
 # By hand: u = 2, w = -3; 0.5 * 2 * -3 = -3, and -3 + 2 - 6 = -7 with each alone.
 PRODUCT = product(
@@ -374,30 +366,28 @@ PRODUCT_LOGS = product(
     source="Form: ours, the first mixed term of a Taylor series in ln x and ln(1 + z).",
     worked=({"x": np.e, "x_ref": 1.0, "z": np.e**2 - 1.0, "z_ref": 0.0}, {"A": 0.5}, 1.0),
 )
-BILINEAR = bilinear(
-    id="bilinear",
-    label="product of {x} and {z}, and each alone",
-    equation="h = A u w + B u + C w, u = x - x_ref, w = z - z_ref",
-    parameters=_bilinear("{y}/({x} {z})", "{y}/{x}", "{y}/{z}"),
-    shape=PRODUCT.shape,
-    source="Form: ours, the first terms of a Taylor series in two channels.",
-    worked=(PRODUCT.worked[0], {"A": 0.5, "B": 1.0, "C": 2.0}, -7.0),
-)
-BILINEAR_LOG = bilinear(
-    id="bilinear_log",
-    label="product of log {x} and {z}, and each alone",
-    equation="h = A u w + B u + C w, u = ln(x / x_ref), w = z - z_ref",
-    parameters=_bilinear("{y}/{z}", "{y}", "{y}/{z}"),
-    shape=PRODUCT_LOG.shape,
-    source="Form: ours, the first terms of a Taylor series in ln x and z.",
-    worked=(PRODUCT_LOG.worked[0], {"A": 0.5, "B": 1.0, "C": 2.0}, -6.5),
-)
-BILINEAR_LOGS = bilinear(
-    id="bilinear_logs",
-    label="product of log {x} and log of 1 + {z}, and each alone",
-    equation="h = A u w + B u + C w, u = ln(x / x_ref), w = ln((1 + z) / (1 + z_ref))",
-    parameters=_bilinear("{y}", "{y}", "{y}"),
-    shape=PRODUCT_LOGS.shape,
-    source="Form: ours, the first terms of a Taylor series in ln x and ln(1 + z).",
-    worked=(PRODUCT_LOGS.worked[0], {"A": 0.5, "B": 1.0, "C": 2.0}, 6.0),
-)
+
+
+def _with_each_alone(product: Effect, u: str, w: str, units: tuple[str, str], value: float) -> Effect:
+    """Return a product and what each channel does alone, with u and w as text and the units of their slopes.
+
+    `value` is the result by hand.
+    """
+    slopes = (amplitude("B", units[0], 0.0, "slope in the first channel"),)
+    slopes += (amplitude("C", units[1], 0.0, "slope in the second channel"),)
+    return replace(
+        product,
+        id=product.id.replace("product", "bilinear"),
+        label=f"{product.label}, and each alone",
+        equation=f"h = A u w + B u + C w, u = {u}, w = {w}",
+        reference="{x} = {x_ref} and {z} = {z_ref}",
+        parameters=(replace(product.parameters[0], meaning="slope of a slope"), *slopes),
+        source=product.source.replace("mixed term", "terms"),
+        worked=(product.worked[0], {"A": 0.5, "B": 1.0, "C": 2.0}, value),
+    )
+
+
+BILINEAR = _with_each_alone(PRODUCT, "x - x_ref", "z - z_ref", ("{y}/{x}", "{y}/{z}"), -7.0)
+BILINEAR_LOG = _with_each_alone(PRODUCT_LOG, "ln(x / x_ref)", "z - z_ref", ("{y}", "{y}/{z}"), -6.5)
+LOG_OF_Z = "ln((1 + z) / (1 + z_ref))"
+BILINEAR_LOGS = _with_each_alone(PRODUCT_LOGS, "ln(x / x_ref)", LOG_OF_Z, ("{y}", "{y}"), 6.0)
