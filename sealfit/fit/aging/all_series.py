@@ -201,12 +201,13 @@ def aged_values(steady: pd.DataFrame, steady_fit: SteadyFit) -> AgedValues:
     return found
 
 
-def aged_of(rows: pd.DataFrame, *scatter) -> Aged:
-    """Return the values of table rows with the condition's columns; `scatter` is as in `Aged`."""
+def aged_of(rows: pd.DataFrame, covariance, **scatter) -> Aged:
+    """Return the values of table rows with the condition's columns; `scatter` is as in `Measured`."""
     known = []
     for name in (TEMPERATURE, COMPRESSION):
         known.append(rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None)
-    return Aged(rows["aging_days"].to_numpy(float), rows["value"].to_numpy(float), *known, *scatter)
+    days, value = (rows[name].to_numpy(float) for name in ("aging_days", "value"))
+    return Aged(days, value, *known, covariance, **scatter)
 
 
 def joint_laws(

@@ -13,7 +13,7 @@ from scipy.special import fdtrc, stdtrit
 
 from sealfit.effects import aging_laws
 from sealfit.errors import FitError
-from sealfit.fit.aging.law import paule_mandel
+from sealfit.fit.aging.law import Measured, paule_mandel
 from sealfit.fit.joint.prior import covariance_of
 from sealfit.fit.joint.whitening import blockwise, log_determinant, whitening_of
 from sealfit.fit.least_squares import levenberg_marquardt
@@ -41,33 +41,21 @@ DRIVERS = {
 
 
 @dataclass(frozen=True)
-class Aged:
-    """Values of one quantity, each of a specimen or the mean of those of a condition; arrays are (n,).
+class Aged(Measured):
+    """Values of one quantity with the temperatures and compressions while aging."""
 
-    `variance`, shape (n,) or (n, n), is the measurement variance or covariance, None if it is 0. The degrees
-    of freedom are those of a variance estimated from replicates, of differences between values and of their
-    common level; 0 if it is known otherwise.
-    """
-
-    days: np.ndarray
-    value: np.ndarray
-    temperature_C: np.ndarray | None = None  # while aging, not used for unaged specimens; None if unknown
+    temperature_C: np.ndarray | None = None  # not used for unaged specimens; None if unknown
     compression_ratio_pct: np.ndarray | None = None  # the same; height in percent
-    variance: np.ndarray | csr_array | None = None
-    size: np.ndarray | None = None  # values to which that scatter is relative; None: the values themselves
-    replicates_df: float = 0.0
-    level_df: float = 0.0
+    variance: np.ndarray | csr_array | None = None  # of measurement, or its covariance, (n, n); None if 0
 
     def part(self, keep: np.ndarray) -> Aged:
         """Return the values in a mask, shape (n,)."""
-        taken = {}
-        for name in ("temperature_C", "compression_ratio_pct", "size"):
-            values = getattr(self, name)
-            taken[name] = None if values is None else values[keep]
+        names = ("days", "value", "temperature_C", "compression_ratio_pct", "size")
+        taken = {name: own[keep] for name in names if (own := getattr(self, name)) is not None}
         variance = self.variance
         if variance is not None:
             variance = variance[keep] if variance.ndim == 1 else variance[keep][:, keep]
-        return replace(self, days=self.days[keep], value=self.value[keep], variance=variance, **taken)
+        return replace(self, variance=variance, **taken)
 
     def covariance(self, scatter: float, about: np.ndarray | None = None) -> csr_array:
         """Return the covariance, shape (n, n), with scatter relative to `size`, `about` or the values."""
@@ -75,8 +63,7 @@ class Aged:
         about = self.value if about is None else about
         measured = csr_array(diags_array(measured) if measured.ndim == 1 else measured)
         least = max(ROUNDING * measured.diagonal().max(), TINY)
-        own = (scatter * (about if self.size is None else self.size)) ** 2 + least
-        return measured + diags_array(own)
+        return measured + diags_array((scatter * self.scale(about)) ** 2 + least)
 
     def whitening(self, scatter: float) -> csr_array:
         """Return W with W C W' = 1 for the covariance C at a scatter, shape (n, n)."""
@@ -85,11 +72,6 @@ class Aged:
     def chi2(self, residual: np.ndarray, scatter: float) -> float:
         """Return r' C^-1 r of a residual, shape (n,)."""
         return float(((self.whitening(scatter) @ residual) ** 2).sum())
-
-    @property
-    def scale(self) -> np.ndarray:
-        """Values to which the scatter is relative, shape (n,)."""
-        return np.abs(self.value) if self.size is None else self.size
 
     @cached_property
     def known(self) -> dict[str, np.ndarray]:
@@ -165,11 +147,7 @@ class JointLaw:
     @property
     def df(self) -> float:
         """Degrees of freedom of intervals of the law's values: those of the scatter that they contain."""
-        return self._df(self.aged.level_df)
-
-    def _df(self, of_replicates: float) -> float:
-        left = self.aged.value.size - self.x.size
-        return left if self.scatter > 0 else of_replicates or left
+        return self.aged.df(self.aged.value.size - self.x.size, self.scatter, level=True)
 
     @property
     def t(self) -> float:
@@ -240,7 +218,8 @@ class JointLaw:
 
         Without a loss (a may be 0) its shape, E and kappa have no meaning.
         """
-        t = float(stdtrit(max(self._df(self.aged.replicates_df), 1), 0.975))
+        df = self.aged.df(self.aged.value.size - self.x.size, self.scatter, level=False)
+        t = float(stdtrit(max(df, 1), 0.975))
         lost = bool(abs(self.x[1]) > t * np.sqrt(self.covariance[1, 1]))
         for k, name in enumerate(self.names):
             half = (self.t if name == "mu_0" else t) * float(np.sqrt(self.covariance[k, k]))
@@ -365,8 +344,8 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
     for _ in range(TURNS):
         x = solved(empty, aged, aged.whitening(scatter), x)
         residual = aged.value - empty.at(aged, x)
-        chi2 = partial(aged.chi2, residual)
-        before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), residual / aged.scale)
+        relative, chi2 = residual / aged.scale(aged.value), partial(aged.chi2, residual)
+        before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), relative)
         if abs(scatter - before) <= CONVERGED * before:
             break
     white = aged.whitening(scatter)

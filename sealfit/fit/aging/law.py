@@ -9,7 +9,7 @@ doi:10.1137/0710036). The cost is proportional to the number of series.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -69,19 +69,36 @@ def solve_law(days, value, weight) -> BatchFit:
 
 
 @dataclass(frozen=True)
-class Values:
+class Measured:
+    """Measured values, each of a specimen or the mean of those of a condition; arrays are (n,).
+
+    The degrees of freedom are those of a covariance estimated from replicates, of differences between values
+    and of their common level; 0 if it is known otherwise.
+    """
+
+    days: np.ndarray
+    value: np.ndarray
+    _: KW_ONLY
+    size: np.ndarray | None = None  # values to which further scatter is relative; None: to those of the law
+    replicates_df: float = 0.0
+    level_df: float = 0.0
+
+    def scale(self, own: np.ndarray) -> np.ndarray:
+        """Return the values to which the scatter is relative, shape (n,), given the law's `own`."""
+        return np.abs(own) if self.size is None else self.size
+
+    def df(self, left: float, scatter: float, *, level: bool) -> float:
+        """Return those of intervals of a law's values (`level`) or differences; `left` if it has scatter."""
+        return left if scatter > 0 else (self.level_df if level else self.replicates_df) or left
+
+
+@dataclass(frozen=True)
+class Values(Measured):
     """Measured values of one rubber; values of one condition are adjacent."""
 
-    days: np.ndarray  # (n,)
-    value: np.ndarray  # (n,)
     origin: np.ndarray  # (n,) int: number of the value's mu_0
     curve: np.ndarray  # (n,) int: number of its curve, -1 for unaged rubber
     covariance: csr_array  # (n, n), or an array
-    size: np.ndarray | None = None  # (n,) values to which the scatter is relative; None: the law's own
-    # Degrees of freedom of a covariance estimated from replicates, of differences between values and of their
-    # common level; 0 if it is known otherwise.
-    replicates_df: float = 0.0
-    level_df: float = 0.0
 
     def __post_init__(self) -> None:
         covariance = csr_array(self.covariance, copy=True)
@@ -142,10 +159,6 @@ class Values:
         given = {"days": self.days[keep], "value": self.value[keep], "origin": origin, "size": size}
         curve, covariance = np.where(curve >= 0, numbered, -1), self.covariance[keep][:, keep]
         return replace(self, **given, curve=curve, covariance=covariance)
-
-    def scale(self, model: np.ndarray) -> np.ndarray:
-        """Return the values to which the scatter is relative, shape (n,), given the law's."""
-        return np.abs(model) if self.size is None else self.size
 
 
 class EqualGroups:

@@ -232,13 +232,12 @@ class OneQuantity:
     @property
     def t(self) -> float:
         """Student's quantile of 95 % intervals of a, b and c, with the df of the scatter they contain."""
-        df = self.alone.df
-        return t_of_95(df if self.tau > 0 else self.alone.values.replicates_df or df)
+        return t_of_95(self.alone.values.df(self.alone.df, self.tau, level=False))
 
     @property
     def level_df(self) -> float:
         """Degrees of freedom of the intervals of mu_0 and of the law's values."""
-        return self.alone.df if self.tau > 0 else self.alone.values.level_df or self.alone.df
+        return self.alone.values.df(self.alone.df, self.tau, level=True)
 
 
 def t_of_95(df: float) -> float:

@@ -50,10 +50,11 @@ class Means:
     level_df: float  # of their common level
 
     @property
-    def size(self) -> np.ndarray:
-        """Values to which further scatter is relative: the root mean square of all, shape (n,)."""
+    def scatter(self) -> dict:
+        """The fields of `Measured` by name; further scatter is relative to the root mean square of all."""
         value = self.table["value"].to_numpy(float)
-        return np.full(value.size, np.sqrt(np.mean(value**2)) or 1.0)
+        size = np.full(value.size, np.sqrt(np.mean(value**2)) or 1.0)
+        return {"size": size, "replicates_df": self.df, "level_df": self.level_df}
 
     def half_width(self) -> np.ndarray:
         """Return half the width of the 95 % intervals of the means, shape (n,); nan without replicates."""
@@ -63,7 +64,7 @@ class Means:
 
     def aged(self) -> Aged:
         """Return the means as the data of a law for all series."""
-        return aged_of(self.table, self.covariance, self.size, self.df, self.level_df)
+        return aged_of(self.table, self.covariance, **self.scatter)
 
 
 def means_of(specimens: pd.DataFrame) -> Means:
@@ -196,5 +197,4 @@ def _law_per_series(means: Means, quantity: str, unit: str) -> LawRows:
     columns = [name for name in (TEMPERATURE, COMPRESSION) if name in table]
     order = table[days > 0].sort_values(columns, kind="stable")["series"] if columns else series[days > 0]
     table = table.assign(quantity=quantity, unit=unit, moved=0.0)
-    replicates = {"size": means.size, "replicates_df": means.df, "level_df": means.level_df}
-    return laws_of_series(table, list(dict.fromkeys(order)), [quantity], means.covariance, **replicates)
+    return laws_of_series(table, list(dict.fromkeys(order)), [quantity], means.covariance, **means.scatter)
