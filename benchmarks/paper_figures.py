@@ -179,8 +179,8 @@ def _predicted(found: Found, name: str, title: str, at: At) -> Plot:
 def _law(found: Found, name: str, title: str) -> Plot:
     curves = found.tables["aging_curves"]
     curves = curves[curves["series"] == SERIES]
-    points = aging_points(found.tables["steady_fit"], ["mu_s", "mu_c"])
-    points = points[points["series"].isin([SERIES, UNAGED])]
+    points = aging_points(found.tables["steady_fit"])
+    points = points[points["series"].isin([SERIES, UNAGED]) & points["quantity"].isin(["mu_s", "mu_c"])]
     days, needed = np.linspace(0, 16, 200), printed_errors()["start"]
 
     def draw(ax: Axes) -> None:

@@ -34,10 +34,9 @@ def law_rows(aging_laws: pd.DataFrame, before: pd.DataFrame | None = None) -> li
     found = []
     earlier = {} if before is None else {row["key"]: row for row in law_rows(before) if row["rank"] == 1}
     for key, own in aging_laws.groupby(["rubber", "quantity"], sort=False):
-        last = own["rank"].max()
         for rank, law in own.groupby("rank", sort=True):
             first = law.iloc[0].to_dict()
-            if rank > MOST_LAWS and not (rank == last and first["law"] == "separate"):
+            if rank > MOST_LAWS and first["law"] != "separate":
                 continue
             parameters = law.dropna(subset=["parameter"]).set_index("parameter")
             found.append({**first, "key": key, "before": False, "parameters": parameters})

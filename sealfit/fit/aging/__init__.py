@@ -21,8 +21,6 @@ from sealfit.physics import aging_law
 from sealfit.tables import AGING_COVARIANCE, AGING_CURVES, AGING_FIT
 
 PAIRS = (("mu_s", "mu_c"), ("F_s", "F_c"))
-# Number of the curve of values that no law is fitted to.
-WITHOUT_LAW = -2
 # Smallest relative standard deviation of a steady value.
 SMALLEST = 1e-6
 # Number of points of a curve, which are denser near day 0.
@@ -190,13 +188,11 @@ def laws_of_series(
         return [row for curve in curves for row in law_table.without_law(curve)], []
     days, value, moved = (found[name].to_numpy(float) for name in ("aging_days", "value", "moved"))
     origin = np.array([quantities.index(name) for name in found["quantity"]], int)
-    # The number of each value's curve; -1 for unaged rubber, `WITHOUT_LAW` for none.
-    place = {(c.series, c.quantity): c.place for c in curves if c.place >= 0}
+    unaged = (days == 0) & found["quantity"].isin(fitted).to_numpy()
+    place = {(c.series, c.quantity): c.place for c in curves}
     keys = zip(found["series"], found["quantity"], strict=True)
-    number = np.array([place.get(key, WITHOUT_LAW) for key in keys], int)
-    has_law = found["quantity"].isin(fitted).to_numpy()
-    number = np.where((found["aging_days"] == 0).to_numpy() & has_law, -1, number)
-    kept = number > WITHOUT_LAW
+    number = np.where(unaged, -1, [place.get(key, -1) for key in keys])
+    kept = unaged | (number >= 0)
     values = Values(days, value, origin, number, covariance, **replicates).part(kept)
     return _rows(values, curves, fitted, moved[kept])
 

@@ -83,8 +83,8 @@ def aging(tables: Tables, config: Config) -> Plot | None:
     quantities = list(dict.fromkeys(curves["quantity"]))
     values = tables.get("property_values", ())
     of_property = len(values) > 0
-    fits = property_means(values) if of_property else tables["steady_fit"]
-    points = aging_points(fits, quantities)
+    points = property_means(values) if of_property else aging_points(tables["steady_fit"])
+    points = points[points["quantity"].isin(quantities)]
     series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural(names(s)))
     series, note = style.panels_of(series, "series")
     if note:
@@ -130,23 +130,21 @@ def _span(
 
 
 def property_means(values: pd.DataFrame) -> pd.DataFrame:
-    """Return the means of table `property_values` per condition as rows of table `steady_fit`."""
+    """Return the means of table `property_values` per condition as `aging_points` does."""
     from sealfit.fit.aging.property import means_of
 
     parts = []
     for (rubber, quantity), own in values.groupby(["rubber", "quantity"]):
         means = means_of(own)
         half, value = means.half_width(), means.table["value"]
-        kept = means.table[["condition", "series", "aging_days", "value"]]
-        named = {"rubber": rubber, "quantity": "steady", "parameter": quantity, "identified": True}
-        parts.append(kept.assign(**named, lo95=value - half, hi95=value + half))
+        kept = means.table[["series", "aging_days", "value"]].astype({"aging_days": float})
+        parts.append(kept.assign(rubber=rubber, quantity=quantity, lo95=value - half, hi95=value + half))
     return pd.concat(parts, ignore_index=True)
 
 
-def aging_points(steady_fit: pd.DataFrame, quantities: Sequence[str]) -> pd.DataFrame:
+def aging_points(steady_fit: pd.DataFrame) -> pd.DataFrame:
     """Return the identified coefficients of every condition with its aging days."""
     rows = steady_fit[(steady_fit["quantity"] == "steady") & steady_fit["identified"].astype(bool)]
-    rows = rows[rows["parameter"].isin(list(quantities))]
     columns = ["series", "rubber", "aging_days", "value", "lo95", "hi95"]
     rows = rows.reindex(columns=[*columns, "parameter"]).astype({"aging_days": float})
     return rows.rename(columns={"parameter": "quantity"})
@@ -256,7 +254,7 @@ def draw_master_curve(
 ) -> None:
     """Draw one quantity's values over scaled aging time, and the law with its 95 % band.
 
-    `rows` are of table `master_curve`, and `before` of that without effects; `colours` by temperature.
+    `rows` are of table `master_curve`, and `before` is the law without effects; `colours` by temperature.
     """
     values, law = rows[rows["kind"] == "value"], rows[rows["kind"] == "law"].sort_values("scaled_days")
     aged = values[values["scaled_days"] > 0]
@@ -265,8 +263,8 @@ def draw_master_curve(
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     style.draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], style.FLOOR)
     ax.plot(law["scaled_days"], law["value"], color=style.FLOOR)
-    earlier = before[before["kind"] == "law"].sort_values("scaled_days")
-    ax.plot(earlier["scaled_days"], earlier["value"], color=style.FLOOR, linestyle=":")
+    before = before.sort_values("scaled_days")
+    ax.plot(before["scaled_days"], before["value"], color=style.FLOOR, linestyle=":")
     fresh = values[values["scaled_days"] == 0]
     if not fresh.empty:  # an unclipped line without points has its place at the corner of the figure
         ax.plot(fresh["scaled_days"], fresh["value"], "o", color=style.BLACK, clip_on=False)
