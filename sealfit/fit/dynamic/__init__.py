@@ -11,7 +11,7 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.engine.run_map import run_map
-from sealfit.fit.dynamic.bristle_model import Cells, RisingStroke, StribeckCurve, over_strokes
+from sealfit.fit.dynamic.bristle_model import Cells, RisingStroke, StribeckCurve
 from sealfit.fit.dynamic.presliding import AT, Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
 from sealfit.fit.dynamic.starts import StrokeStart, starts_of, strokes_along, whole_strokes
 from sealfit.fit.joint.rows import nesting_run, records
@@ -222,10 +222,10 @@ def _fit_some(asked: Asked, config: Config) -> list[pd.DataFrame]:
 
 def _mean_start(cells: Cells, models: Sequence[np.ndarray] | None) -> pd.DataFrame:
     """Return the mean start, measured and, if there is a fit, modelled, as rows of `dynamic_curves`."""
-    force, error, n = over_strokes(cells.force_N)
-    model = over_strokes(cells.means(models))[0] if models else np.full(n.shape, np.nan)
-    columns = {"force_N": force, "force_se_N": error, "n": n, "model_N": model}
-    return pd.DataFrame({"distance_mm": cells.middle_mm, **columns})[n > 0]
+    force = pd.DataFrame(cells.force_N)
+    found = pd.DataFrame({"distance_mm": cells.middle_mm, "force_N": force.mean(), "force_se_N": force.sem()})
+    model = pd.DataFrame(cells.means(models)).mean() if models else np.nan
+    return found.assign(n=force.count(), model_N=model)[force.notna().any()]
 
 
 def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:

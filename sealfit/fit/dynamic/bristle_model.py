@@ -41,15 +41,6 @@ class Cells:
         return found
 
 
-def over_strokes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean over strokes of values, (strokes, cells), its standard error and number, (cells,)."""
-    there = np.isfinite(values)
-    n = there.sum(axis=0)
-    mean = np.where(n > 0, np.where(there, values, 0.0).sum(axis=0) / np.maximum(n, 1), np.nan)
-    variance = np.where(there, (values - mean) ** 2, 0.0).sum(axis=0) / np.maximum(n - 1, 1)
-    return mean, np.where(n > 1, np.sqrt(variance / np.maximum(n, 1)), np.nan), n
-
-
 # ---------------------------------------------------------------- rises
 # Grid values of the stiffness. The length of the rise goes from a third of a step to the whole stroke.
 STIFFNESSES = 40
