@@ -1,7 +1,5 @@
 """The commands: paths in, messages out. Everything heavy is imported by the command that needs it."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

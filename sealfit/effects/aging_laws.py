@@ -1,7 +1,5 @@
 """Other laws of aging than Eq. 15."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sealfit.effects.contract import Parameter, amplitude, effect, factors, not_negative, positive, reference

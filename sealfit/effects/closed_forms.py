@@ -1,7 +1,5 @@
 """Closed forms of one channel and of two, for a residual without a known mechanism."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The description of an effect, and its shape as one pure function; effects of users follow it, too."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -5,8 +5,6 @@ products of two of these. If its mean over the campaign is given it is subtracte
 constant already. `free_effect` builds them from plain values, which is the form in model files.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from inspect import signature

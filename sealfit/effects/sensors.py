@@ -1,7 +1,5 @@
 """Effects of the force sensor and the set-up: offsets, drift and a ripple along the track."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sealfit.effects.contract import (

@@ -1,7 +1,5 @@
 """Effects of sliding: history of the contact, and other laws of speed, load and humidity than declared."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sealfit.effects.contract import (

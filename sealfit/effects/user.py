@@ -4,8 +4,6 @@ This is the only place where Python of a user is run. A file has one or more fun
 at its top level, like the modules of this package. Files whose name starts with an underscore are not read.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace

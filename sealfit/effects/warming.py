@@ -1,7 +1,5 @@
 """Warming: friction falls as the contact warms, with time, distance or the power of friction."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sealfit.effects.contract import ROOM, Parameter, amplitude, deviation, effect, factors, reference

@@ -1,7 +1,5 @@
 """Nonlinear least squares: Levenberg-Marquardt for one or many small problems, and variable projection."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -32,7 +30,7 @@ def levenberg_marquardt(
     start: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
-    linear: Linear | None = None,
+    linear: "Linear | None" = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the local least-squares optima from starting points, (problems, p), and their sums of squares.
 

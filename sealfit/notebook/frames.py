@@ -1,7 +1,5 @@
 """The tables of a notebook: one meaning each, a row per key, true units in `attrs`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import pandas as pd

@@ -1,7 +1,5 @@
 """Every figure of the report, as a function that a notebook calls."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

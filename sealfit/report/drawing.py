@@ -1,7 +1,5 @@
 """Plots as SVG, PNG and PDF; for the page texts of points, and traces of runs."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

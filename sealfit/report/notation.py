@@ -1,7 +1,5 @@
 """Numbers, symbols, channels and conditions as people read them, always with the true unit."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -249,7 +247,7 @@ class ConditionNames:
     units: Units
 
     @classmethod
-    def of(cls, config: Config) -> ConditionNames:
+    def of(cls, config: Config) -> "ConditionNames":
         """Return the names for a config's condition and rubber columns."""
         rubber = [name for name in config.rubber if name not in config.condition]
         return cls((*config.condition, *rubber), config.units)

@@ -1,7 +1,5 @@
 """The self-contained report.html: tables, sentences and embedded plots."""
 
-from __future__ import annotations
-
 import json
 from base64 import b64encode
 from collections.abc import Mapping

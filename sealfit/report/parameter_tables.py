@@ -1,7 +1,5 @@
 """Tables of the fitted parameters and aging laws, each value with its interval."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

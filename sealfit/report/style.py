@@ -1,7 +1,5 @@
 """Style and layout of the plots, and the selection of panels in large campaigns."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager

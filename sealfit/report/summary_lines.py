@@ -1,7 +1,5 @@
 """The summary that a command prints: the figures of `summary` in words."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from sealfit.errors import EXAMPLES

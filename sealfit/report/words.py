@@ -1,7 +1,5 @@
 """The loop's results as the page writes them: sentences, and rows of errors and of tests by variable."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -3,8 +3,6 @@
 `load_spec` reads a SPEC, `simulate` writes the campaign.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

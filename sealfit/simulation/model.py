@@ -1,7 +1,5 @@
 """The declared model of a SPEC, Eq. 14 with Eq. 15, and its undeclared effects, bound to the catalogue."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -110,7 +108,7 @@ class EffectEntry(Strict):
     formula: Expression | None = Field(None, description="of an expression")
 
     @model_validator(mode="after")
-    def _whole(self) -> EffectEntry:
+    def _whole(self) -> "EffectEntry":
         if (self.id == EXPRESSION) != (self.formula is not None):
             raise ValueError("id = 'expression' and formula belong together")
         if self.id == LEVELS and (len(self.channels) != 1 or not self.parameters):

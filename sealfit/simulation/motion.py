@@ -1,7 +1,5 @@
 """The motion of the platform, and the noise-free force."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -148,7 +146,7 @@ class SteadyLaw:
     physics: Physics
     effects: tuple[BoundEffect, ...]
 
-    def without(self, number: int) -> SteadyLaw:
+    def without(self, number: int) -> "SteadyLaw":
         """Return the law without its effect `number`."""
         return replace(self, effects=self.effects[:number] + self.effects[number + 1 :])
 

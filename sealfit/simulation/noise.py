@@ -1,7 +1,5 @@
 """Scatter, noise and defects of a SPEC, and irrelevant channels: other columns that a laboratory records."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -152,7 +150,7 @@ def draw_scatter(noise: Sequence[Noise], files: pd.DataFrame, seed: int) -> pd.D
 
 
 def logged(
-    noise: Sequence[Noise], force_N: np.ndarray, motion: Motion, speed_mm_s: float, file: int, seed: int
+    noise: Sequence[Noise], force_N: np.ndarray, motion: "Motion", speed_mm_s: float, file: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return force in N and displacement in mm as the sensors of one trace give them, shape (n,) each.
 
@@ -271,7 +269,7 @@ class CategoryChannel(Strict):
     assignment: Literal["random", "balanced", "unique"] = "random"
 
     @model_validator(mode="after")
-    def _has_labels(self) -> CategoryChannel:
+    def _has_labels(self) -> "CategoryChannel":
         if (self.assignment == "unique") == bool(self.labels):
             raise ValueError("give labels, or assignment = 'unique'")
         return self

@@ -1,7 +1,5 @@
 """What a SPEC says: rubber, rig, design, effects and scatter, checked on load; and the files it plans."""
 
-from __future__ import annotations
-
 import re
 from datetime import datetime, timedelta
 from itertools import product
@@ -77,7 +75,7 @@ class Design(Strict):
         return [name for name, there in zip((*CONDITIONS, "load_N"), values, strict=True) if there]
 
     @model_validator(mode="after")
-    def _holds_together(self) -> Design:
+    def _holds_together(self) -> "Design":
         for name in ("temperatures_C", "compressions_pct", "days", "loads_N", "speeds_mm_s", "directions"):
             values = getattr(self, name)
             if len(set(values)) != len(values):
@@ -185,7 +183,7 @@ class Spec(Strict):
         own = [channel.name for channel in self.channels]
         return (*along, "repeat", "specimen_id", *self.design.columns, *dated, *own)
 
-    def risen(self) -> Spec:
+    def risen(self) -> "Spec":
         """Return the SPEC whose `design.stiffness_mm` is the longest rise that `physics.sigma_0` makes.
 
         It is unchanged if `physics.sigma_0` is not given. ConfigError if the stroke is too short for it.
@@ -201,7 +199,7 @@ class Spec(Strict):
             raise ConfigError(explain(error), fix=fix) from error
 
     @model_validator(mode="after")
-    def _names_are_free(self) -> Spec:
+    def _names_are_free(self) -> "Spec":
         seen: set[str] = set()
         for channel in self.channels:
             name = channel.name

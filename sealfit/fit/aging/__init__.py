@@ -1,7 +1,5 @@
 """The aging law (Eq. 15) of mu_s and mu_c per series, fitted to the steady fits of the conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product

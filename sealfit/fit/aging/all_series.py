@@ -11,8 +11,6 @@ separate fit. If an F test rejects that the days of a series share them, its con
 fits; so do days with few speeds that disagree with the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -103,7 +101,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataF
 
 def _shared(
     own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
-) -> _SharedCurve | None:
+) -> "_SharedCurve | None":
     """Return the shared curve of the days of a series, or None; `widened` are the factors on variances."""
     is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]

@@ -1,7 +1,5 @@
 """One law of aging for all temperatures and compressions of a rubber, and the evidence for its shape."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -48,7 +46,7 @@ class Aged(Measured):
     compression_ratio_pct: np.ndarray | None = None  # the same; height in percent
     variance: np.ndarray | csr_array | None = None  # of measurement, or its covariance, (n, n); None if 0
 
-    def part(self, keep: np.ndarray) -> Aged:
+    def part(self, keep: np.ndarray) -> "Aged":
         """Return the values in a mask, shape (n,)."""
         names = ("days", "value", "temperature_C", "compression_ratio_pct", "size")
         taken = {name: own[keep] for name in names if (own := getattr(self, name)) is not None}

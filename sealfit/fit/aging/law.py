@@ -6,8 +6,6 @@ series by series, many at once as arrays (Golub and Pereyra 1973, SIAM J. Numer.
 doi:10.1137/0710036). The cost is proportional to the number of series.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
@@ -138,7 +136,7 @@ class Values(Measured):
         return np.column_stack([origin, m + curve, m + self.curves + curve])
 
     @cached_property
-    def groups(self) -> list[EqualGroups]:
+    def groups(self) -> "list[EqualGroups]":
         """The values in groups that are independent given mu_0, those of one size together."""
         n, aged = self.value.size, np.flatnonzero(self.curve >= 0)
         member = csr_array((np.ones(aged.size), (aged, self.curve[aged])), shape=(n, self.curves))
@@ -150,7 +148,7 @@ class Values(Measured):
                 found[rows.shape[1], curves.shape[1]] = EqualGroups(self, rows, curves - n)
         return list(found.values())
 
-    def part(self, keep) -> Values:
+    def part(self, keep) -> "Values":
         """Return some of the values, with origins and curves renumbered."""
         curve = self.curve[keep]
         numbered = np.searchsorted(np.unique(curve[curve >= 0]), curve)

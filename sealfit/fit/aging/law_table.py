@@ -1,7 +1,5 @@
 """Rows of table `aging_fit`: laws with errors and intervals, lack of fit, and what is not determined."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -113,7 +111,7 @@ def curve_intervals(fit: LawFit, rise_of_origin: np.ndarray) -> list[CurveInterv
     return [intervals[curve] for curve in range(fit.values.curves)]
 
 
-def _intervals(profile: _Profile, rise: np.ndarray) -> list[CurveInterval]:
+def _intervals(profile: "_Profile", rise: np.ndarray) -> list[CurveInterval]:
     """Return the intervals of a curve of each group; `rise`, shape (g,), is that of chi-square."""
     limit = profile.chi2 + rise
     low, high = (profile.ends(sign, limit) for sign in (-1, 1))

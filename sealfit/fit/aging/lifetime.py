@@ -1,7 +1,5 @@
 """The lifetime, the aging time until a quantity reaches a threshold, and the temperature for a lifetime."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -11,8 +11,6 @@ that no law is assumed. The law is fitted to these means, which are generalised 
 (Searle, Casella & McCulloch 1992, Variance Components, chapters 6 and 8).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

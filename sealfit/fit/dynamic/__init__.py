@@ -1,7 +1,5 @@
 """The model's dynamic part per condition: sigma_0 and sigma_1 from pre-sliding, and the break-away force."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

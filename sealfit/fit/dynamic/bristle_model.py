@@ -1,7 +1,5 @@
 """The starts of the strokes of a condition: averages over cells of distance, and the bristle model."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -88,7 +86,7 @@ class StribeckCurve:
         """Whether the curve is determined; it is flat otherwise."""
         return bool(np.isfinite(self.v_s))
 
-    def moved(self) -> Iterator[StribeckCurve]:
+    def moved(self) -> Iterator["StribeckCurve"]:
         """Yield the curve one standard deviation off along each principal axis; values stay above a tenth."""
         size = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         unit = np.where(size > 0, size, 1.0)

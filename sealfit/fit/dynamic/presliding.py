@@ -15,8 +15,6 @@ neighbouring samples are correlated; that of the level of the strokes is the run
 of a run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 

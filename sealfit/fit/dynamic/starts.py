@@ -1,7 +1,5 @@
 """The starts of strokes: from the first motion of the platform, along a ramp of speed, to steady sliding."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +39,7 @@ class _PaddedRows:
     along: np.ndarray
     there: np.ndarray
 
-    def some(self, strokes: np.ndarray) -> _PaddedRows:
+    def some(self, strokes: np.ndarray) -> "_PaddedRows":
         return _PaddedRows(self.time[strokes], self.along[strokes], self.there[strokes])
 
     def centred(self, values: np.ndarray) -> np.ndarray:
@@ -178,7 +176,7 @@ class Sliding:
     extent_mm: float  # square root of the sum of squared deviations from `distance_mm`
 
     @classmethod
-    def of(cls, distance_mm: np.ndarray, force_N: np.ndarray) -> Sliding:
+    def of(cls, distance_mm: np.ndarray, force_N: np.ndarray) -> "Sliding":
         """Return the line through samples, shape (n,) each."""
         middle = float(distance_mm.mean())
         away = distance_mm - middle

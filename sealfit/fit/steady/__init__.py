@@ -1,7 +1,5 @@
 """The steady distributed LuGre model (Eq. 14) fitted per condition; which parameters the speeds determine."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The model of one condition: the parameters of Eq. 14 that its speeds determine, and their fit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

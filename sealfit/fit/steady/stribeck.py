@@ -1,7 +1,5 @@
 """Eq. 14 fitted to many conditions at once, with exact intervals of nonnegative coefficients."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

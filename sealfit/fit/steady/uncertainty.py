@@ -6,8 +6,6 @@ the model by more, because the rig is set up for each run or because the model l
 are widened by the Birge ratio, the square root of the reduced chi-square.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -111,7 +109,7 @@ class UnitVariance:
     p: np.ndarray
     own: np.ndarray  # (conditions,) bool: whether the condition has its own ratio
 
-    def at(self, some: slice | int) -> UnitVariance:
+    def at(self, some: slice | int) -> "UnitVariance":
         """Return the factors of some conditions, or of one."""
         return UnitVariance(self.value[some], self.df[some], self.f[some], self.p[some], self.own[some])
 

@@ -1,7 +1,5 @@
 """All plots of a report, from its tables; each subject is drawn in a file of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from sealfit.config import Config

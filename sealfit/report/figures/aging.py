@@ -1,7 +1,5 @@
 """Aging curves, the master curve, and a few averaged traces."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 

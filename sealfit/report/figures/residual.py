@@ -1,7 +1,5 @@
 """Errors before and after, the residual by level and variable, and the shapes of the effects."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial

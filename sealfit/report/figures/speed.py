@@ -1,7 +1,5 @@
 """Force against speed, a panel per series; and the pre-sliding rise at selected speeds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
