@@ -357,14 +357,14 @@ def test_birge_by_hand():
     calm = unit_variance([4.0, 6.0], [5, 5], True, 40.0)  # pooled 1: no set-up scatter
     npt.assert_allclose(calm.value, 1.0)
     npt.assert_allclose(calm.df, 40)
-    npt.assert_allclose(calm.rise(), 2.0211**2, rtol=1e-4)  # t table, 40 degrees of freedom
+    npt.assert_allclose(calm["rise"], 2.0211**2, rtol=1e-4)  # t table, 40 degrees of freedom
 
 
 def test_a_condition_worse_than_the_others_gets_its_own_ratio():
     variance = unit_variance([5.0] * 9 + [100.0], [5] * 10, True, 100.0)
     assert list(variance.own) == [False] * 9 + [True]
-    npt.assert_allclose(variance.value[-1], 20.0)
-    assert variance.df[-1] == 5
+    npt.assert_allclose(variance["value"].iloc[-1], 20.0)
+    assert variance["df"].iloc[-1] == 5
 
 
 def test_likelier_weights_by_hand():

@@ -31,7 +31,7 @@ from sealfit.fit.least_squares import covariance_of
 from sealfit.fit.steady import FORCES, SteadyFit, parameter_units, solve_conditions
 from sealfit.fit.steady.condition import FULL, Condition
 from sealfit.fit.steady.stribeck import search_grid
-from sealfit.fit.steady.uncertainty import UnitVariance, shifts_of
+from sealfit.fit.steady.uncertainty import shifts_of
 from sealfit.physics.aging_laws import LOSSES
 from sealfit.tables import AGING_LAWS, MASTER_CURVE, STEADY_FIT
 
@@ -76,7 +76,7 @@ def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataF
     tables, covariances, shifts, covered = [], [], [], set()
     for places in about.groupby(series, sort=False).indices.values():
         of = [place[name] for name in about["condition"].to_numpy(object)[places]]
-        curve = _shared([conditions[k] for k in of], variance, variance.value[of], curved)
+        curve = _shared([conditions[k] for k in of], variance, variance["value"].to_numpy()[of], curved)
         if curve is not None:
             for kept, one in zip((tables, covariances, shifts), curve.determined(), strict=True):
                 kept.append(one)
@@ -100,13 +100,13 @@ def shared_levels(steady: pd.DataFrame, steady_fit: SteadyFit) -> tuple[pd.DataF
 
 
 def _shared(
-    own: Sequence[Condition], variance: UnitVariance, widened: np.ndarray, curved: set[str]
+    own: Sequence[Condition], variance: pd.DataFrame, widened: np.ndarray, curved: set[str]
 ) -> "_SharedCurve | None":
     """Return the shared curve of the days of a series, or None; `widened` are the factors on variances."""
     is_full = np.array([c.model == FULL for c in own])
     full = [c for c in own if c.model == FULL]
-    usual = variance.df[np.isfinite(variance.value) & ~variance.own]
-    df = float(usual[0]) if usual.size else np.nan
+    usual = variance.loc[np.isfinite(variance["value"]) & ~variance["own"], "df"]
+    df = float(usual.iloc[0]) if usual.size else np.nan
     if is_full.sum() < 2 or not curved & {c.name for c in own} or len({c.has_load for c in own}) > 1:
         return None
     if not np.isfinite(widened).all() or not np.isfinite(df):

@@ -21,14 +21,7 @@ from sealfit.fit.steady.condition import (
     solve,
 )
 from sealfit.fit.steady.stribeck import NAMES, linearised
-from sealfit.fit.steady.uncertainty import (
-    SMALLEST_SHARE,
-    UnitVariance,
-    more_likely,
-    run_means,
-    run_weights,
-    unit_variance,
-)
+from sealfit.fit.steady.uncertainty import SMALLEST_SHARE, more_likely, run_means, run_weights, unit_variance
 from sealfit.ingest.columns import condition_columns
 from sealfit.ingest.scatter import RepeatScatter, repeat_scatter
 from sealfit.tables import STEADY_COVARIANCE, STEADY_FIT, STEADY_SHIFT, Schema
@@ -89,10 +82,10 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
     keys = condition_keys(steady, config)
     for start in range(0, len(conditions), BLOCK):
         block = slice(start, start + BLOCK)
-        bound(conditions[block], variance.at(block).rise())
+        bound(conditions[block], variance["rise"].to_numpy()[block])
     rows = {schema: [] for schema in (STEADY_FIT, STEADY_COVARIANCE, STEADY_SHIFT)}
-    for k, c in enumerate(conditions):
-        for schema, row in _rows(c, variance.at(k), scatter, config):
+    for c, own in zip(conditions, variance.itertuples(), strict=True):
+        for schema, row in _rows(c, own, scatter, config):
             rows[schema].append({"condition": c.name, **row})
     others = [name for name in keys.columns if name not in STEADY_FIT.names()]
     found = {}
@@ -104,8 +97,8 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
     return found
 
 
-def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], RepeatScatter, UnitVariance]:
-    """Return fitted conditions without intervals, the scatter of repeats, and factors on stated variances.
+def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], RepeatScatter, pd.DataFrame]:
+    """Return fitted conditions without intervals, the scatter of repeats, and table `unit_variance`.
 
     A Stribeck curve that is not significant is dropped. FitError if there is no row to fit.
     """
@@ -117,7 +110,7 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], RepeatScatt
     if not scatter.df > 0:
         conditions = _more_likely_weights(conditions)
     first = unit_variance(*scatter_of_runs(conditions), scatter.df)
-    for condition, value, df in zip(conditions, first.value, first.df, strict=True):
+    for condition, value, df in zip(conditions, first["value"], first["df"], strict=True):
         if condition.model == FULL:
             drop_flat_curve(condition, value, df)
     return conditions, scatter, unit_variance(*scatter_of_runs(conditions), scatter.df)
@@ -147,9 +140,9 @@ def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
 
 def _rows(
-    condition: Condition, variance: UnitVariance, scatter: RepeatScatter, config: Config
+    condition: Condition, variance: tuple, scatter: RepeatScatter, config: Config
 ) -> Iterator[tuple[Schema, dict]]:
-    """Yield the rows of a condition, each with its table."""
+    """Yield the rows of a condition, each with its table; `variance` is its row of `unit_variance`."""
     unit_of = parameter_units(config.units, condition.has_load)
     speed, _, _, weight = condition.arrays
     moved = np.column_stack([np.ones_like(speed), condition.shifts])
@@ -192,7 +185,7 @@ def _rows(
 
 
 def _statistics(
-    condition: Condition, variance: UnitVariance, scatter: RepeatScatter, config: Config
+    condition: Condition, variance: tuple, scatter: RepeatScatter, config: Config
 ) -> Iterator[dict]:
     repeated, force_unit = scatter.df > 0, config.units.unit("force")
     no_repeats = "" if repeated else "no run was repeated: there is no pure error to compare with."

@@ -7,7 +7,6 @@ are widened by the Birge ratio, the square root of the reduced chi-square.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -99,28 +98,12 @@ def more_likely(chi2: Sequence[float], weights: Sequence[np.ndarray], df: float)
         return int(np.argmin([len(w) * np.log(c / df) - np.log(w).sum() for c, w in both]))
 
 
-@dataclass(frozen=True)
-class UnitVariance:
-    """Factor on the stated variances per condition, and the tests behind it; NaN if not determined."""
-
-    value: np.ndarray  # (conditions,), Birge ratio squared
-    df: np.ndarray  # (conditions,), of the Student t of the intervals
-    f: np.ndarray  # (conditions,), lack of fit against pure error; NaN without repeats
-    p: np.ndarray
-    own: np.ndarray  # (conditions,) bool: whether the condition has its own ratio
-
-    def at(self, some: slice | int) -> "UnitVariance":
-        """Return the factors of some conditions, or of one."""
-        return UnitVariance(self.value[some], self.df[some], self.f[some], self.p[some], self.own[some])
-
-    def rise(self) -> np.ndarray:
-        """Return chi-square's rise above its minimum at the ends of a 95 % interval, shape (conditions,)."""
-        with np.errstate(invalid="ignore"):
-            return stdtrit(self.df, 0.975) ** 2 * self.value
-
-
-def unit_variance(chi2, df, scatter, pure_df: float) -> UnitVariance:
+def unit_variance(chi2, df, scatter, pure_df: float) -> pd.DataFrame:
     """Return the factors on the variances stated by the weights, from chi-square of every condition.
+
+    The columns are `value`, the factor (Birge ratio squared); `df` of the intervals' Student t; `rise`, that
+    of chi-square above its minimum at their ends; `f` and `p` of the lack of fit against pure error, NaN
+    without repeats; and whether the condition has its `own` ratio. They are NaN if not determined.
 
     With repeats (`pure_df` > 0) the reduced chi-square, pooled over the conditions in which it is `scatter`
     of runs, is tested against pure error. If its p-value is at most `POOLING_P`, the factor is the pooled
@@ -143,8 +126,9 @@ def unit_variance(chi2, df, scatter, pure_df: float) -> UnitVariance:
         worse = (ratio > base) & (fdtrc(df, base_df, ratio / base) < WORSE_P) & (df < df.sum())
         none = np.full(chi2.shape, np.nan)
         f, p = (ratio, fdtrc(df, pure_df, ratio)) if repeated else (none, none)
-    df = np.where(worse, df, base_df if base_df > 0 else np.nan)
-    return UnitVariance(np.where(worse, ratio, base), df, f, p, worse)
+        value, df = np.where(worse, ratio, base), np.where(worse, df, base_df if base_df > 0 else np.nan)
+        rise = stdtrit(df, 0.975) ** 2 * value
+    return pd.DataFrame({"value": value, "df": df, "rise": rise, "f": f, "p": p, "own": worse})
 
 
 def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
