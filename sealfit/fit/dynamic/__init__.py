@@ -11,7 +11,7 @@ from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.fit.dynamic.bristle_model import Cells, RisingStroke, StribeckCurve
 from sealfit.fit.dynamic.presliding import AT, Stiffness, break_away_rows, fit_stiffness, largest_rows, peaks
-from sealfit.fit.dynamic.starts import StrokeStart, starts_of, strokes_along, whole_strokes
+from sealfit.fit.dynamic.starts import StrokePart, starts_of, strokes_along, whole_strokes
 from sealfit.fit.joint.rows import nesting_run, records
 from sealfit.fit.steady import SteadyFit, condition_keys, covariance_matrix, parameter_units, table_row
 from sealfit.ingest.stored_parts import StoredTraces
@@ -235,9 +235,7 @@ def _widened(steady_fit: pd.DataFrame) -> tuple[float, float]:
     return (float(table["chi2"].sum()) / df, df) if df > 0 else (1.0, 1.0)
 
 
-def _evidence(
-    starts: Sequence[StrokeStart], steady: pd.DataFrame, curve: StribeckCurve
-) -> list[RisingStroke]:
+def _evidence(starts: Sequence[StrokePart], steady: pd.DataFrame, curve: StribeckCurve) -> list[RisingStroke]:
     """Return the starts of a condition with their units of evidence and their ratio to the curve.
 
     The ratio is that of the loads, or of the sliding forces if the curve is not determined. `steady` has the

@@ -16,7 +16,7 @@ of a run.
 """
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -197,7 +197,7 @@ def peaks(cells: Cells, file: np.ndarray) -> pd.DataFrame:
     The table has one row per unit; units with an unknown value are left out.
     """
     half = int(np.ceil(cells.count * max(SAMPLES / cells.samples, SHARE) / 2))  # of the window, in cells
-    lines = np.array([astuple(part.sliding) for part in cells.parts], float)
+    lines = np.array([part.sliding for part in cells.parts], float)
     mean_N, middle, slope, samples, extent = lines.T
     sliding = mean_N[:, None] + slope[:, None] * (cells.middle_mm - middle[:, None])
     there = np.isfinite(cells.force_N)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -165,8 +166,7 @@ JUST_BEGUN = 0.1
 LEAST = 4
 
 
-@dataclass(frozen=True)
-class Sliding:
+class Sliding(NamedTuple):
     """A straight line through the force at the beginning of steady sliding, before much warming or wear."""
 
     force_N: float  # mean
@@ -175,31 +175,16 @@ class Sliding:
     rows: int  # number of samples
     extent_mm: float  # square root of the sum of squared deviations from `distance_mm`
 
-    @classmethod
-    def of(cls, distance_mm: np.ndarray, force_N: np.ndarray) -> "Sliding":
-        """Return the line through samples, shape (n,) each."""
-        middle = float(distance_mm.mean())
-        away = distance_mm - middle
-        square = float(away @ away)
-        slope = float(away @ force_N) / max(square, 1e-300)
-        return cls(float(force_N.mean()), middle, slope, len(force_N), math.sqrt(square))
-
 
 @dataclass(frozen=True)
 class StrokePart:
-    """A part of one stroke; distance and force are positive in its direction."""
+    """The start of one stroke, with smoothed displacement, or all of it; positive in its direction."""
 
     row: int  # in table `steady`
     distance_mm: np.ndarray  # (n,) distance slid, not decreasing
     force_N: np.ndarray  # (n,)
     sliding: Sliding  # force at the beginning of steady sliding
-
-
-@dataclass(frozen=True)
-class StrokeStart(StrokePart):
-    """The start of one stroke, with smoothed displacement."""
-
-    speed_mm_s: np.ndarray  # (n,) rate of the distance
+    speed_mm_s: np.ndarray | None = None  # (n,) rate of the distance of a start
 
 
 @dataclass(frozen=True)
@@ -250,7 +235,7 @@ def strokes_along(traces: pd.DataFrame, steady: pd.DataFrame) -> list[Along]:
     return made
 
 
-def starts_of(strokes: Sequence[Along]) -> list[StrokeStart]:
+def starts_of(strokes: Sequence[Along]) -> list[StrokePart]:
     """Return the start of every stroke that has one; a record that begins in steady sliding has none."""
     strokes = [stroke for stroke in strokes if stroke.until >= LEAST]
     noisy = [stroke for stroke in strokes if stroke.noisy]
@@ -274,7 +259,7 @@ def whole_strokes(strokes: Sequence[Along]) -> list[StrokePart]:
     return made
 
 
-def _begun(stroke: Along, ramp: Ramp | None) -> StrokeStart | None:
+def _begun(stroke: Along, ramp: Ramp | None) -> StrokePart | None:
     """Return the start of a stroke from its first motion, along its ramp if that fits; None if too short."""
     until, pace = stroke.until, stroke.pace_mm_s
     on_ramp = ramp is not None and ramp.rms_mm <= AS_NOISE * stroke.noise_mm and ramp.final_mm_s > 0.0
@@ -286,8 +271,12 @@ def _begun(stroke: Along, ramp: Ramp | None) -> StrokeStart | None:
         return None
     after = np.flatnonzero(stroke.steady)
     after = after[: max(LEAST, int(JUST_BEGUN * len(after)))]
-    line = Sliding.of(stroke.along_mm[after] - stroke.along_mm[since], stroke.force_N[after])
-    return StrokeStart(stroke.row, distance, stroke.force_N[since:until], line, speed[since:until])
+    slid, force = stroke.along_mm[after] - stroke.along_mm[since], stroke.force_N[after]
+    away = slid - slid.mean()
+    square = float(away @ away)
+    slope = float(away @ force) / max(square, 1e-300)
+    line = Sliding(float(force.mean()), float(slid.mean()), slope, len(force), math.sqrt(square))
+    return StrokePart(stroke.row, distance, stroke.force_N[since:until], line, speed[since:until])
 
 
 def _smoothed(stroke: Along) -> tuple[np.ndarray, np.ndarray]:
