@@ -121,9 +121,6 @@ def _fail(error: SealfitError, code: int = 1, *, above: str = "", **known: str) 
     return code
 
 
-# ---------------------------------------------------------------- cli
-
-
 class Command(TyperCommand):
     """A command whose usage has its arguments without braces: CAMPAIGN."""
 

@@ -36,7 +36,6 @@ def with_units(frame: pd.DataFrame, units: Units, schema: Schema | None = None) 
     return frame
 
 
-# ---------------------------------------------------------------- what the loop found
 def verdict(closure: Mapping, units: Units) -> pd.DataFrame:
     """Return one row: the verdict, its sentence, how good the fit is, and what is left."""
     quality, left = closure["fit_quality"], closure["left"]
@@ -108,7 +107,6 @@ def _frame(rows: list, columns: list[str] | None, numbers: Sequence[str], units:
     return with_units(frame, units)
 
 
-# ---------------------------------------------------------------- fits
 def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], config: Config) -> pd.DataFrame:
     """Return a row per condition and parameter of Eqs. 1 to 14; unaged rubber has them in each of its series.
 

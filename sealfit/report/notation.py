@@ -297,9 +297,6 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-# ---------------------------------------------------------------- order
-
-
 def by_number(text: str) -> tuple[int, float, str]:
     """Return a sort key that puts texts that are numbers by their size and before the others."""
     try:

@@ -97,9 +97,6 @@ def name_of(provenance: Mapping, config: Config) -> str:
     return own or provenance["table"] or PurePath(campaign).name or campaign
 
 
-# ---------------------------------------------------------------- page
-
-
 @dataclass(frozen=True)
 class Report:
     """The page, and its plots by name and format."""

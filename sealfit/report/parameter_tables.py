@@ -58,8 +58,6 @@ def with_interval(parameters: pd.DataFrame, name: str) -> str:
     return " ".join(measured(row["value"], row["lo95"], row["hi95"]))
 
 
-# ---------------------------------------------------------------- parameters
-
 STATISTICS = {
     "rmse_N": "rms error", "rmse": "rms error", "max_error_pct": "largest error",
     "specimen_sd_pct": "specimen scatter", "reduced_chi2": "χ² / df", "lack_of_fit_p": "lack of fit, p",

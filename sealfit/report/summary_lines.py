@@ -278,9 +278,6 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3g}"
 
 
-# ---------------------------------------------------------------- lifetime
-
-
 def lifetime_lines(part: Mapping) -> list[str]:
     """Return the lines of a lifetime, followed by those of the alternative laws."""
     found = [line("model", text) for text in _model(part)]

@@ -219,8 +219,6 @@ def spoil(columns: Columns, defect: str, random: np.random.Generator) -> Columns
     return {**columns, "force_N": force}
 
 
-# ---------------------------------------------------------------- channels
-
 Level = Literal["file", "run", "specimen", "condition"]
 GROUPS = {"file": "file", "run": "run_id", "specimen": "specimen_id", "condition": "condition"}
 

@@ -93,7 +93,6 @@ def _damping_row(found: Stiffness, curve: StribeckCurve, unit: str) -> dict:
     return table_row(**row, identified=False, reason=reason)
 
 
-# ---------------------------------------------------------------- dynamic
 # Columns of table `traces` that are read.
 OF_TRACES = ["file", "stroke", "time_s", "displacement_mm", "force_N", "steady"]
 

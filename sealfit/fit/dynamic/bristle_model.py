@@ -39,7 +39,6 @@ class Cells:
         return found
 
 
-# ---------------------------------------------------------------- rises
 # Grid values of the stiffness. The length of the rise goes from a third of a step to the whole stroke.
 STIFFNESSES = 40
 # Grid values of the damping: tau as a share of the duration of the rise.

@@ -151,7 +151,6 @@ def _lagging(since: np.ndarray, ramp: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return since - ramp * (1 - decay), 1 - decay, since * decay - ramp * (1 - decay)
 
 
-# ---------------------------------------------------------------- starts
 # A platform is at rest below this share of the steady speed.
 STANDSTILL = 0.05
 # Largest standard deviation of the local speed, as a share of the steady speed.

@@ -60,7 +60,6 @@ def _ends(gram, centre, spare, j, keep, nonnegative):
     return low, np.where(~bounded & possible & ~falling, np.inf, high)
 
 
-# ---------------------------------------------------------------- stribeck
 # F sgn(v) = N mu_s E + N mu_c (1 - E) + sigma_2 |v|, E = exp(-(v/v_s)^2). The coefficients of the three
 # columns are nonnegative, as friction dissipates energy at every speed; mu_s < mu_c is allowed. Without load
 # N = 1, and the coefficients are F_s and F_c.

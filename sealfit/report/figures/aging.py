@@ -35,7 +35,6 @@ REPEAT_BUCKETS = 120
 UNCORRECTED = Key("before, without the effects", style.FLOOR, "dotted")
 
 
-# ---------------------------------------------------------------- aging
 def draw_aging(
     ax: Axes, points: pd.DataFrame, curves: pd.DataFrame, before: pd.DataFrame, quantities: Sequence[str],
     units: Units,
@@ -148,7 +147,6 @@ def aging_points(steady_fit: pd.DataFrame) -> pd.DataFrame:
     return rows.rename(columns={"parameter": "quantity"})
 
 
-# ---------------------------------------------------------------- averaged traces
 def draw_trace(ax: Axes, trace: pd.DataFrame, repeats: pd.DataFrame, units: Units) -> None:
     """Draw one run's mean force along its displacement with its standard error; the steady window is shaded.
 
@@ -237,8 +235,6 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
             picked.append(left.iloc[style.evenly(len(left), MOST_TRACES)[k]])
     return pd.DataFrame(picked)
 
-
-# ---------------------------------------------------------------- the master curve
 
 MARKERS = "os^Dv<>"
 QUANTITIES = {

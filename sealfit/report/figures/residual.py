@@ -43,7 +43,6 @@ BARS = (Key("before", style.BEFORE, "bar"), Key("after", style.AFTER, "bar"))
 STAGES = (Key("before", style.BEFORE, "open"), Key("after", style.AFTER, "point"))
 
 
-# ---------------------------------------------------------------- before and after
 def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
     """Draw each error as a step from before to after, with the noise floor as a line."""
     rows = [(key, label) for key, label in ERRORS if known(closure["before"][key])]
@@ -127,7 +126,6 @@ def before_after(tables: Tables, closure: Mapping, config: Config) -> Plot | Non
     return Plot("before_after", "Errors before and after", tuple(panels), tuple(legend))
 
 
-# ---------------------------------------------------------------- finding
 def finding(tables: Tables, closure: Mapping, config: Config) -> Plot | None:
     """Return the evidence for the verdict: the residual along one variable, and the panels of the errors.
 
@@ -186,7 +184,6 @@ def signed_speeds(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found).rename_axis("x").reset_index().assign(along_motion=False)
 
 
-# ---------------------------------------------------------------- residual by level
 def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
     """Draw the residual variance at every level, before and after; beside each bar its standard deviation."""
     whole = levels[levels["channel"].isna()]
@@ -226,7 +223,6 @@ def variance_levels(tables: Tables, config: Config) -> Plot | None:
     return Plot("variance_levels", "Residual variance by level", (panel,), BARS, height=height)
 
 
-# ---------------------------------------------------------------- residual by channel
 def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> None:
     """Draw the mean residual along one channel, `rows` of table `channels`, with 95 % intervals."""
     numeric = rows["x"].notna().all() and channel != "direction"
@@ -325,7 +321,6 @@ def _span(channels: pd.DataFrame) -> tuple[float, float]:
     return low - room, high + room
 
 
-# ---------------------------------------------------------------- shapes of effects
 def draw_shape(ax: Axes, rows: pd.DataFrame, points: pd.DataFrame, effect: Mapping, units: Units) -> None:
     """Draw an effect along one channel: its form with the 95 % band, and the free shape it was compared with.
 

@@ -28,8 +28,6 @@ from sealfit.report.notation import (
 from sealfit.report.style import Key, Panel, Plot, Tables
 from sealfit.units import Units
 
-# ---------------------------------------------------------------- force against speed
-
 MOST_CURVES = 24  # in one panel
 MOST_FILES = 4  # named under the pointer
 MOST_COLOURS = 10  # in one panel; with more, each condition has its own, or numbers are thinned
@@ -199,8 +197,6 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
         return {title: style.spread(group, MOST_COLOURS) for title, group in groups.items()}
     return {names(c): [c] for group in groups.values() for c in group}
 
-
-# ---------------------------------------------------------------- the pre-sliding rise
 
 MOST_START_PANELS = 6
 MOST_SPEEDS = 3
