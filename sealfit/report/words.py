@@ -252,22 +252,18 @@ def _rival(rival: Mapping, config: Config) -> Markup:
 
 def channel_tests(levels: pd.DataFrame, known_channels: Collection[str], config: Config) -> list[dict]:
     """Return the part of the residual each variable explains, before and after, most significant first."""
-    rows: dict[tuple, dict] = {}
-    names = set(known_channels) | {"direction"}
-    for row in levels[levels["channel"].notna()].itertuples():
-        words = joined([channel_words(part, config.units) for part in split_channels(row.channel, names)])
-        entry = rows.setdefault(
-            (row.channel, row.level),
-            {"channel": words, "level": level_words(row.level), "rank": 1.0}
-            | {f"{what}_{stage}": NOTHING for what in ("sd", "p") for stage in ("before", "after")},
-        )
-        entry[f"sd_{row.stage}"] = number(row.sd_N, 2)
-        entry[f"p_{row.stage}"] = _p(row.p_value)
-        if row.stage == "before" and known(row.p_value):
-            entry["rank"] = row.p_value
+    names, found = set(known_channels) | {"direction"}, []
     order = {level: k for k, level in enumerate(reversed(LEVELS))}
-    listed = sorted(rows.items(), key=lambda item: (item[1]["rank"], order.get(item[0][1], 9)))
-    return [entry for _, entry in listed[:MOST_TESTS]]
+    tests = levels[levels["channel"].notna()].set_index("stage")
+    for (channel, level), own in tests.groupby(["channel", "level"], sort=False):
+        words = joined([channel_words(part, config.units) for part in split_channels(channel, names)])
+        row = {"channel": words, "level": level_words(level)}
+        for stage in ("before", "after"):
+            row[f"sd_{stage}"] = number(own["sd_N"].get(stage), 2)
+            row[f"p_{stage}"] = _p(own["p_value"].get(stage))
+        rank = own["p_value"].get("before")
+        found.append((rank if known(rank) else 1.0, order.get(level, 9), row))
+    return [row for *_, row in sorted(found, key=lambda one: one[:2])[:MOST_TESTS]]
 
 
 def wanted(conditions: Mapping, config: Config) -> str:
