@@ -122,27 +122,12 @@ def build_report(tables: Tables, closure: Mapping | None, provenance: Mapping, c
         images[name] = inline(figures[name]["svg"], name, alt)
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
-    html = TEMPLATES.get_template("template.html").render(
-        style=Markup(_text("style.css")),
-        script=Markup(_text("report.js")),
-        runs=Markup(runs),
-        script_hash=b64encode(sha256(_text("report.js").encode()).digest()).decode(),
-        plots=plots,
-        images=images,
-        most_channels=MOST_CHANNELS,
-        tables=tables,
-        closure=closure,
-        config=config,
-        units=config.units,
-        unit=config.units.unit("force"),
-        force=config.units.quantity("force"),
-        names=ConditionNames.of(config),
-        name=name_of(provenance, config),
-        provenance=provenance,
-        most_inputs=MOST_INPUTS,
-        fitted=_fitted(tables, config),
-        **opening,
-    )
+    units = config.units
+    about = {"tables": tables, "closure": closure, "provenance": provenance, "config": config}
+    about |= {"units": units, "unit": units.unit("force"), "force": units.quantity("force")}
+    about |= {"name": name_of(provenance, config), "names": ConditionNames.of(config)}
+    shown = {"plots": plots, "images": images, "runs": Markup(runs), "fitted": _fitted(tables, config)}
+    html = TEMPLATES.get_template("template.html").render(**about, **shown, **opening)
     return Report(html, figures)
 
 
@@ -239,3 +224,7 @@ def _text(name: str) -> str:
 for module in (notation, words, parameter_tables):
     TEMPLATES.globals |= vars(module)
 TEMPLATES.globals |= {"quality_counts": quality_counts, "quality_findings": quality_findings}
+TEMPLATES.globals |= {"most_channels": MOST_CHANNELS, "most_inputs": MOST_INPUTS}
+script = _text("report.js")
+TEMPLATES.globals |= {"style": Markup(_text("style.css")), "script": Markup(script)}
+TEMPLATES.globals["script_hash"] = b64encode(sha256(script.encode()).digest()).decode()
