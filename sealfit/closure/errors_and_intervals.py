@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.polynomial import Legendre
-from scipy.special import fdtrc, stdtrit
+from scipy.special import fdtrc
 
 from sealfit.closure.channels import FINER, Channel
 from sealfit.closure.criteria import FEW_UNITS, LARGEST_LEVERAGE, LEAST_SPARE_RUNS
@@ -21,6 +21,7 @@ from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 from sealfit.fit.joint.whitening import KINDS, LEVELS_OF_FORCE
+from sealfit.fit.least_squares import t_quantile
 from sealfit.tables import LEVELS as TABLE_OF_LEVELS
 
 SHAPES = 3  # Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3.
@@ -267,11 +268,6 @@ def _taken(fitted: Fitted, level: str) -> float:
     return float((fitted.basis.sums(groups, level, white).values ** 2).sum())
 
 
-def t_quantile(df: float) -> float:
-    """Return the two-sided 95 % quantile of Student's t; NaN for 0 degrees of freedom."""
-    return float(stdtrit(df, 0.975))
-
-
 def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
     """Return the sandwich covariance from whole groups of a level (CR2), shape (p, p)."""
     scores = fitted.white_jacobian.sums(fitted.rows.groups, level, fitted.unit_residual(level))
@@ -368,7 +364,7 @@ def mean_half_width(
             parts = [tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information]
             share = np.maximum(parts, 0.0)
             share /= np.maximum(share.sum(axis=0), 1e-300)
-            reach = stdtrit(satterthwaite_df(share), 0.975)
+            reach = t_quantile(satterthwaite_df(share))
             reach[share.max(axis=0) > LARGEST_LEVERAGE] = 0.0
         half = np.maximum(half, reach * mean_se(tangent, covariance_of_groups))
     return half

@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 from scipy.optimize.elementwise import find_minimum
+from scipy.special import stdtrit
 
 from sealfit.errors import FitError
 
@@ -137,6 +138,11 @@ def covariance_of(jacobian: np.ndarray, free: np.ndarray | None = None) -> tuple
     covariance[unknown[..., :, None] | unknown[..., None, :]] = 0.0
     covariance[unknown[..., :, None] & np.eye(p, dtype=bool)] = np.inf
     return covariance, known.sum(axis=-1)
+
+
+def t_quantile(df):
+    """Return Student's quantile of two-sided 95 % intervals, of the shape of `df`; NaN for df = 0."""
+    return stdtrit(df, 0.975)
 
 
 # ---------------------------------------------------------------- variable projection

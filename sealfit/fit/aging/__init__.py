@@ -13,6 +13,7 @@ from sealfit.fit.aging import law_table
 from sealfit.fit.aging.law import LawFit, Values, fit_law, paule_mandel
 from sealfit.fit.aging.law_table import Estimate, OneQuantity, SeriesCurve
 from sealfit.fit.joint.declared import DAYS_FOR_LAW
+from sealfit.fit.least_squares import t_quantile
 from sealfit.fit.steady import SteadyFit, covariance_matrix
 from sealfit.fit.steady.condition import FULL
 from sealfit.physics import aging_law
@@ -245,7 +246,7 @@ def _curve(
         return {}
     covariances = of_law.set_index(["parameter", "other"])["value"].to_dict()
     covariance = covariance_matrix(covariances, ("mu_0", "a", "ln b"))
-    t = law_table.t_of_95(known["statistics", f"{quantity}:error_df"])
+    t = t_quantile(known["statistics", f"{quantity}:error_df"] or np.inf)
     days = known["statistics", f"{quantity}:last_day"] * np.linspace(0, 1, CURVE_POINTS) ** 2
     ratio = days / b
     slope = np.stack([np.ones_like(days), -np.log1p(ratio), a * ratio / (1 + ratio)], axis=1)

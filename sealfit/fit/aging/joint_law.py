@@ -7,14 +7,14 @@ from itertools import product
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
-from scipy.special import fdtrc, stdtrit
+from scipy.special import fdtrc
 
 from sealfit.effects import aging_laws
 from sealfit.errors import FitError
 from sealfit.fit.aging.law import Measured, paule_mandel
 from sealfit.fit.joint.prior import covariance_of
 from sealfit.fit.joint.whitening import blockwise, log_determinant, whitening_of
-from sealfit.fit.least_squares import levenberg_marquardt
+from sealfit.fit.least_squares import levenberg_marquardt, t_quantile
 from sealfit.physics.aging_laws import LOSSES, Loss
 
 # Gas constant in kJ/(mol K).
@@ -150,7 +150,7 @@ class JointLaw:
     @property
     def t(self) -> float:
         """Student's quantile of 95 % intervals of the law's values."""
-        return float(stdtrit(max(self.df, 1), 0.975))
+        return float(t_quantile(max(self.df, 1)))
 
     def lack_of_fit_p(self) -> float:
         """Return the p-value of the law's lack of fit against the replicates (F test); nan without them."""
@@ -217,7 +217,7 @@ class JointLaw:
         Without a loss (a may be 0) its shape, E and kappa have no meaning.
         """
         df = self.aged.df(self.aged.value.size - self.x.size, self.scatter, level=False)
-        t = float(stdtrit(max(df, 1), 0.975))
+        t = float(t_quantile(max(df, 1)))
         lost = bool(abs(self.x[1]) > t * np.sqrt(self.covariance[1, 1]))
         for k, name in enumerate(self.names):
             half = (self.t if name == "mu_0" else t) * float(np.sqrt(self.covariance[k, k]))

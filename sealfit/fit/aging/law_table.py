@@ -6,11 +6,11 @@ from functools import cached_property
 
 import numpy as np
 from scipy.optimize.elementwise import find_root
-from scipy.special import chdtrc, fdtrc, ndtri, stdtrit
+from scipy.special import chdtrc, fdtrc
 
 from sealfit.fit.aging.law import PROFILED, EqualGroups, LawFit
 from sealfit.fit.joint.declared import DAYS_FOR_LAW
-from sealfit.fit.least_squares import CHUNK, covariance_of, levenberg_marquardt
+from sealfit.fit.least_squares import CHUNK, covariance_of, levenberg_marquardt, t_quantile
 from sealfit.fit.steady import table_row
 
 # Tolerance of the ends of intervals in ln b: 0.1 % of b.
@@ -230,17 +230,12 @@ class OneQuantity:
     @property
     def t(self) -> float:
         """Student's quantile of 95 % intervals of a, b and c, with the df of the scatter they contain."""
-        return t_of_95(self.alone.values.df(self.alone.df, self.tau, level=False))
+        return t_quantile(self.alone.values.df(self.alone.df, self.tau, level=False) or np.inf)
 
     @property
     def level_df(self) -> float:
         """Degrees of freedom of the intervals of mu_0 and of the law's values."""
         return self.alone.values.df(self.alone.df, self.tau, level=True)
-
-
-def t_of_95(df: float) -> float:
-    """Return Student's quantile of 95 % intervals; the normal one without degrees of freedom."""
-    return float(stdtrit(df, 0.975) if df > 0 else ndtri(0.975))
 
 
 @dataclass(frozen=True)
@@ -272,7 +267,7 @@ def law_rows(curve: SeriesCurve, found: Estimate, ends: CurveInterval, df: float
     """Return the rows of mu_0, a, b and c; `df` are the degrees of freedom of mu_0's interval."""
     mu_0, a, u = found.x
     b, se = np.exp(u), np.sqrt(np.diag(found.covariance))
-    beside, t = "" if df > 0 else NO_SCATTER, t_of_95(df)
+    beside, t = "" if df > 0 else NO_SCATTER, t_quantile(df or np.inf)
     move = np.where(np.abs(found.shift) > 1e-12 * np.abs(found.x), found.shift, 0.0)  # the rest is rounding
     judged = _judge(curve, found, ends, t)
     of_mu_0 = (mu_0 - t * se[0], mu_0 + t * se[0])

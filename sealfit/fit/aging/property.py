@@ -16,12 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from scipy.optimize import minimize_scalar
-from scipy.special import stdtr, stdtrit
+from scipy.special import stdtr
 
 from sealfit.config import Config
 from sealfit.fit.aging import SMALLEST, LawRows, aging_curves, law_fit, laws_of_series
 from sealfit.fit.aging.all_series import COMPRESSION, TEMPERATURE, aged_of, law_tables, laws_of
 from sealfit.fit.aging.joint_law import Aged, JointLaw
+from sealfit.fit.least_squares import t_quantile
 
 # Largest ratio of the variance between batches to that between specimens that is searched.
 MOST_RATIO = 1e6
@@ -58,7 +59,7 @@ class Means:
         """Return half the width of the 95 % intervals of the means, shape (n,); nan without replicates."""
         if not self.level_df:
             return np.full(len(self.table), np.nan)
-        return stdtrit(self.level_df, 0.975) * np.sqrt(np.diag(self.covariance))
+        return t_quantile(self.level_df) * np.sqrt(np.diag(self.covariance))
 
     def aged(self) -> Aged:
         """Return the means as the data of a law for all series."""

@@ -26,7 +26,7 @@ from scipy.special import stdtrit
 from sealfit.config import Config
 from sealfit.fit.dynamic.bristle_model import BristleTangent, Cells, Rises, RisingStroke, StribeckCurve
 from sealfit.fit.joint.search import least_squares_within
-from sealfit.fit.least_squares import levenberg_marquardt
+from sealfit.fit.least_squares import levenberg_marquardt, t_quantile
 
 # Number of samples inside the rise that an estimate needs.
 LEAST = 3
@@ -78,7 +78,7 @@ class Stiffness:
     @property
     def quantile(self) -> np.ndarray:
         """Student's quantile of the 95 % intervals of the two, shape (2,)."""
-        return stdtrit(np.maximum(self.df, 1.0), 0.975)
+        return t_quantile(np.maximum(self.df, 1.0))
 
     def log_half_width(self) -> float:
         """Return half of the 95 % interval of log sigma_0."""
@@ -287,7 +287,7 @@ def break_away_rows(found: pd.DataFrame, widened: tuple[float, float], config: C
     ):
         value = np.exp(mean[f"log {name}"].to_numpy())
         error = np.where(peak, np.sqrt(variance / n), np.nan)
-        half = stdtrit(error_df, 0.975) * error
+        half = t_quantile(error_df) * error
         row = {"quantity": "break_away", "parameter": name, "value": value, "se": value * error}
         row |= {"lo95": value * np.exp(-half), "hi95": value * np.exp(half), "u_sys": u_sys, "unit": unit}
         both.append(pd.DataFrame({**row, "identified": peak, "reason": reason}))

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtrit
 
 from sealfit.config import Config
 from sealfit.effects.contract import fill_unit
 from sealfit.fit.joint.rows import merge_directions
+from sealfit.fit.least_squares import t_quantile
 from sealfit.fit.steady.condition import (
     FULL,
     Condition,
@@ -161,7 +161,7 @@ def _rows(
             low, high = (None, None) if condition.low is None else (condition.low[j], condition.high[j])
             open_below = name == "v_s" and low == 0.0
             if effects.any() and low is not None:  # the half-widths are added in quadrature
-                reach = stdtrit(variance.df, 0.975) * float(np.sqrt((effects[j] ** 2).sum()))
+                reach = t_quantile(variance.df) * float(np.sqrt((effects[j] ** 2).sum()))
                 low = max(value - float(np.hypot(value - low, reach)), 0.0)
                 high = value + float(np.hypot(high - value, reach))
             se = None if value == 0.0 else np.sqrt(covariance[j, j])  # at its limit: not known with error 0

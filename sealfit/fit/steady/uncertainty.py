@@ -10,10 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-from scipy.special import fdtrc, stdtrit
+from scipy.special import fdtrc
 
 from sealfit.errors import FitError
 from sealfit.fit.joint.rows import BOTH_DIRECTIONS, merge_directions
+from sealfit.fit.least_squares import t_quantile
 from sealfit.ingest.scatter import RepeatScatter
 from sealfit.ingest.strokes import speed_clusters
 
@@ -127,7 +128,7 @@ def unit_variance(chi2, df, scatter, pure_df: float) -> pd.DataFrame:
         none = np.full(chi2.shape, np.nan)
         f, p = (ratio, fdtrc(df, pure_df, ratio)) if repeated else (none, none)
         value, df = np.where(worse, ratio, base), np.where(worse, df, base_df if base_df > 0 else np.nan)
-        rise = stdtrit(df, 0.975) ** 2 * value
+        rise = t_quantile(df) ** 2 * value
     return pd.DataFrame({"value": value, "df": df, "rise": rise, "f": f, "p": p, "own": worse})
 
 
