@@ -32,7 +32,8 @@ from sealfit.errors import (
 # ---------------------------------------------------------------- options that several commands share
 
 Campaign = Annotated[Path, Argument(metavar="CAMPAIGN", help="Folder of runs.csv and trace files.")]
-Results = Annotated[Path, Argument(metavar="OUT", help="Folder of results of `run`, or of the steps before.")]
+OUT = Argument(metavar="OUT", help="Folder of results of `run`, or of the steps before.")
+Results = Annotated[Path, OUT]
 Out = Annotated[Path, Option("--out", help="Folder of results; created if it is missing.")]
 ConfigFile = Annotated[Path | None, Option("--config", help="Rig config (TOML); else the default.")]
 Workers = Annotated[int | None, Option("--workers", min=1, help="Processes. [default: all cores]")]
@@ -256,9 +257,7 @@ _fit_command("fit-steady", "Fit steady LuGre to each condition.")
 
 @command("fit-aging", epilog="Example: sealfit fit-aging --values strength.csv --out results")
 def fit_aging(
-    out: Annotated[
-        Path | None, Argument(metavar="OUT", help="Folder of results of `run`, or of the steps before.")
-    ] = None,
+    out: Annotated[Path | None, OUT] = None,
     values: Annotated[
         Path | None, Option("--values", help="Or a table of property values of specimens.")
     ] = None,

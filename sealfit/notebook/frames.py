@@ -112,7 +112,7 @@ def parameters(fits: Sequence[pd.DataFrame], before: Sequence[pd.DataFrame], con
 
     `fits` are tables `steady_fit` and `dynamic_fit` of the answer, and `before` the same without effects.
     """
-    rows = _with_before(_of(fits, OF_CONDITIONS), _of(before, OF_CONDITIONS), ["condition", "parameter"])
+    rows = _with_before(_of_conditions(fits), _of_conditions(before), ["condition", "parameter"])
     if config.aging and "aging_days" in rows:
         rows = _starting_series(rows, config)
     keys = [name for name in (*config.condition, *config.rubber) if name in rows]
@@ -135,9 +135,9 @@ def laws(fit: pd.DataFrame, before: pd.DataFrame, config: Config) -> pd.DataFram
     return rows[list(columns)].reset_index(drop=True)
 
 
-def _of(fits: Sequence[pd.DataFrame], quantities: Sequence[str]) -> pd.DataFrame:
+def _of_conditions(fits: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return the rows of parameters, whatever else a fit has: statistics, break-aways."""
-    kept = [fit[fit["quantity"].isin(quantities)] for fit in fits]
+    kept = [fit[fit["quantity"].isin(OF_CONDITIONS)] for fit in fits]
     return pd.concat([part for part in kept if len(part)] or kept[:1], ignore_index=True)
 
 

@@ -85,14 +85,14 @@ def measured(value: float | None, lo: float | None, hi: float | None) -> tuple[s
     return _fixed(value, places) + tail, f"[{_fixed(lo, places)}, {_fixed(hi, places)}]" + tail
 
 
-def together(values: Sequence[float | None], digits: int = 2) -> list[str]:
-    """Return numbers of one unit with the same decimals: the smallest shows `digits` significant ones."""
+def together(values: Sequence[float | None]) -> list[str]:
+    """Return numbers of one unit with the same decimals: the smallest shows two significant ones."""
     sizes = [abs(value) for value in values if known(value) and value != 0]
     if not sizes:
         return [number(value) for value in values]
     power = _power(max(sizes))
     largest = decimals(max(sizes) / 10.0**power, 4)  # one tiny value does not give the others nine decimals
-    places = min(decimals(min(sizes) / 10.0**power, digits), largest)
+    places = min(decimals(min(sizes) / 10.0**power), largest)
     return [_fixed(v / 10.0**power, places) + _times_ten(power) if known(v) else NOTHING for v in values]
 
 
