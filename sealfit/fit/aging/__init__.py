@@ -202,10 +202,13 @@ def _rows(values: Values, curves: list[SeriesCurve], fitted: list[str], moved: n
     model = np.empty(values.value.size)
     for q, name in enumerate(fitted):
         part = np.flatnonzero(values.origin == q)
-        tau, alone = between_scatter(values.part(part))
-        series = len({c.series for c in curves if c.place >= 0 and c.quantity == name})
-        quantities[name] = OneQuantity(alone, part, tau, series)
+        own = values.part(part)
+        tau, alone = between_scatter(own)
         model[part] = alone.model
+        squares = (own.whitening @ (own.value - alone.model)) ** 2
+        series = len({c.series for c in curves if c.place >= 0 and c.quantity == name})
+        df, level_df = (own.df(alone.df, tau, level=level) for level in (False, True))
+        quantities[name] = OneQuantity(part, squares, tau, series, t_quantile(df or np.inf), level_df)
     joint = fit_law(_with_specimens(values, [one.tau for one in quantities.values()], model))
     intervals = law_table.curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))
     covariance, shift = law_table.curve_errors(joint, moved)

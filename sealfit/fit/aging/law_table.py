@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize.elementwise import find_root
@@ -213,29 +213,15 @@ class SeriesCurve:
     unit: str
 
 
-@dataclass(frozen=True)
-class OneQuantity:
+class OneQuantity(NamedTuple):
     """The separate fit of one quantity of all series, and the scatter between specimens."""
 
-    alone: LawFit
     part: np.ndarray  # indices of its values among those of the joint fit
+    squares: np.ndarray  # (n,) of its whitened residuals
     tau: float  # relative standard deviation between specimens in excess of the steady fits' errors
     series: int  # number of series with a law
-
-    @cached_property
-    def squares(self) -> np.ndarray:
-        """Squares of the whitened residuals, shape (n,)."""
-        return (self.alone.values.whitening @ (self.alone.values.value - self.alone.model)) ** 2
-
-    @property
-    def t(self) -> float:
-        """Student's quantile of 95 % intervals of a, b and c, with the df of the scatter they contain."""
-        return t_quantile(self.alone.values.df(self.alone.df, self.tau, level=False) or np.inf)
-
-    @property
-    def level_df(self) -> float:
-        """Degrees of freedom of the intervals of mu_0 and of the law's values."""
-        return self.alone.values.df(self.alone.df, self.tau, level=True)
+    t: float  # Student's quantile of intervals of a, b and c, with the df of the scatter they contain
+    level_df: float  # degrees of freedom of the intervals of mu_0 and of the law's values
 
 
 @dataclass(frozen=True)
