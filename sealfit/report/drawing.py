@@ -58,7 +58,7 @@ def run_traces(tables: Tables, config: Config) -> dict:
     made["every"] = every = max(1, math.ceil(len(rows) / MOST_BINS))
     if rows.empty or every > LARGEST_STEP:
         return made
-    names = ConditionNames.of(config)
+    names = ConditionNames(config)
     for run_id, run in rows[rows["bin"] % every == 0].groupby("run_id", sort=False):
         first = run.iloc[0]
         speed = f"{given(abs(run['speed_mm_s'].mean()), 3)} {units.unit('speed')}"

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
@@ -234,23 +233,16 @@ def effect_label(effect: Mapping, units: Units) -> str:
     return _slot(effect["channels"]).sub(lambda found: channel_words(found[0], units), label)
 
 
-@dataclass(frozen=True)
 class ConditionNames:
-    """Short names of conditions and series: values with units.
+    """Short names of conditions and series of a config: values with units.
 
-    >>> names = ConditionNames.of(Config())
+    >>> names = ConditionNames(Config())
     >>> names("temperature_C=60, compression_ratio_pct=80, aging_days=4"), names("unaged"), names.key
     ('60 °C · 80 % · 4 d', 'unaged', 'aging temperature · compression ratio · aging time')
     """
 
-    columns: tuple[str, ...]
-    units: Units
-
-    @classmethod
-    def of(cls, config: Config) -> "ConditionNames":
-        """Return the names for a config's condition and rubber columns."""
-        rubber = [name for name in config.rubber if name not in config.condition]
-        return cls((*config.condition, *rubber), config.units)
+    def __init__(self, config: Config) -> None:
+        self.columns, self.units = tuple(dict.fromkeys([*config.condition, *config.rubber])), config.units
 
     def __call__(self, text: object) -> str:
         """Return the short name of a condition or series."""

@@ -125,7 +125,7 @@ def build_report(tables: Tables, closure: Mapping | None, provenance: Mapping, c
     units = config.units
     about = {"tables": tables, "closure": closure, "provenance": provenance, "config": config}
     about |= {"units": units, "unit": units.unit("force"), "force": units.quantity("force")}
-    about |= {"name": name_of(provenance, config), "names": ConditionNames.of(config)}
+    about |= {"name": name_of(provenance, config), "names": ConditionNames(config)}
     shown = {"plots": plots, "images": images, "runs": Markup(runs), "fitted": _fitted(tables, config)}
     html = TEMPLATES.get_template("template.html").render(**about, **shown, **opening)
     return Report(html, figures)

@@ -106,7 +106,7 @@ def parameter_tables(
 
     `before` is the same table without the loop's effects, for its values beside those of `fit`.
     """
-    key, names = "series" if name == "aging_fit" else "condition", ConditionNames.of(config)
+    key, names = "series" if name == "aging_fit" else "condition", ConditionNames(config)
     every = sorted(fit[key].unique(), key=names.place)
     excerpt = ""
     if len(every) > MOST_ROWS:
@@ -147,7 +147,7 @@ def _row(row: Mapping, key: str, earlier: Mapping, config: Config) -> dict:
         value, interval = "not identified", NOTHING
         note = note or "these data do not determine it"
     return {
-        "name": ConditionNames.of(config)(row[key]),
+        "name": ConditionNames(config)(row[key]),
         "quantity": quantity,
         "parameter": symbol,
         "value": value,

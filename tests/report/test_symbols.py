@@ -78,9 +78,7 @@ def test_labels_of_effects_are_in_words_of_the_rig(label, words):
 
 
 def test_conditions_are_values_with_units():
-    names = ConditionNames.of(
-        Config(condition=["pressure_bar", "oil", "material"], column_units={"oil": "°C"})
-    )
+    names = ConditionNames(Config(condition=["pressure_bar", "oil", "material"], column_units={"oil": "°C"}))
     assert names("pressure_bar=2, oil=40, material=NBR, black") == "2 bar · 40 °C · NBR, black"
     assert names.parts("pressure_bar=2, oil=40, material=a=b") == {
         "pressure_bar": "2",
@@ -90,12 +88,12 @@ def test_conditions_are_values_with_units():
 
 
 def test_a_number_without_unit_keeps_its_name():
-    assert ConditionNames.of(Config(condition=["batch"]))("batch=3") == "batch 3"
+    assert ConditionNames(Config(condition=["batch"]))("batch=3") == "batch 3"
 
 
 @pytest.mark.parametrize("text", ["unaged", "unaged, NBR", "all"])
 def test_other_series_stay_as_they_are(text):
-    assert ConditionNames.of(Config())(text) == text
+    assert ConditionNames(Config())(text) == text
 
 
 def test_long_names_are_cut_with_an_ellipsis():

@@ -76,7 +76,7 @@ def aging(tables: Tables, config: Config) -> Plot | None:
     curves = tables["aging_curves"]
     if curves.empty or not config.aging:
         return None
-    names = ConditionNames.of(config)
+    names = ConditionNames(config)
     quantities = list(dict.fromkeys(curves["quantity"]))
     values = tables.get("property_values", ())
     of_property = len(values) > 0
@@ -191,7 +191,7 @@ def traces_mean(tables: Tables, config: Config) -> Plot | None:
     chosen = example_runs(traces, tables["runs"])
     if chosen.empty:
         return None
-    names, units, single = ConditionNames.of(config), config.units, tables["traces"]
+    names, units, single = ConditionNames(config), config.units, tables["traces"]
     traces = traces[traces["run_id"].isin(chosen["run_id"])]
     ends = along_motion(single)["force_N"].quantile([0.002, 0.998]) if len(single) else None  # but spikes
     shown = pd.concat([along_motion(traces)["force_N"], ends])

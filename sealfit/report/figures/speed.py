@@ -85,7 +85,7 @@ def force_speed(tables: Tables, config: Config) -> Plot | None:
     conditions = pd.unique(pd.concat([points["condition"], curves["condition"]], ignore_index=True))
     if not len(conditions):
         return None
-    names = ConditionNames.of(config)
+    names = ConditionNames(config)
     last = "aging_days" if config.aging else config.condition[-1]
     rubber = tables["steady"].drop_duplicates("condition").set_index("condition")["rubber"].to_dict()
     unaged = [c for c in conditions if is_unaged(c)]
@@ -235,7 +235,7 @@ def starts(tables: Tables, config: Config) -> Plot | None:
     curves = tables["dynamic_curves"]
     if curves.empty:
         return None
-    names, units = ConditionNames.of(config), config.units
+    names, units = ConditionNames(config), config.units
     picked = style.spread(sorted(curves["condition"].unique(), key=names.place), MOST_START_PANELS)
     speeds = style.spread(np.sort(curves["speed_set_mm_s"].dropna().unique()).tolist(), MOST_SPEEDS)
     colours = dict(zip(speeds, style.shades(len(speeds)), strict=True))
