@@ -1,7 +1,5 @@
 """`sealfit.run`, `fit_properties` and `open`: the results of a campaign for a notebook or another program."""
 
-from __future__ import annotations
-
 import html
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +35,7 @@ def run(
     workers: int | None = None,
     effects_folder: str | Path | None = None,
     **options: object,
-) -> Results:
+) -> "Results":
     """Run all out-of-date steps, as `sealfit run` does, and return the results.
 
     Parameters
@@ -74,7 +72,7 @@ def fit_properties(
     properties: Sequence[str] = (),
     batch: str = BATCH,
     **options: object,
-) -> Results:
+) -> "Results":
     """Fit the aging laws of properties of specimens, as `sealfit fit-aging --values` does.
 
     Parameters
@@ -102,7 +100,7 @@ def fit_properties(
     return Results(out)
 
 
-def open(out: str | Path, effects_folder: str | Path | None = None) -> Results:
+def open(out: str | Path, effects_folder: str | Path | None = None) -> "Results":
     """Return the results in a folder that `sealfit.run` or the command line made.
 
     Parameters
@@ -225,7 +223,7 @@ class Results:
 
     # ------------------------------------------------------------ what follows
     @property
-    def plot(self) -> Plots:
+    def plot(self) -> "Plots":
         """The report's figures: `results.plot.aging()` returns a matplotlib Figure."""
         from sealfit.notebook.plots import Plots
 
@@ -259,7 +257,7 @@ class Results:
         loss_pct: float | None = None,
         temperature_C: float | None = None,
         **options: object,
-    ) -> Lifetime:
+    ) -> "Lifetime":
         """Return the days until a quantity reaches a threshold, as `sealfit lifetime` does.
 
         Parameters

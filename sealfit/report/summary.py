@@ -1,19 +1,17 @@
 """Summaries of the steps as plain values, and clauses on the verdict that the report shares."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
+from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.report.summary_lines import has_weak_evidence
 from sealfit.units import Units
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from sealfit.effects.contract import Effect
     from sealfit.store import Store
 
 STATISTICS = "statistics"  # `quantity` of rows about the fit itself
@@ -37,7 +35,7 @@ ERRORS = {  # of closure.json, before and after; {held} is the unit that is held
 FLOORED = ("rmse_N", "heldout_rmse_N")  # errors that the noise floor is compared with
 
 
-def of_steps(store: Store, steps: Iterable[str]) -> dict:
+def of_steps(store: "Store", steps: Iterable[str]) -> dict:
     """Return the summaries of `steps`, all of them current."""
     make = {
         "ingest": lambda: of_ingest({name: store.read(name) for name in OF_INGEST}),
@@ -97,7 +95,7 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
     return {of: int(fit[of].nunique()), "parameters": ranges}
 
 
-def of_aging(store: Store) -> dict:
+def of_aging(store: "Store") -> dict:
     """Return the ranges of the aging law's parameters; of properties, also their scatter and their laws."""
     fit = store.read("aging_fit")
     found = of_fit(fit, "series")
@@ -170,7 +168,7 @@ def of_closure(closure: Mapping, units: Units) -> dict:
     return found | {"effects": effects}
 
 
-def of_after(store: Store) -> dict:
+def of_after(store: "Store") -> dict:
     """Return the summaries of the fits after the loop; empty if it added no effect and left out no file."""
     closure = store.read_json("closure")
     if all(effect["candidate"] for effect in closure["effects"]) and not closure["outlier_files"]:
@@ -244,7 +242,6 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
     from types import SimpleNamespace
 
     from sealfit.closure.result import parameter_unit
-    from sealfit.effects.contract import CHANNEL
 
     units = replace(units, channels={**units.channels, CHANNEL: "unit of x"})
     listed = []
