@@ -1,7 +1,5 @@
 """Commands that keep nothing in OUT: init, check, predict, lifetime, effects and simulate."""
 
-from __future__ import annotations
-
 import shlex
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -104,7 +102,7 @@ def predict(
     return {"out": str(store.out), "output": str(output), **written, "includes": effects}
 
 
-def answers_to(points: pd.DataFrame, store: Store) -> pd.DataFrame:
+def answers_to(points: "pd.DataFrame", store: Store) -> "pd.DataFrame":
     """Return points with their answers, by the model that `store`'s loop recorded; errors as `predict`."""
     from sealfit.closure.predict import predict as answer
     from sealfit.effects.user import load_user_effects
@@ -165,7 +163,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     return {**said, **chosen, "rivals": rivals, "before": before}
 
 
-def _laws_of(store: Store, asked: LifetimeRequest, model: str) -> tuple[list[JointLaw], list[dict]]:
+def _laws_of(store: Store, asked: LifetimeRequest, model: str) -> "tuple[list[JointLaw], list[dict]]":
     """Return the laws of a quantity in order of BIC, and the effects taken out of its values."""
     if store.state.properties is not None:
         from sealfit.fit.aging.property import laws_of_property
@@ -178,7 +176,7 @@ def _laws_of(store: Store, asked: LifetimeRequest, model: str) -> tuple[list[Joi
     return law_of(*tables, asked.quantity, asked.law), taken_out
 
 
-def _fits_of(store: Store, model: str) -> tuple[tuple[pd.DataFrame, SteadyFit], list[dict]]:
+def _fits_of(store: Store, model: str) -> "tuple[tuple[pd.DataFrame, SteadyFit], list[dict]]":
     """Return a model's table `steady`, the fit of its conditions, and the effects taken out of them."""
     suffix, added = "", []
     try:
