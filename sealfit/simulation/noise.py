@@ -186,7 +186,7 @@ def _streams(noise: Sequence[Noise], seed: int, *file: int) -> Iterator[tuple[No
         seen[kind.kind] += 1
 
 
-DEFECTS = ("missing_cells", "spikes", "gaps", "saturated", "reversed")  # keys of `BadData`
+DEFECTS = tuple(name for name in BadData.model_fields if name != "kind")
 Columns = dict[str, np.ndarray]  # a trace's columns, each of shape (n,); NaN is written as an empty cell
 
 

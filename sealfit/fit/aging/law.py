@@ -77,16 +77,19 @@ class Measured:
     days: np.ndarray
     value: np.ndarray
     _: KW_ONLY
-    size: np.ndarray | None = None  # values to which further scatter is relative; None: to those of the law
+    size: np.ndarray | None = None  # values to which further scatter is relative; None: the law's
     replicates_df: float = 0.0
     level_df: float = 0.0
 
     def scale(self, own: np.ndarray) -> np.ndarray:
-        """Return the values to which the scatter is relative, shape (n,), given the law's `own`."""
+        """Return the values to which further scatter is relative, shape (n,), given the law's `own`."""
         return np.abs(own) if self.size is None else self.size
 
     def df(self, left: float, scatter: float, *, level: bool) -> float:
-        """Return those of intervals of a law's values (`level`) or differences; `left` if it has scatter."""
+        """Return the degrees of freedom of intervals of a law's values (`level`) or of their differences.
+
+        They are `left`, those of the law's residual, if it shows `scatter` beyond the covariance.
+        """
         return left if scatter > 0 else (self.level_df if level else self.replicates_df) or left
 
 
