@@ -34,7 +34,7 @@ from sealfit.fit.aging.lifetime import Goal, lifetime, over_laws
 from sealfit.fit.joint import Fitted
 from sealfit.fit.steady import SteadyFit, fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
-from sealfit.pipeline import FITS
+from sealfit.pipeline import MADE
 from sealfit.simulation import Spec, load_truth, simulate, truth_path
 
 KINDS = ("warming_distance", "warming_time", "conditioning", "zero_offset", "lab_temperature", "two_at_once")
@@ -60,7 +60,7 @@ def count(kind: str, seed: int, strength: str) -> list[Entry]:
     entries = [Entry("effects found as they are", right, None, None)]
     entries += _laws("after", after["aging_fit_after"], laws, factor)
     entries += _laws("before", before, laws, factor)
-    free = {name: after[f"{name}_after"] for name in FITS["fit-steady"]}
+    free = {name: after[f"{name}_after"] for name in MADE["fit-steady"]}
     entries += _life("after", after["steady_after"], free, spec, laws, factor)
     return entries + list(_life("before", tables["steady"], conditions, spec, laws, factor))
 

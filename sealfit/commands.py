@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sealfit.engine.run_map import on_cluster
 from sealfit.errors import CampaignError, Fault, OutError, ParameterError, RequestError, StaleError
-from sealfit.pipeline import FITS
+from sealfit.pipeline import MADE
 from sealfit.progress import Silent
 from sealfit.store import Store, paths
 from sealfit.store.manifest import ConfigCopy
@@ -190,7 +190,7 @@ def _fits_of(store: Store, model: str) -> "tuple[tuple[pd.DataFrame, SteadyFit],
         closure = store.read_json("closure")
         added = [effect for effect in closure["effects"] if not effect["candidate"]]
         suffix = "_after" if added or closure["outlier_files"] else ""
-    fit = {name: store.read(f"{name}{suffix}") for name in FITS["fit-steady"]}
+    fit = {name: store.read(f"{name}{suffix}") for name in MADE["fit-steady"]}
     taken_out = [{key: effect[key] for key in ("id", "label", "reference")} for effect in added]
     return (store.read(f"steady{suffix}"), fit), taken_out
 

@@ -21,16 +21,7 @@ from sealfit.store.staged_writes import Staged
 if TYPE_CHECKING:
     import pandas as pd
 
-INGESTED = tuple(table.name for table in schemas.INGESTED)
-CLOSED = tuple(table.name for table in schemas.LOOP)
-FITS = {
-    "fit-steady": ("steady_fit", "steady_covariance", "steady_shift"),
-    "fit-aging": ("aging_fit", "aging_covariance", "aging_curves", "aging_laws", "master_curve"),
-    "fit-dynamic": ("dynamic_fit", "dynamic_curves"),
-}
-FITTED = tuple(name for names in FITS.values() for name in names)
-AFTER = tuple(f"{name}_after" for name in ("steady", *FITTED))
-MADE = {"ingest": INGESTED, **FITS, "close-loop": (*CLOSED, *AFTER)}  # tables by the step that makes them
+MADE = {step: tuple(table.name for table in made) for step, made in schemas.MADE.items()}
 TABLES = tuple(name for names in MADE.values() for name in names)
 OF_PROPERTIES = ("property_values", "aging_fit", "aging_curves", "aging_laws", "master_curve")
 BESIDE = tuple(table.name for table in schemas.BESIDE)

@@ -390,10 +390,19 @@ AGING_CURVES = table(
     Column("hi95", "upper end of its 95 % interval"),
 )
 
-INGESTED = (INPUTS, RUNS, QUALITY, TRACES, TRACES_MEAN, STEADY, BINS)
-FITTED = (STEADY_FIT, AGING_FIT, AGING_CURVES, AGING_LAWS, MASTER_CURVE, DYNAMIC_FIT, DYNAMIC_CURVES)
+_FITS = {
+    "fit-steady": (STEADY_FIT, STEADY_COVARIANCE, STEADY_SHIFT),
+    "fit-aging": (AGING_FIT, AGING_COVARIANCE, AGING_CURVES, AGING_LAWS, MASTER_CURVE),
+    "fit-dynamic": (DYNAMIC_FIT, DYNAMIC_CURVES),
+}
+_FITTED = [fitted for made in _FITS.values() for fitted in made]
 BESIDE = (STEADY_COVARIANCE, STEADY_SHIFT, AGING_COVARIANCE)  # of the parameters of a fit
+FITTED = tuple(fitted for fitted in _FITTED if fitted not in BESIDE)
 LOOP = (EFFECTS, RESIDUALS_BEFORE, RESIDUALS_AFTER, LEVELS, CHANNELS, SHAPES, SHAPE_POINTS, CURVES)
-AFTER = (STEADY_AFTER, *(replace(fitted, name=f"{fitted.name}_after") for fitted in (*FITTED, *BESIDE)))
-_ALL = (*INGESTED, *FITTED, PROPERTY_VALUES, *BESIDE, *LOOP, *AFTER)
-SCHEMAS = {schema.name: schema for schema in _ALL}
+AFTER = (STEADY_AFTER, *(replace(fitted, name=f"{fitted.name}_after") for fitted in _FITTED))
+MADE = {  # by the step that makes them
+    "ingest": (INPUTS, RUNS, QUALITY, TRACES, TRACES_MEAN, STEADY, BINS),
+    **_FITS,
+    "close-loop": (*LOOP, *AFTER),
+}
+SCHEMAS = {schema.name: schema for made in (*MADE.values(), (PROPERTY_VALUES,)) for schema in made}

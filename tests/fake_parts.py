@@ -7,9 +7,8 @@ import pandas as pd
 from small_tables import small
 
 from sealfit.errors import Fault
-from sealfit.pipeline import CLOSED
 from sealfit.store.manifest import fingerprint
-from sealfit.tables import AFTER
+from sealfit.tables import AFTER, LOOP
 
 FAULT = Fault(
     "not_a_number",
@@ -173,7 +172,7 @@ class Parts:
         self._called("close-loop", config)
         self.workers = workers
         on_progress("trying ripple along displacement_mm")
-        tables = {name: small(name) for name in CLOSED}
+        tables = {schema.name: small(schema.name) for schema in LOOP}
         if not self.closure["effects"]:
             tables["shapes"] = tables["shapes"].iloc[:0]
         return SimpleNamespace(

@@ -22,7 +22,7 @@ from sealfit.closure import loop
 from sealfit.engine.run_map import Cluster, on_cluster, run_map
 from sealfit.errors import RequestError, WorkerError
 from sealfit.ingest import partitions
-from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED, STEPS, run
+from sealfit.pipeline import MADE, STEPS, TABLES, run
 from sealfit.progress import Silent
 from sealfit.simulation import load_spec, simulate
 from sealfit.store import Store
@@ -163,7 +163,7 @@ class KillsAt(Silent):
 
 def results(out):
     store = Store.open(out)
-    tables = {name: store.read(name) for name in (*INGESTED, *FITTED, *CLOSED, *AFTER)}
+    tables = {name: store.read(name) for name in TABLES}
     return tables, json.loads((out / "closure.json").read_text("utf-8"))
 
 
@@ -241,7 +241,7 @@ def test_files_read_on_a_cluster_give_the_same_although_a_worker_is_killed(
     run(folder, tmp_path / "there", rig, steps=("ingest",), scheduler=str(dask.file), progress=kills)
     assert kills.killed
     there = Store.open(tmp_path / "there")
-    for name in INGESTED:
+    for name in MADE["ingest"]:
         pdt.assert_frame_equal(there.read(name), here[name], check_exact=True, obj=name)
 
 

@@ -21,11 +21,11 @@ from drawing_helpers import undrawn
 from truths import true_force
 
 from sealfit.cli import app, exit_code
-from sealfit.pipeline import AFTER, CLOSED, FITTED, INGESTED
+from sealfit.pipeline import MADE, TABLES
 from sealfit.simulation import load_truth
 from sealfit.store import Store
 from sealfit.store.manifest import STEPS
-from sealfit.tables import SCHEMAS
+from sealfit.tables import AFTER, SCHEMAS
 
 SPEC = """
 name = "pipeline"
@@ -76,7 +76,7 @@ def started(*arguments):
 
 
 def tables(out):
-    return {name: pd.read_parquet(out / f"{name}.parquet") for name in (*INGESTED, *FITTED, *CLOSED, *AFTER)}
+    return {name: pd.read_parquet(out / f"{name}.parquet") for name in TABLES}
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def first(campaign):
 
 def test_a_run_gives_every_table_with_its_schema(first):
     out, _ = first
-    for name in (*INGESTED, *FITTED, *CLOSED, *AFTER):
+    for name in TABLES:
         schema = ds.dataset(out / f"{name}.parquet", partitioning=None).schema
         fixed = SCHEMAS[name].columns
         assert schema.names[: len(fixed)] == [column.name for column in fixed]
@@ -119,7 +119,7 @@ def test_closure_json_has_every_key_and_no_nan(first):
 
 def test_where_nothing_is_missing_after_is_before(first):
     out, _ = first
-    assert all(pd.read_parquet(out / f"{name}.parquet").empty for name in AFTER)
+    assert all(pd.read_parquet(out / f"{after.name}.parquet").empty for after in AFTER)
     assert set(pd.read_parquet(out / "aging_fit.parquet")["model"]) == {"before"}
     asked = ("lifetime", out, "--threshold", "0.75", "--json")
     after, before = (json.loads(sealfit(*asked, *model).stdout) for model in ((), ("--model", "before")))
@@ -163,7 +163,7 @@ def test_a_second_run_redoes_nothing_and_says_the_same(first, campaign):
 def test_results_do_not_depend_on_the_number_of_workers(first, campaign, tmp_path):
     out, _ = first
     sealfit("ingest", campaign, "--out", tmp_path / "out", "--workers", 1)
-    for name in INGESTED:
+    for name in MADE["ingest"]:
         one, many = (pd.read_parquet(folder / f"{name}.parquet") for folder in (tmp_path / "out", out))
         pd.testing.assert_frame_equal(one, many)
 

@@ -364,7 +364,7 @@ class Lifetime(dict):
 
 
 def _step_of(table: str) -> str:
-    made = {**pipeline.MADE, "fit-aging": (*pipeline.FITS["fit-aging"], *pipeline.OF_PROPERTIES)}
+    made = {**pipeline.MADE, "fit-aging": (*pipeline.MADE["fit-aging"], *pipeline.OF_PROPERTIES)}
     step = next((step for step, names in made.items() if table in names), None)
     if step is None:
         raise RequestError(f"there is no table '{table}'.", fix=_nearest(table, pipeline.TABLES))

@@ -26,7 +26,7 @@ from sealfit.fit.joint.model import Term, evaluate
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.steady import fit_conditions
 from sealfit.fit.steady.uncertainty import shifts_of
-from sealfit.pipeline import FITS
+from sealfit.pipeline import MADE
 from sealfit.tables import AFTER, AGING_FIT, SCHEMAS
 
 SCATTER = {"setup": 0.003, "specimen": 0.005, "bins": 10}
@@ -58,7 +58,7 @@ def warmed():
 
 def conditions_of(tables):
     """Return the fits of the conditions without the effects."""
-    return {name: tables[f"{name}_after"] for name in FITS["fit-steady"]}
+    return {name: tables[f"{name}_after"] for name in MADE["fit-steady"]}
 
 
 def made_traces(bins):
@@ -184,7 +184,7 @@ def test_starts_are_fitted_to_forces_without_the_offset():
         "speed_set_mm_s": 1.0,
     }
     steady = pd.DataFrame([{**steady, "load_N": 50.0, "force_N": 30.0, "effects_start_N": 2.0, "used": True}])
-    none = {name: pd.DataFrame(columns=SCHEMAS[name].names()) for name in FITS["fit-steady"]}
+    none = {name: pd.DataFrame(columns=SCHEMAS[name].names()) for name in MADE["fit-steady"]}
     traces = trace.assign(steady=distance > 3.0)
     curve = fit_dynamic(traces, steady, none, Config())["dynamic_curves"]
     assert curve["force_N"].max() == pytest.approx(30.0, abs=0.01)

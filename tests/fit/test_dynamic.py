@@ -17,7 +17,7 @@ from sealfit.fit.steady import fit_conditions
 from sealfit.ingest import partitions
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.physics import LuGre
-from sealfit.pipeline import FITS, STEPS, run
+from sealfit.pipeline import MADE, STEPS, run
 from sealfit.simulation import Spec, simulate
 from sealfit.store import Store
 
@@ -261,7 +261,7 @@ def stored(tmp_path_factory):
         patch.setattr(partitions, "PART_FILES", 20)
         run(SIMULATED, out, steps=STEPS[:2])
     store = Store.open(out)
-    tables = store.read("steady"), {name: store.read(name) for name in FITS["fit-steady"]}
+    tables = store.read("steady"), {name: store.read(name) for name in MADE["fit-steady"]}
     return store, tables, fit_dynamic(store.read("traces"), *tables, store.config)
 
 
