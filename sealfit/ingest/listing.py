@@ -53,12 +53,9 @@ class Entry:
 def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, list[Fault]]:
     """Return the trace files of a campaign in order, what runs.csv says of them, and what was found amiss.
 
-    Without a table of runs the config's glob finds the files, in natural order (2 before 10). CampaignError
-    if there is no folder, or neither runs.csv nor a glob, or runs.csv cannot be read as a table.
+    The folder is one that `paths.campaign_folder` accepts: without a table of runs the config's glob finds
+    the files, in natural order (2 before 10). CampaignError if runs.csv cannot be read as a table.
     """
-    if not campaign.is_dir():
-        what = "is not a folder." if campaign.exists() else "does not exist."
-        raise stopped("missing_folder", f"the campaign folder '{campaign}' {what}", "Check the path.")
     cells: Columns = {}
     if table := _runs_table(campaign, config):
         lines, cells, faults = read_table(campaign, table, config, needed="file")
@@ -68,12 +65,8 @@ def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, 
         entries = [Entry(file, line, table) for file, line in zip(files, lines, strict=True)]
         entries, found = _with_whole_paths(campaign, entries, table)
         faults += found
-    elif config.files.glob is not None:
-        entries, faults = _by_glob(campaign, config)
     else:
-        count = sum(1 for _ in campaign.rglob("*.csv"))
-        fix = f"Write one (the folder holds {count} CSV files), or give a config with files.glob."
-        raise stopped("missing_file", f"there is no {RUNS_CSV} in '{campaign}'.", fix, file=RUNS_CSV)
+        entries, faults = _by_glob(campaign, config)
     outside = {entry.file for entry in entries if inside(campaign, entry.file) is None}
     faults = faults + _paths(campaign, entries, outside) + _unlisted(campaign, entries, outside, config)
     return entries, cells, faults

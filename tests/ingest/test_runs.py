@@ -6,6 +6,7 @@ from trace_helpers import DAYS, campaign, channels, config, faults, trace
 from sealfit.errors import CampaignError
 from sealfit.ingest.columns import keys_of
 from sealfit.ingest.runs import list_traces
+from sealfit.store.paths import campaign_folder
 
 FULL = """
 file,run_id,repeat,specimen_id,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s,started_at,batch,humidity_pct
@@ -267,11 +268,12 @@ def test_one_trace_file_whose_name_is_longer_than_a_file_system_takes_is_missing
 
 
 def test_missing_folder_table_traces_and_links_out(tmp_path):
-    assert faults(tmp_path / "no")[0].check == "missing_folder"
+    with pytest.raises(CampaignError, match="there is no such folder"):
+        campaign_folder(tmp_path / "no", config())
     (tmp_path / "c").mkdir()
     trace(tmp_path, "c/a.csv")
-    (fault,) = faults(tmp_path / "c")
-    assert "the folder holds 1 CSV files" in fault.fix
+    with pytest.raises(CampaignError, match=r"has no runs\.csv.* Files here: a\.csv\."):
+        campaign_folder(tmp_path / "c", config())
     (tmp_path / "secret.csv").write_text(FULL)
     (tmp_path / "c" / "runs.csv").symlink_to(tmp_path / "secret.csv")
     assert faults(tmp_path / "c")[0].check == "path_outside"
