@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import errno
+import os
 import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -180,8 +181,11 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return by_case[0] if by_case else folded[close[0]] if close else ""
 
 
-def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
-    """Return a fix for a missing path: the nearest name that `fits`, beside it or its folder; "" if none."""
+def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir, campaign: Path | None = None) -> str:
+    """Return a fix for a missing path: the nearest name that `fits`, beside it or its folder; "" if none.
+
+    With `campaign` the path is given as a trace file's, relative to that folder.
+    """
     parent = path.absolute().parent
     missing = None
     while not parent.is_dir():
@@ -197,6 +201,7 @@ def did_you_mean(path: Path, fits: Callable[[Path], bool] = Path.is_dir) -> str:
     names = {Path(name).stem: name for name in there}
     likely = names.get(nearest(wanted.stem, names), "")
     meant = parent / likely if missing else path.parent / likely
+    meant = meant if campaign is None else os.path.relpath(meant, campaign)
     return f"Did you mean {quoted(meant)}?" if likely else ""
 
 

@@ -112,7 +112,7 @@ def _read(campaign: Path, file: str, size: int = -1) -> tuple[bytes, os.stat_res
             with path.open("rb") as opened:
                 status, raw = os.fstat(opened.fileno()), opened.read(size)
         except FileNotFoundError:
-            reason, fix = "does not exist.", did_you_mean(path, Path.is_file)
+            reason, fix = "does not exist.", did_you_mean(path, Path.is_file, campaign)
             if path.is_symlink():
                 reason = f"is a link to '{path.readlink()}', which does not exist."
                 fix = "Copy the file itself into the campaign."

@@ -263,8 +263,11 @@ def test_missing_folders_links_and_paths_outside_are_refused(tmp_path):
     for file in ("../secret.csv", str(tmp_path / "secret.csv"), "link.csv", "C:\\secret.csv", "."):
         with pytest.raises(BadFile, match="outside the campaign"):
             read_trace(tmp_path / "c", TraceRef(file, {}), config())
-    with pytest.raises(BadFile, match=r"Did you mean .*Run\.csv\?"):
+    with pytest.raises(BadFile, match=r"Did you mean Run\.csv\?"):
         read_trace(tmp_path / "c", TraceRef("run.csv", {}), config())
+    (tmp_path / "c" / "raw").mkdir()
+    with pytest.raises(BadFile, match=r"Did you mean raw\?"):
+        read_trace(tmp_path / "c", TraceRef("row/run.csv", {}), config())
     with pytest.raises(BadFile, match="Paths are relative to the folder"):
         read_trace(tmp_path / "c", TraceRef("x/run.csv", {}), config())
 
