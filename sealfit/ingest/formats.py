@@ -20,6 +20,8 @@ from pathlib import PurePosixPath
 from types import ModuleType
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from sealfit.config import TraceFormat
 from sealfit.errors import NOTED, CampaignError, Fault, SealfitError
@@ -331,14 +333,18 @@ MOST_CELLS = 2 * 10**8
 
 
 def _parquet(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    opened = pq.ParquetFile(pa.BufferReader(raw), page_checksum_verification=True)
-    about = {k: v for k, v in (opened.schema_arrow.metadata or {}).items() if k not in _OF_WRITERS}
-    header = [_header_line(k.decode(), v.decode("utf-8", "replace")) for k, v in about.items()]
+    about = pq.read_schema(pa.BufferReader(raw)).metadata or {}
+    said = ((key.decode(), about[key].decode("utf-8", "replace")) for key in about if key not in _OF_WRITERS)
+    header = [_header_line(*one) for one in said]
     if head:
         return Arrays(tuple(header))
+    columns = parquet_columns(raw)
+    return _arrays(header, {name: _from_arrow(column) for name, column in columns.items()}, settings)
+
+
+def parquet_columns(raw: bytes) -> dict[str, pa.ChunkedArray]:
+    """Return the columns of a Parquet file without an index of pandas's; BadFile if two have one name."""
+    opened = pq.ParquetFile(pa.BufferReader(raw), page_checksum_verification=True)
     rows, columns = opened.metadata.num_rows, opened.metadata.num_columns
     if rows * columns > MOST_CELLS:
         reason = f"has {rows} rows of {columns} columns; at most {MOST_CELLS:,} cells are read from one file."
@@ -347,12 +353,10 @@ def _parquet(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
     names = [name for name in table.column_names if not name.startswith("__index_level_")]
     if len(set(names)) < len(names):
         raise bad_file("duplicate_column", "has two columns of one name.", "Rename one.")
-    return _arrays(header, {name: _from_arrow(table.column(name)) for name in names}, settings)
+    return {name: table.column(name) for name in names}
 
 
-def _from_arrow(column) -> np.ndarray:
-    import pyarrow as pa
-
+def _from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     kind = column.type
     if pa.types.is_dictionary(kind):
         column, kind = column.cast(kind.value_type), kind.value_type

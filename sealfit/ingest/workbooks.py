@@ -15,7 +15,7 @@ from pathlib import Path
 from sealfit.config import Config
 from sealfit.errors import nearest
 from sealfit.ingest.files import as_utf8, bad_file, read_bytes
-from sealfit.ingest.formats import CALLED, damage_named, kind_of, library, value_text
+from sealfit.ingest.formats import CALLED, damage_named, kind_of, library, parquet_columns, value_text
 
 HEAD_ROWS = 1000  # a header longer than this is no header
 LONGEST = object()  # stands for the sheet with the most rows
@@ -179,12 +179,7 @@ def text_of_runs(campaign: Path, file: str, config: Config) -> tuple[bytes, str]
 
 
 def _parquet_text(raw: bytes) -> bytes:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    file = pq.ParquetFile(pa.BufferReader(raw), page_checksum_verification=True)
-    table = file.read(use_threads=False)
-    table = table.select([name for name in table.column_names if not name.startswith("__index_level_")])
-    rows = zip(*(column.to_pylist() for column in table.columns), strict=True)
-    lines = ["\t".join(_cell(value, ".") for value in row) for row in (table.column_names, *rows)]
+    columns = parquet_columns(raw)
+    rows = zip(*(column.to_pylist() for column in columns.values()), strict=True)
+    lines = ["\t".join(_cell(value, ".") for value in row) for row in (columns, *rows)]
     return "\n".join(lines).encode("utf-8", "replace")

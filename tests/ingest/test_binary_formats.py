@@ -30,6 +30,7 @@ from sealfit.errors import BadFile, CampaignError
 from sealfit.ingest import formats
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.columns import TraceRef
+from sealfit.ingest.listing import read_table
 from sealfit.ingest.reader import read_header, read_trace
 from sealfit.pipeline import ingest
 
@@ -454,3 +455,5 @@ def test_a_parquet_file_with_too_many_cells_is_left_out(tmp_path, monkeypatch):
     assert read(tmp_path, "t.parquet") is not None
     monkeypatch.setattr(formats, "MOST_CELLS", cells - 1)
     assert f"at most {cells - 1:,} cells" in refused(tmp_path, "t.parquet").reason
+    with pytest.raises(CampaignError, match=f"at most {cells - 1:,} cells"):  # as a table of runs, too
+        read_table(tmp_path, "t.parquet", config())
