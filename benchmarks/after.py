@@ -26,7 +26,7 @@ from loop_summary import coverage
 
 from sealfit.closure.after import after_fits
 from sealfit.closure.loop import close_loop
-from sealfit.config import load_config
+from sealfit.config import Config
 from sealfit.engine import one_thread
 from sealfit.fit.aging import fit_series
 from sealfit.fit.aging.all_series import law_of
@@ -43,7 +43,7 @@ DAYS = 10.0
 
 def count(kind: str, seed: int, strength: str) -> list[Entry]:
     """Return the intervals of one campaign, and which effects were found."""
-    spec, config = campaign(kind, seed=seed, strength=strength), load_config()
+    spec, config = campaign(kind, seed=seed, strength=strength), Config()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "campaign"
         simulate(spec, place)

@@ -23,7 +23,7 @@ import numpy as np
 from loop_summary import coverage
 from steady_tables import MU_C, MU_S, steady_rows
 
-from sealfit.config import Config, load_config
+from sealfit.config import Config
 from sealfit.engine import one_thread
 from sealfit.fit.aging import fit_series
 from sealfit.fit.aging.all_series import aged_values
@@ -203,7 +203,7 @@ def dynamic(settings: tuple[dict, dict], seed: int) -> Iterator[Entry]:
 
 
 def _dynamic_fit(physics: dict, design: dict, noise: Sequence[dict], seed: int):
-    config = load_config()
+    config = Config()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "campaign"
         simulate(Spec(seed=seed, physics=physics, design={**ONE, **design}, noise=tuple(noise)), place)

@@ -19,7 +19,7 @@ from campaigns import campaign, names
 from counts import bounds
 
 from sealfit.closure.loop import close_loop
-from sealfit.config import load_config
+from sealfit.config import Config
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.simulation import simulate
 
@@ -27,7 +27,7 @@ from sealfit.simulation import simulate
 def close(name: str, seed: int, *, size: str, strength: str) -> tuple[dict, float]:
     """Return closure.json of one simulated campaign and the CPU seconds of the loop."""
     spec = campaign(name, seed=seed, size=size, strength=strength)
-    config = load_config()
+    config = Config()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "campaign"
         simulate(spec, place)

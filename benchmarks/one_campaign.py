@@ -23,7 +23,7 @@ from sealfit.closure.predict import predict
 from sealfit.closure.ripple_selection import numbered
 from sealfit.closure.score_test import project
 from sealfit.closure.subsampling import merged_bins
-from sealfit.config import load_config
+from sealfit.config import Config
 from sealfit.fit.joint import fitted_at
 from sealfit.fit.joint.model import Model, evaluate
 from sealfit.fit.joint.rows import Rows, make_rows
@@ -78,7 +78,7 @@ def run_campaign(task: Task) -> dict:
     clock, wall = Clock(), time.monotonic()
     strength = "medium" if task.strength == "-" else task.strength
     spec = campaign(task.kind, seed=task.draw, size=task.size, strength=strength)
-    config = load_config()
+    config = Config()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "campaign"
         with clock.part("simulate"):

@@ -28,7 +28,7 @@ from counts import bounds
 
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
-from sealfit.config import load_config
+from sealfit.config import Config
 from sealfit.errors import SealfitError
 from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
@@ -151,7 +151,7 @@ def write(folder: Path, rig: Rig, ratio: float, seed: int) -> None:
 
 def one(rig: Rig, ratio: float, seed: int) -> dict:
     """Return what one campaign gives."""
-    config = load_config()
+    config = Config()
     with tempfile.TemporaryDirectory() as place:
         write(Path(place), rig, ratio, seed)
         tables = ingest_campaign(Path(place), config).tables

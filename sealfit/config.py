@@ -506,12 +506,7 @@ class Config(Strict):
         return [name for name in self.condition if name != "aging_days"]
 
 
-def load_config(path: Path | None = None) -> Config:
-    """Return the config at `path`, or the default that ships inside the package; ConfigError for a fault."""
-    return parse_config(read_config(path), "default.toml" if path is None else str(path))
-
-
-def read_config(path: Path | None = None) -> str:
+def read_config(path: Path | None) -> str:
     """Return the text of the config at `path`, or of the default in the package; errors as `read_toml`."""
     if path is None:
         return files("sealfit").joinpath("configs/default.toml").read_text("utf-8")
@@ -532,7 +527,7 @@ def read_toml(path: Path, fix: str) -> str:
 
 
 def parse_config(text: str, name: str) -> Config:
-    """Return the config written in `text`, which messages call `name`; errors as `load_config`."""
+    """Return the config written in `text`, which messages call `name`; errors as `parse_toml`."""
     return parse_toml(Config, text, name, "docs/reference/config.md has every key.")
 
 

@@ -15,7 +15,7 @@ from many_files import MU_C, MU_S, SIGMA_2, V_S, add_files, design_for, write_ca
 from process_tree import watched
 from speed_growth import DESIGNS, many_conditions
 
-from sealfit.config import load_config
+from sealfit.config import Config
 from sealfit.fit.steady import fit_conditions
 from sealfit.ingest.campaign import ingest_campaign
 
@@ -28,9 +28,9 @@ def short(tmp_path_factory):
 
 
 def test_short_traces_are_read_without_a_fault_and_fit_their_law(short):
-    ingested = ingest_campaign(short, load_config())
+    ingested = ingest_campaign(short, Config())
     assert ingested.faults == []
-    fits = fit_conditions(ingested.tables["steady"], load_config())
+    fits = fit_conditions(ingested.tables["steady"], Config())
     unaged = fits["steady_fit"].query("condition == 'unaged' and quantity == 'steady'")
     unaged = unaged.set_index("parameter")["value"]
     wanted = {"mu_s": MU_S["mu_0"], "mu_c": MU_C["mu_0"], "v_s": V_S, "sigma_2": SIGMA_2}
@@ -100,7 +100,7 @@ def test_added_files_are_a_new_run_of_a_condition_that_was_there(tmp_path):
     assert added["run_id"].nunique() == 1
     assert not set(added["run_id"]) & set(before["run_id"])
     assert added["started_at"].min() > before["started_at"].max()
-    assert ingest_campaign(tmp_path, load_config()).faults == []
+    assert ingest_campaign(tmp_path, Config()).faults == []
 
 
 def test_the_script_finds_the_law_of_the_traces(short):

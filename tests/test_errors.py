@@ -3,12 +3,13 @@ from pathlib import Path
 import pytest
 from trace_helpers import DAYS, campaign, config, trace
 
-from sealfit.config import Config, load_config
+from sealfit.config import Config
 from sealfit.errors import CampaignError, ConfigError, Fault, did_you_mean, grouped, nearest, told
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.quality import quality_table
 from sealfit.progress import Lines
 from sealfit.report.page import quality_findings
+from sealfit.store.manifest import ConfigCopy
 
 FIX = 'Set decimal = "," in the rig config.'
 
@@ -200,6 +201,6 @@ def test_each_of_several_faults_of_a_config_has_its_line():
 def test_a_mistyped_config_is_answered_with_the_nearest_file_beside_it(tmp_path):
     (tmp_path / "rig.toml").write_text("")
     with pytest.raises(ConfigError, match=r"Did you mean .*rig\.toml\?"):
-        load_config(tmp_path / "rog.toml")
+        ConfigCopy.at(tmp_path / "rog.toml").parse()
     with pytest.raises(ConfigError, match=r"Check --config\."):
-        load_config(tmp_path / "other.ini")
+        ConfigCopy.at(tmp_path / "other.ini").parse()

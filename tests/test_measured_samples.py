@@ -13,8 +13,8 @@ from bins_helpers import THREE_FOLDS
 from page_helpers import DOCS, ROOT, as_in_a_clone, assert_as_shown, ran
 
 from sealfit.closure.loop import close_loop
-from sealfit.config import load_config
 from sealfit.ingest.campaign import ingest_campaign
+from sealfit.store.manifest import ConfigCopy
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def tutorial(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pneuseal():
-    config = load_config(ROOT / "configs" / "pneuseal.toml")
+    config = ConfigCopy.at(ROOT / "configs" / "pneuseal.toml").parse()
     config = config.model_copy(update={"loop": THREE_FOLDS.loop})
     tables = ingest_campaign(ROOT / "sample_data" / "measured" / "pneuseal-repeats", config).tables
     return close_loop(tables["bins"], tables["traces"], config)

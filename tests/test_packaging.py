@@ -11,7 +11,8 @@ import pytest
 from pydantic import BaseModel
 
 from sealfit import __version__
-from sealfit.config import Config, load_config
+from sealfit.config import Config
+from sealfit.store.manifest import ConfigCopy
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
@@ -28,7 +29,7 @@ def test_the_version_is_said_once():
 
 def test_the_default_config_ships_inside_the_package():
     text = files("sealfit").joinpath("configs/default.toml").read_text("utf-8")
-    assert load_config() == Config.model_validate(tomllib.loads(text)) == Config()
+    assert ConfigCopy.at(None).parse() == Config.model_validate(tomllib.loads(text)) == Config()
 
 
 def test_every_data_file_of_the_package_is_declared():
@@ -52,7 +53,7 @@ def test_every_folder_with_code_is_a_package():
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.toml")), ids=lambda path: path.name)
 def test_every_config_that_ships_is_sound(path):
-    assert load_config(path).condition
+    assert ConfigCopy.at(path).parse().condition
 
 
 def test_every_key_of_a_config_has_a_meaning():

@@ -58,8 +58,8 @@ from pollution import (
 )  # fmt: skip
 
 from sealfit.cli import app, exit_code
-from sealfit.config import load_config
 from sealfit.errors import SealfitError
+from sealfit.store.manifest import ConfigCopy
 from sealfit.store.staged_writes import LOCK
 
 LIMIT_S = 10
@@ -176,7 +176,7 @@ def inputs(work: Path, seed: int) -> dict[str, tuple[bytes, Callable[[bytes], ob
 
     def config(raw: bytes) -> object:
         (folder / "rig.toml").write_bytes(raw)
-        return load_config(folder / "rig.toml")
+        return ConfigCopy.at(folder / "rig.toml").parse()
 
     table = trace_rows(seed)
     found = {

@@ -45,7 +45,7 @@ from polluters import SURVEY, Polluted, Rows, polluted, text_of
 
 from sealfit import __version__, commands
 from sealfit.closure.prediction_csv import ANSWERS
-from sealfit.config import load_config, parse_config
+from sealfit.config import parse_config
 from sealfit.errors import Fault, SealfitError
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.columns import TraceRef
@@ -53,6 +53,7 @@ from sealfit.ingest.property_table import read_properties
 from sealfit.ingest.reader import read_trace
 from sealfit.pipeline import STEPS, run
 from sealfit.simulation import load_spec, simulate
+from sealfit.store.manifest import ConfigCopy
 
 BAD = ("wrong", "lost", "traceback")
 CONFIG = 'condition = ["aging_days"]\n'
@@ -376,12 +377,12 @@ def config_outcomes(work: Path) -> list[Outcome]:
     clean_text = CONFIG_TEXT.replace('[units]\nforce = "N"\n', "")
     path = Path(tempfile.mkdtemp(dir=work)) / "rig.toml"
     path.write_text(clean_text)
-    clean, found = load_config(path), []
+    clean, found = ConfigCopy.at(path).parse(), []
     for kind, raw in _configs(clean_text):
         path.write_bytes(raw)
         about = ("config", kind, "")
         try:
-            same = load_config(path) == clean
+            same = ConfigCopy.at(path).parse() == clean
             other = " = " in kind or "other case" in kind  # these say something else
             found.append(
                 Outcome(*about, "exact" if same or other else "wrong", "" if same else "another config")

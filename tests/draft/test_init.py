@@ -13,12 +13,13 @@ import pandas as pd
 import pytest
 
 from sealfit import cli
-from sealfit.config import load_config, parse_config
+from sealfit.config import parse_config
 from sealfit.draft import draft
 from sealfit.errors import RequestError
 from sealfit.ingest import workbooks
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.runs import list_traces
+from sealfit.store.manifest import ConfigCopy
 
 
 @pytest.fixture
@@ -48,7 +49,7 @@ def test_a_draft_is_written_here_and_the_next_command_works(sealfit, campaign):
     before = {path: path.read_bytes() for path in campaign.rglob("*.asc")}
     code, out, err = sealfit("init", campaign)
     assert (code, err) == (0, "")
-    assert load_config("rig.toml").name == "raw data"
+    assert ConfigCopy.at(Path("rig.toml")).parse().name == "raw data"
     assert os.listdir() == ["rig.toml"]
     assert {path: path.read_bytes() for path in campaign.rglob("*") if path.is_file()} == before
     *_, last = out.splitlines()
@@ -93,7 +94,7 @@ def test_a_file_that_is_there_is_kept_unless_forced(sealfit, campaign):
     )
     assert Path("rig.toml").read_text() == "mine"
     assert sealfit("init", campaign, "--force")[0] == 0
-    assert load_config("rig.toml")
+    assert ConfigCopy.at(Path("rig.toml")).parse()
 
 
 def test_only_toml_files_are_written(sealfit, campaign):

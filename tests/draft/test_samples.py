@@ -4,11 +4,12 @@ from pathlib import Path
 
 import numpy.testing as npt
 
-from sealfit.config import load_config, parse_config
+from sealfit.config import parse_config
 from sealfit.draft import draft
 from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
+from sealfit.store.manifest import ConfigCopy
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = ROOT / "sample_data"
@@ -20,7 +21,7 @@ def both(campaign, config, edit=lambda text: text):
     return (
         made,
         parse_config(edit(made.text), "rig.toml"),
-        load_config(ROOT / "configs" / config if config else None),
+        ConfigCopy.at(ROOT / "configs" / config if config else None).parse(),
     )
 
 

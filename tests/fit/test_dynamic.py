@@ -8,7 +8,7 @@ import pandas.testing as pdt
 import pytest
 from bristle_helpers import integrated
 
-from sealfit.config import load_config
+from sealfit.config import Config
 from sealfit.fit.dynamic import bristle_rows, fit_dynamic
 from sealfit.fit.dynamic.bristle_model import RisingStroke, StribeckCurve
 from sealfit.fit.dynamic.presliding import fit_stiffness
@@ -20,6 +20,7 @@ from sealfit.physics import LuGre
 from sealfit.pipeline import MADE, STEPS, run
 from sealfit.simulation import Spec, simulate
 from sealfit.store import Store
+from sealfit.store.manifest import ConfigCopy
 
 MODEL = {"mu_s": 0.9, "mu_c": 0.6, "v_s": 5.0, "sigma_2": 0.05, "sigma_0": 100.0, "sigma_1": 0.5}
 LOAD = 49.03
@@ -80,7 +81,7 @@ def test_damping_is_not_determined_if_strokes_begin_at_constant_speed(seed):
         strokes.append(RisingStroke(k, k, 1.0, distance, speed * (1 + 1e-5 * rng.standard_normal(40)), noisy))
     found = fit_stiffness(strokes, curve)
     assert found.sigma_0 == pytest.approx(40.0, rel=0.02)
-    row = list(bristle_rows(found, curve, load_config()))[1]
+    row = list(bristle_rows(found, curve, Config()))[1]
     assert not row["identified"]
     assert "constant speed" in row["reason"]
 
@@ -98,7 +99,7 @@ def made(tmp_path, *, physics=(), noise=NOISE, seed=1, effects=(), **design):
     }  # fmt: skip
     design = {"days": (), "temperatures_C": (), "compressions_pct": (), **design}
     simulate(Spec(seed=seed, physics=physics, design=design, noise=noise, effects=effects), tmp_path / "c")
-    config = load_config()
+    config = Config()
     tables = ingest_campaign(tmp_path / "c", config, workers=1).tables
     return tables, fit_dynamic(
         tables["traces"], tables["steady"], fit_conditions(tables["steady"], config), config
@@ -171,7 +172,7 @@ def test_a_peak_of_the_ramp_is_a_break_away_and_noise_is_none(tmp_path):
 
 def test_traces_that_begin_in_steady_sliding_say_so(tmp_path):
     tables, _ = made(tmp_path)
-    config = load_config()
+    config = Config()
     traces = tables["traces"][tables["traces"]["steady"]]
     assert starts_of(strokes_along(traces, tables["steady"])) == []
     found = fit_dynamic(traces, tables["steady"], fit_conditions(tables["steady"], config), config)
@@ -193,7 +194,7 @@ def test_a_sliding_force_along_the_motion_is_said(tmp_path):
     shifted = {
         name: tables[name].assign(force_N=tables[name]["force_N"] + 60.0) for name in ("traces", "steady")
     }
-    config = load_config()
+    config = Config()
     fit = fit_dynamic(
         shifted["traces"], shifted["steady"], fit_conditions(shifted["steady"], config), config
     )["dynamic_fit"]
@@ -216,7 +217,7 @@ def test_a_ramp_of_another_shape_is_followed_by_its_own_speed(tmp_path):
 
 @pytest.mark.skipif(MEASURED is None, reason="SEALFIT_MEASURED names no folder of measured data")
 def test_micro_tribometer(tmp_path):
-    config = load_config(Path(__file__).resolve().parents[2] / "configs" / "microtribo.toml")
+    config = ConfigCopy.at(Path(__file__).resolve().parents[2] / "configs" / "microtribo.toml").parse()
     tables = ingest_campaign(Path(MEASURED) / "microtribo", config, workers=1).tables
     steady = tables["steady"]
     assert steady["direction"].value_counts().to_dict() == {1: 50, -1: 50}

@@ -8,12 +8,13 @@ import pyarrow as pa
 import pytest
 
 from sealfit.closure.channels import channels_of
-from sealfit.config import Bins, Config, Strokes, load_config
+from sealfit.config import Bins, Config, Strokes
 from sealfit.errors import CampaignError
 from sealfit.fit.joint.rows import LEVELS, make_rows
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.columns import force_inputs
 from sealfit.report import summary, summary_lines
+from sealfit.store.manifest import ConfigCopy
 from sealfit.tables import SCHEMAS
 
 TABLES = ["inputs", "runs", "quality", "traces", "traces_mean", "steady", "bins"]
@@ -395,7 +396,7 @@ def test_half_loop_and_offset_of_the_pneumatic_cylinder():
     }
     root = Path(__file__).parents[2]
     made = ingest_campaign(
-        Path(MEASURED) / "pneuseal-repeats", load_config(root / "configs" / "pneuseal.toml")
+        Path(MEASURED) / "pneuseal-repeats", ConfigCopy.at(root / "configs" / "pneuseal.toml").parse()
     )
     bins = made.tables["bins"]
     middle = bins[bins["displacement_mm"].between(7.0, 27.0)]
@@ -419,7 +420,9 @@ def test_half_loop_and_offset_of_the_pneumatic_cylinder():
 @pytest.mark.skipif(MEASURED is None, reason="SEALFIT_MEASURED names no folder of measured data")
 def test_torques_of_the_screw_drives():
     root = Path(__file__).parents[2]
-    made = ingest_campaign(Path(MEASURED) / "screwdrive", load_config(root / "configs" / "screwdrive.toml"))
+    made = ingest_campaign(
+        Path(MEASURED) / "screwdrive", ConfigCopy.at(root / "configs" / "screwdrive.toml").parse()
+    )
     torque = made.tables["steady"].set_index("file")["force_N"]
     for file, known in {"1/{}/50": 2.54, "1/{}/n50": -3.27, "3/{}/50": 1.00, "3/{}/n50": -1.89}.items():
         name = f"raw/driveNo{file.format('steady_state/0.096kg')}.csv"

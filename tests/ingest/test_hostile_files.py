@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 from trace_helpers import HEADER, ROWS, campaign, channels, config, csv_of, read, refused, trace
 
-from sealfit.config import load_config
 from sealfit.errors import BadFile, CampaignError, ConfigError, Fault, grouped, told
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
 from sealfit.ingest.stored_parts import part_key
+from sealfit.store.manifest import ConfigCopy
 
 RUNS = """
 file,aging_days,speed_mm_s
@@ -236,7 +236,7 @@ def test_settings_have_bounds(text):
 def test_a_pipe_is_no_config(tmp_path):
     os.mkfifo(tmp_path / "rig.toml")
     with pytest.raises(ConfigError, match=r"is not a file. Check --config."):
-        load_config(tmp_path / "rig.toml")
+        ConfigCopy.at(tmp_path / "rig.toml").parse()
 
 
 @pytest.mark.parametrize("encoding", ["rot13", "hex", "no-such", "latin-1\\u0000"])

@@ -7,16 +7,16 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 
-from sealfit.config import load_config
 from sealfit.ingest.reader import read_trace
 from sealfit.ingest.runs import list_traces
+from sealfit.store.manifest import ConfigCopy
 
 ROOT = Path(__file__).resolve().parents[2]
 MEASURED = ROOT / "sample_data" / "measured"
 
 
 def campaign(folder, rig):
-    config = load_config(ROOT / "configs" / f"{rig}.toml")
+    config = ConfigCopy.at(ROOT / "configs" / f"{rig}.toml").parse()
     refs, faults = list_traces(MEASURED / folder, config)
     return {ref.file: read_trace(MEASURED / folder, ref, config) for ref in refs}, faults
 

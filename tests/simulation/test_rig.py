@@ -176,7 +176,7 @@ def test_channels_vary_where_they_are_said_to(campaign):
     ids=["one way", "separate files", "strokes in one file"],
 )
 def test_ingest_reads_a_campaign_with_the_default_config_and_finds_the_truth(campaign, tmp_path, design):
-    from sealfit.config import load_config
+    from sealfit.config import Config
     from sealfit.ingest.campaign import ingest_campaign
 
     truth, _, _ = campaign(
@@ -188,7 +188,7 @@ def test_ingest_reads_a_campaign_with_the_default_config_and_finds_the_truth(cam
         ],
         noise=[{"kind": "white", "sd_N": 0.02}],
     )
-    found = ingest_campaign(tmp_path / "c", load_config())
+    found = ingest_campaign(tmp_path / "c", Config())
     bins = found.tables["bins"]
     assert found.faults == []
     assert bins["file"].nunique() == len({row["file"] for row in truth["files"]})
