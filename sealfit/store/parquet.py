@@ -146,32 +146,29 @@ def _check_schema(found: pa.Schema) -> None:
 
 def _array(values: pd.Series | np.ndarray | pa.Array, column: Column, table: str) -> pa.Array:
     try:
-        array = values if isinstance(values, pa.Array) else _of_column(values, column)
+        if isinstance(values, pa.Array):
+            array = values
+        elif column.dtype == TEXT or (column.dtype is None and _holds_words(values)):
+            array = as_words(pd.Series(values))
+        else:
+            array = pa.array(values, type=column.dtype, from_pandas=True)
     except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
         raise ValueError(f"table {table}, column '{column.name}': {error}") from error
     if isinstance(array, pa.ChunkedArray):
         array = array.combine_chunks()
-    if pa.types.is_null(array.type):  # an optional channel without a single value
-        return array.cast(pa.float64())
-    if pa.types.is_large_string(array.type):
-        return array.cast(TEXT)
-    return array
-
-
-def _of_column(values: pd.Series | np.ndarray, column: Column) -> pa.Array | pa.ChunkedArray:
-    if column.dtype == TEXT and isinstance(values.dtype, pd.StringDtype):
-        return pa.array(values, from_pandas=True)
-    if column.dtype == TEXT or (column.dtype is None and _mixed(values)):
-        return as_words(pd.Series(values))
-    return pa.array(values, type=column.dtype, from_pandas=True)
+    # A column without a single value is an optional channel.
+    return array.cast(pa.float64()) if pa.types.is_null(array.type) else array
 
 
 def as_words(values: pd.Series) -> pa.Array:
     """Return values of any kind as words, null where one is missing."""
-    return pa.array(values.map(str, na_action="ignore").astype(object), type=TEXT, from_pandas=True)
+    if not isinstance(values.dtype, pd.StringDtype):
+        values = values.map(str, na_action="ignore").astype(object)
+    return pa.array(values, type=TEXT, from_pandas=True)
 
 
-def _mixed(values: pd.Series | np.ndarray) -> bool:
-    """Whether a channel holds categories, or a mixture of numbers and text, which is stored as text."""
-    categories = isinstance(values.dtype, pd.CategoricalDtype)
-    return categories or (values.dtype == object and any(isinstance(value, str) for value in values))
+def _holds_words(values: pd.Series | np.ndarray) -> bool:
+    """Whether a channel holds words or categories; a mixture with numbers is stored as words, too."""
+    if isinstance(values.dtype, pd.CategoricalDtype | pd.StringDtype):
+        return True
+    return values.dtype == object and any(isinstance(value, str) for value in values)
