@@ -21,14 +21,12 @@ PATTERN_RUNS = 3  # with fewer runs a common pattern of their repeats cannot be 
 class RepeatScatter:
     """Standard deviation of a repeat about its run: `sd_N(force) = sqrt(s0_N^2 + (g |force|)^2)`, with `df`.
 
-    `pattern` holds, per repeat number, the share by which repeats of that number differ from their runs'
-    means. With no repeats at all `df` is 0 and `s0_N` and `g` are NaN.
+    With no repeats at all `df` is 0 and `s0_N` and `g` are NaN.
     """
 
     s0_N: float
     g: float
     df: float
-    pattern: dict[int, float]
 
     def sd_N(self, force_N: np.ndarray | float) -> np.ndarray:
         """Return the standard deviation of one repeat's mean force, in N, at `force_N`, shape (n,)."""
@@ -66,14 +64,14 @@ class RepeatCodes:
     run: np.ndarray
     runs: int
     repeat: np.ndarray
-    numbers: np.ndarray
+    repeats: int
 
     @classmethod
     def of(cls, means: pd.DataFrame) -> RepeatCodes:
         """Return the layout of a table as `repeat_means` returns it."""
         run, names = pd.factorize(means["run_id"])
         repeat, numbers = pd.factorize(means["repeat"], sort=True)
-        return cls(run, len(names), repeat, np.asarray(numbers))
+        return cls(run, len(names), repeat, len(numbers))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +99,11 @@ class ScatterFit:
 def fit_scatter(layout: RepeatCodes, force_N: np.ndarray, kept: np.ndarray) -> ScatterFit:
     """Fit run means, the pattern and the scatter to the rows kept; residuals of every row."""
     count = np.bincount(layout.run[kept], minlength=layout.runs).astype(float)
-    pattern, cost = np.zeros(len(layout.numbers)), 0
+    pattern, cost = np.zeros(layout.repeats), 0
     flat = force_N
     s0_2, g_2, covariance = _variance(layout, flat, kept, count, 0)
     repeated = count[layout.run] > 1
-    present = np.bincount(layout.repeat[kept & repeated], minlength=len(layout.numbers)) >= PATTERN_RUNS
+    present = np.bincount(layout.repeat[kept & repeated], minlength=layout.repeats) >= PATTERN_RUNS
     if present.sum() >= 2 and (count > 1).sum() >= PATTERN_RUNS:
         cost = int(present.sum()) - 1
         for _ in range(3):  # weights of the pattern and the scatter need each other; both settle at once
@@ -116,8 +114,7 @@ def fit_scatter(layout: RepeatCodes, force_N: np.ndarray, kept: np.ndarray) -> S
     residual = flat - mean
     share = np.where(count[layout.run] > 1, 1.0 - 1.0 / np.maximum(count[layout.run], 1.0), 0.0)
     df = max(float(np.maximum(count - 1.0, 0.0).sum()) - cost, 0.0)
-    named = {int(number): float(value) for number, value in zip(layout.numbers, pattern, strict=True)}
-    scatter = RepeatScatter(float(np.sqrt(s0_2)), float(np.sqrt(g_2)), df, named)
+    scatter = RepeatScatter(float(np.sqrt(s0_2)), float(np.sqrt(g_2)), df)
     sd = scatter.sd_N(mean)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(share > 0.0, residual / (sd * np.sqrt(np.where(share > 0.0, share, 1.0))), 0.0)

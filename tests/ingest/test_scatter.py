@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import nnls
 
 from sealfit.ingest.repeat_checks import outlying_repeats
-from sealfit.ingest.scatter import repeat_means, repeat_scatter, two_nonnegative
+from sealfit.ingest.scatter import RepeatCodes, fit_scatter, repeat_means, repeat_scatter, two_nonnegative
 
 S0, G = 0.1, 0.01
 
@@ -28,14 +28,17 @@ def campaign(runs, rng, repeats=3, pattern=(0.02, 0.0, -0.015), shift=0.0):
 
 def test_scatter_and_pattern_of_repeats_are_recovered():
     rng = np.random.default_rng(4)
-    found = [repeat_scatter(campaign(200, rng)) for _ in range(10)]
+    campaigns = [campaign(200, rng) for _ in range(10)]
+    found = [repeat_scatter(means) for means in campaigns]
     assert np.sqrt(np.mean([s.s0_N**2 for s in found])) == pytest.approx(S0, rel=0.15)
     assert np.sqrt(np.mean([s.g**2 for s in found])) == pytest.approx(G, rel=0.05)
     # 200 runs of three have 400 degrees of freedom; the common pattern of three numbers takes two.
     assert found[0].df == 398
-    npt.assert_allclose(
-        [found[0].pattern[k] for k in (1, 2, 3)], np.array([0.02, 0.0, -0.015]) - 0.005 / 3, atol=0.003
-    )
+    means, force = campaigns[0], campaigns[0]["force_N"].to_numpy()
+    fit = fit_scatter(RepeatCodes.of(means), force, np.ones(len(means), bool))
+    taken_out = (force / (fit.mean + fit.residual) - 1.0).reshape(-1, 3)
+    npt.assert_allclose(taken_out, np.tile(taken_out[0], (200, 1)), atol=1e-12)
+    npt.assert_allclose(taken_out[0], np.array([0.02, 0.0, -0.015]) - 0.005 / 3, atol=0.003)
     npt.assert_allclose(found[0].sd_N([0.0, 30.0]), [found[0].s0_N, np.hypot(found[0].s0_N, 30 * found[0].g)])
 
 
