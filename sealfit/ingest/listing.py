@@ -38,16 +38,15 @@ INDEX = ".tdms_index"  # ending of the files that LabVIEW writes beside its trac
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """The place of one trace file in the list, for messages."""
+    """The place of one trace file in the list, for messages; in no table if the glob found it."""
 
     file: str
-    line: int | None = None  # in the table of runs; None where the file was found by the glob
-    table: str = RUNS_CSV
+    line: int | None = None
+    table: str | None = None  # of runs
 
     def fault(self, check: str, reason: str, column: str | None = None, **rest) -> Fault:
         """Return a fault at this entry's place: its line in the table of runs, or the file itself."""
-        place = {"file": self.table, "line": self.line} if self.line is not None else {"file": self.file}
-        return Fault(check, reason, column=column, **place, **rest)
+        return Fault(check, reason, column=column, file=self.table or self.file, line=self.line, **rest)
 
 
 def list_entries(campaign: Path, config: Config) -> tuple[list[Entry], Columns, list[Fault]]:
@@ -285,7 +284,7 @@ def _paths(campaign: Path, entries: list[Entry], outside: set[str]) -> list[Faul
 
 def _unlisted(campaign: Path, entries: list[Entry], outside: set[str], config: Config) -> list[Fault]:
     """Return files that runs.csv omits: beside the traces and of the same ending, or matched by the glob."""
-    if not entries or entries[0].line is None:
+    if not entries or entries[0].table is None:
         return []
     table, listed = entries[0].table, {entry.file for entry in entries}
     there, faults = files_beside(campaign, listed - outside), []

@@ -70,14 +70,13 @@ def join_date_and_time(entries: list[Entry], columns: Columns, config: Config) -
     two = config.files.started_at
     if two is None:
         return columns, []
-    file = entries[0].table if entries[0].line is not None else None
     missing = [name for name in (two.date, two.time) if name not in columns]
     joined: Column = []
     faults = []
     for name in missing:
         reason = "there is no such column, but files.started_at names it."
         fix = suggestion(name, list(columns))
-        faults.append(Fault("missing_column", reason, column=name, fix=fix, file=file))
+        faults.append(Fault("missing_column", reason, column=name, fix=fix, file=entries[0].table))
     if missing:
         return columns, faults
     for i, cells in enumerate(zip(columns[two.date], columns[two.time], strict=True)):
@@ -397,7 +396,7 @@ def _says_more(campaign: Path, ref: TraceRef, columns: Columns, config: Config) 
 
 def _missing(entries: list[Entry], columns: Columns, config: Config) -> list[Fault]:
     """Return faults of condition columns that no source gives: one per column, or one per cell."""
-    faults, table = [], entries[0].table if entries[0].line is not None else None
+    faults, table = [], entries[0].table
     lacking = {name: np.flatnonzero(lack) for name, lack in _lacking(columns, len(entries), config).items()}
     for name, rows in sorted(lacking.items(), key=lambda one: one[1][:1].tolist()):
         if name in columns:
