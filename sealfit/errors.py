@@ -57,9 +57,10 @@ class Fault:
         return {name: getattr(self, name) for name in self.__slots__} | {"value": value}
 
 
-# Severity and action of findings that leave nothing out, and of a stroke that is left out: fields of `Fault`.
+# Severity and action of findings that leave nothing out, a row, or a stroke: fields of `Fault`.
 KEPT = {"severity": "warning", "action": "kept"}
 NOTED = {"severity": "info", "action": "kept"}
+ROW_OUT = {"severity": "warning", "action": "row left out"}
 STROKE_OUT = {"severity": "error", "action": "stroke left out"}
 LONGEST_VALUE = 80  # characters of a cell that a message shows
 LONGEST_PATH = 400  # and of the path of a file

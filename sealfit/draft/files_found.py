@@ -17,10 +17,11 @@ from sealfit.draft.vocabulary import UNAGED, name_and_unit, setting
 from sealfit.errors import BadFile, CampaignError, RequestError, did_you_mean
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
-from sealfit.ingest.listing import RUNS_CSV, is_utf8, natural, read_table
+from sealfit.ingest.listing import is_utf8, natural, read_table
 from sealfit.ingest.runs import time_of
 from sealfit.ingest.workbooks import LONGEST, read_sheet
 from sealfit.store.manifest import STATE
+from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.units import Unit
 
 SNIFFED = 24  # files of one kind of name that are looked at, spread evenly: more would show the same

@@ -19,8 +19,9 @@ from sealfit.draft.file_names import FEW, HEIGHT_FROM, NamePart, Names
 from sealfit.draft.files_found import Found, RunsTable
 from sealfit.errors import ConfigError
 from sealfit.ingest.files import as_number
-from sealfit.ingest.listing import RUNS_CSV, channels_of, name_parts, natural
+from sealfit.ingest.listing import channels_of, name_parts, natural
 from sealfit.ingest.runs import excel_time, usual_formats
+from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.units import Units, conversion
 
 NO_CONDITION = {

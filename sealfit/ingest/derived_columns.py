@@ -16,10 +16,9 @@ from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.columns import UNAGED, Column, Columns, known, mapped, overlaid, put, where
 from sealfit.ingest.expression import evaluate, parse, require_columns
 from sealfit.ingest.files import TEXT_COLUMNS, as_number
-from sealfit.ingest.listing import Entry, stopped
+from sealfit.ingest.listing import NUMBERS, Entry, stopped
 from sealfit.units import Conversion
 
-NUMBERS = ("temperature_C", "compression_ratio_pct", "aging_days", "load_N", "speed_mm_s")
 COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
 _MOSTLY = 0.5  # a column with more numbers than this is one of numbers, and the rest of its cells are slips
 UNAGED_WORDS = ("unaged", "fresh", "new", "rt")  # RT: kept at room temperature

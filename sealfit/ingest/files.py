@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import regex
 
 from sealfit.config import Config, TraceFormat
-from sealfit.errors import BadFile, ConfigError, Fault, did_you_mean, shortened
+from sealfit.errors import ROW_OUT, BadFile, ConfigError, Fault, did_you_mean, shortened
 from sealfit.store.manifest import Fingerprint, fingerprint_of
 
 LINE_ENDS = b"\r\n\x1a"  # the last is DOS's end of a file
@@ -77,8 +77,7 @@ def whole_lines(text: bytes) -> tuple[bytes, Fault]:
     reason = "the last line has no line end, which most files here have: it may be cut within a number."
     line = text.count(b"\n", 0, end) + 1
     fix = "Copy the file again; if it is whole, end its last line."
-    done = {"severity": "warning", "action": "row left out"}
-    return text[:end], Fault("cut_file", reason, line=line, fix=fix, **done)
+    return text[:end], Fault("cut_file", reason, line=line, fix=fix, **ROW_OUT)
 
 
 def bad_file(check: str, reason: str, fix: str, **place) -> BadFile:

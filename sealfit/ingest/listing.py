@@ -13,21 +13,18 @@ from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 
-from sealfit.config import Config, Files
+from sealfit.config import AGING_CONDITION, Config, Files
 from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, ConfigError, Fault, nearest, printable
 from sealfit.ingest.columns import NO_COLUMN, Columns, mapped, suggestion
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import TEXT_COLUMNS, as_number, found_by, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
 from sealfit.store.manifest import found_by_glob, glob_names
-from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.store.paths import runs_tables
 from sealfit.units import Conversion
 
-KNOWN = (
-    "run_id", "repeat", "specimen_id", "temperature_C", "compression_ratio_pct", "aging_days", "load_N",
-    "speed_mm_s", "started_at",
-)  # fmt: skip
+NUMBERS = (*AGING_CONDITION, "load_N", "speed_mm_s")
+KNOWN = (*TEXT_COLUMNS, *NUMBERS, "repeat")
 # Words, and codes of loggers, for no value.
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?", "-999", "-9999", "-99999"}
 PASSED_OVER = {"severity": "info", "action": "file left out"}

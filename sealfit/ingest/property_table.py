@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sealfit.config import Config
-from sealfit.errors import KEPT, CampaignError, Fault, nearest
+from sealfit.errors import KEPT, ROW_OUT, CampaignError, Fault, nearest
 from sealfit.ingest import derived_columns as derived
 from sealfit.ingest.cells import LISTED
 from sealfit.ingest.columns import NO_COLUMN, Columns, keys_of, known, suggestion, where
@@ -129,6 +129,5 @@ def _left_out(entries: list[Entry], rows: pd.DataFrame) -> list[Fault]:
         listed = ", ".join(map(str, lines.head(LISTED))) + (", ..." if len(lines) > LISTED else "")
         reason = f"{len(lines)} rows have no value and are left out: {listed}."
         place = {"file": entries[0].table, "line": int(lines.iloc[0]), "column": name}
-        done = {"severity": "warning", "action": "row left out"}
-        faults.append(Fault("empty_cell", reason, value=float(len(lines)), **place, **done))
+        faults.append(Fault("empty_cell", reason, value=float(len(lines)), **place, **ROW_OUT))
     return faults

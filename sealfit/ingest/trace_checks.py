@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from sealfit.config import Config, Quality
-from sealfit.errors import KEPT, ConfigError, Fault
+from sealfit.errors import KEPT, ROW_OUT, ConfigError, Fault
 from sealfit.ingest.cells import Trace
 from sealfit.ingest.files import bad_file
 from sealfit.ingest.strokes import Stroke, displacement_noise_mm
@@ -96,8 +96,7 @@ def resolution(values: np.ndarray) -> float:
 def _spike(stroke: int | None, column: str, value: float, off: float, line: int) -> Fault:
     reason = f"a single sample, {abs(off):.4g} off its neighbours."
     place = {"stroke": stroke, "line": int(line), "column": column, "value": float(value)}
-    done = {"severity": "warning", "action": "row left out"}
-    return Fault("spike", reason, fix="Correct the cell if the true value is known.", **place, **done)
+    return Fault("spike", reason, fix="Correct the cell if the true value is known.", **place, **ROW_OUT)
 
 
 def motion_fault(trace: Trace, strokes: Sequence[Stroke], config: Config) -> Fault | None:
