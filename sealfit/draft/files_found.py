@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
 from sealfit.ingest.listing import is_utf8, natural, read_table
 from sealfit.ingest.runs import time_of
 from sealfit.ingest.workbooks import LONGEST, read_sheet
-from sealfit.store.manifest import STATE
+from sealfit.store.manifest import found_by_glob
 from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.units import Unit
 
@@ -36,6 +37,9 @@ DOCUMENTS = {
     ".md", ".rst", ".toml", ".json", ".py", ".ipynb", ".m", ".html", ".htm", ".pdf", ".png", ".jpg", ".svg",
     ".ini", ".xml", ".yml", ".yaml", ".zip", ".gz", ".docx", ".doc", ".pptx", ".exe", ".tex",
 }  # fmt: skip
+_OF_PROGRAMS = re.compile(
+    r"(^|/)(__[^/]*/|~[^/]*$)"
+)  # such as __pycache__/a, and ~$a.xlsx
 NO_TRACES = ("readme", "license", "licence", "notice", "sha256sums", "changelog")
 NAMING = 0.5  # share of a column's cells that must name traces: a log may list tests that were not kept
 MAX_BYTES = 4_000_000  # a larger file is no list of runs
@@ -103,13 +107,8 @@ def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]
 
 
 def _files(folder: Path) -> list[str]:
-    found = []
-    for root, folders, names in os.walk(folder):
-        results = [name for name in folders if (Path(root) / name / STATE).is_file()]
-        folders[:] = [name for name in folders if not name.startswith((".", "__")) and name not in results]
-        below = Path(root).relative_to(folder)
-        found += [(below / name).as_posix() for name in names if not name.startswith((".", "~"))]
-    return sorted(found, key=natural)
+    found = found_by_glob(folder, "**/*")
+    return sorted((file for file in found if not _OF_PROGRAMS.search(file)), key=natural)
 
 
 def _may_be_trace(file: str) -> bool:
