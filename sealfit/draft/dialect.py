@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from itertools import product
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from sealfit.config import AGING_CONDITION
 from sealfit.draft.vocabulary import column_role, name_and_unit, plain, setting
 from sealfit.ingest.derived_columns import UNAGED_WORDS
 from sealfit.ingest.files import as_number, split_line
+from sealfit.ingest.runs import formats_that_fit
 from sealfit.units import Unit, conversion, unit_of
 
 SAMPLE_LINES = 200  # from the top that are looked at: longer than the headers we know of, by five times
@@ -324,8 +324,8 @@ def _date_in(headers: Sequence[Sequence[str]], number: int, line: str) -> When |
     numbers = re.sub(r"\d+", r"\\d+", re.escape(line[start:end]))
     pattern = f"{_leading(line[:start])}({numbers})"
     pattern = re.sub(r"[AP]M\)$", "[AP]M)", pattern).replace(r"\ ", " ")
-    texts = _found(pattern, headers)
-    spelled = next((one for one in _DATES if all(_is_day(text, one) for text in texts)), None)
+    days = [_DATE.search(text) or [""] for text in _found(pattern, headers)]
+    spelled = next(formats_that_fit([day[0] for day in days], _DATES), None)
     if spelled is None:
         return None
     following = headers[0][number] if number < len(headers[0]) else ""
@@ -335,13 +335,6 @@ def _date_in(headers: Sequence[Sequence[str]], number: int, line: str) -> When |
         own = _leading(following[: clock.start()]) + r"(\d+:\d+(?::\d+)?)"
         return When(pattern, f"{spelled} {_clock_format(clock)}", number, line.strip(), own)
     return When(pattern, "" if spelled in _ISO else spelled, number, line.strip())
-
-
-def _is_day(text: str, spelled: str) -> bool:
-    try:
-        return bool(datetime.strptime(_DATE.search(text)[0], spelled))
-    except (TypeError, ValueError):  # 14/03/2024 is no date where the month stands first
-        return False
 
 
 def _clock_format(clock: re.Match) -> str:

@@ -37,9 +37,7 @@ DOCUMENTS = {
     ".md", ".rst", ".toml", ".json", ".py", ".ipynb", ".m", ".html", ".htm", ".pdf", ".png", ".jpg", ".svg",
     ".ini", ".xml", ".yml", ".yaml", ".zip", ".gz", ".docx", ".doc", ".pptx", ".exe", ".tex",
 }  # fmt: skip
-_OF_PROGRAMS = re.compile(
-    r"(^|/)(__[^/]*/|~[^/]*$)"
-)  # such as __pycache__/a, and ~$a.xlsx
+_OF_PROGRAMS = re.compile(r"(^|/)(__[^/]*/|~[^/]*$)")  # such as __pycache__/a, and ~$a.xlsx
 NO_TRACES = ("readme", "license", "licence", "notice", "sha256sums", "changelog")
 NAMING = 0.5  # share of a column's cells that must name traces: a log may list tests that were not kept
 MAX_BYTES = 4_000_000  # a larger file is no list of runs

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -160,8 +160,12 @@ def usual_formats(texts: Sequence[str]) -> list[str]:
     (["'%d/%m/%Y %H:%M'"], ["'%d/%m/%Y'"])
     """
     usual = (date + clock for clock in _CLOCKS for date in _USUAL)
-    fits = (repr(one) for one in usual if all(_read(datetime.strptime, text, one) for text in texts))
-    return list(islice(fits, 2))
+    return list(islice(map(repr, formats_that_fit(texts, usual)), 2))
+
+
+def formats_that_fit(texts: Sequence[str], formats: Iterable[str]) -> Iterator[str]:
+    """Yield those of the formats in which all of these dates are."""
+    return (one for one in formats if all(_read(datetime.strptime, text, one) for text in texts))
 
 
 def _fix(text: str) -> str:
