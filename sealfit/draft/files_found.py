@@ -78,7 +78,8 @@ def look(folder: Path) -> Found:
         reason = "is a file, not a folder." if folder.is_file() else "there is no such folder."
         fix = did_you_mean(folder) or "Give the folder that holds the trace files."
         raise RequestError(reason, file=folder, fix=fix)
-    files = _files(folder)
+    found = (file for file in found_by_glob(folder, "**/*") if not _OF_PROGRAMS.search(file))
+    files = sorted(found, key=natural)
     if odd := [file for file in files if not is_utf8(file)]:
         reason = f"the names of {len(odd)} files are not UTF-8, such as {os.fsencode(odd[0])!r}."
         raise RequestError(reason, file=folder, fix="Rename them.")
@@ -102,11 +103,6 @@ def _like(same: Collection[str], rest: Sequence[str], looked_at: Collection[str]
     suffixes = {kind[0] for kind in kinds}
     named = [(file, _kind(file)) for file in rest]
     return [file for file, kind in named if kind in kinds or (kind not in known and kind[0] in suffixes)]
-
-
-def _files(folder: Path) -> list[str]:
-    found = found_by_glob(folder, "**/*")
-    return sorted((file for file in found if not _OF_PROGRAMS.search(file)), key=natural)
 
 
 def _may_be_trace(file: str) -> bool:
