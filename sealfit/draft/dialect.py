@@ -17,8 +17,9 @@ from sealfit.config import AGING_CONDITION
 from sealfit.draft.vocabulary import column_role, name_and_unit, plain, setting
 from sealfit.ingest.derived_columns import UNAGED_WORDS
 from sealfit.ingest.files import as_number, split_line
+from sealfit.ingest.listing import NUMBERS
 from sealfit.ingest.runs import formats_that_fit
-from sealfit.units import Unit, conversion, unit_of
+from sealfit.units import Unit, Units, conversion, unit_of
 
 SAMPLE_LINES = 200  # from the top that are looked at: longer than the headers we know of, by five times
 ENDS = 1000  # lines at either end of a file that are looked at for lines that are no data
@@ -28,13 +29,7 @@ STRAYS = ",;| \t"  # what lines end in without meaning: separators of empty colu
 DELIMITERS = ("tab", ";", ",", "|", "whitespace")  # of equally good ones the first is taken
 
 # What header lines may set, and what its unit measures.
-SETTINGS = {
-    "temperature_C": "temperature",
-    "compression_ratio_pct": "share",
-    "aging_days": "time",
-    "load_N": "force",
-    "speed_mm_s": "speed",
-}
+SETTINGS = {name: unit_of(Units().of(name)).dimension for name in NUMBERS}
 _LINE = re.compile(r'^\W*(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
 _SPECIMEN = re.compile(r"(specimen|probe|sample|pruefling|muster)( (id|nr|no|number|nummer|name))?")
 _SIZE = r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?"

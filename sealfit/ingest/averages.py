@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sealfit.config import Bins, Config
+from sealfit.config import MEASURED, Bins, Config
 from sealfit.errors import BadFile, Fault
 from sealfit.ingest.cells import Trace
 from sealfit.ingest.columns import TraceRef
@@ -28,7 +28,6 @@ Strokes = Mapping[str, Sequence]
 
 OWN_SPEED = "speed_file_mm_s"  # what the reader calls a speed column of the trace itself
 ALONG = "speed_bin_mm_s"  # the speed at a sample, of which bins have the mean
-SLOTS = ("time_s", "displacement_mm", "force_N")
 
 
 def standard_error(values: np.ndarray) -> float:
@@ -267,11 +266,11 @@ def with_strokes(trace: Trace, config: Config) -> tuple[Trace, list[Stroke]]:
         trace = trace.having({"displacement_mm": displacement})
     keep, faults = displacement_spikes(displacement, trace.line, config.quality)
     trace = _without_inertia(trace.where(keep).with_faults(faults), config.mass)
-    strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
+    strokes = find_strokes(*(trace.columns[name] for name in MEASURED), config.strokes)
     keep, faults = force_spikes(trace.columns["force_N"], strokes, trace.line, config.quality)
     trace = trace.where(keep).with_faults(faults)
     if not keep.all():
-        strokes = find_strokes(*(trace.columns[name] for name in SLOTS), config.strokes)
+        strokes = find_strokes(*(trace.columns[name] for name in MEASURED), config.strokes)
     return trace, strokes
 
 
@@ -282,7 +281,7 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
     """
     if not mass or len(trace.line) < 3:
         return trace
-    time_s, displacement, force = (trace.columns[name] for name in SLOTS)
+    time_s, displacement, force = (trace.columns[name] for name in MEASURED)
     noise, wanted = (displacement_noise_mm(values, order=4) for values in (displacement, force))
     noise = max(noise, resolution_mm(displacement) / math.sqrt(12.0))
     inertia = mass * acceleration(time_s, displacement, noise, wanted / mass)
@@ -291,7 +290,7 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
 
 def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[str, np.ndarray]:
     """Return the samples of a trace with stroke, distance and flags, time from the start of the motion."""
-    time_s, displacement, force = (trace.columns[name] for name in SLOTS)
+    time_s, displacement, force = (trace.columns[name] for name in MEASURED)
     before = int(trace.channels.get("stroke", 1)) - 1  # strokes of the record that other files hold
     size = [stroke.stop - stroke.start for stroke in strokes]
     origin = np.array([stroke.origin for stroke in strokes])
@@ -310,7 +309,7 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         "presliding_N": np.concatenate([stroke.presliding_N for stroke in strokes]),
         ALONG: config.units.speed_factor * np.concatenate([stroke.speed_along_mm_s for stroke in strokes]),
         "distance_mm": np.abs(displacement - np.repeat(displacement[origin], size)),
-        **{name: values for name, values in trace.columns.items() if name not in SLOTS},
+        **{name: values for name, values in trace.columns.items() if name not in MEASURED},
     }
 
 

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 
-from sealfit.config import Config, TraceFormat
+from sealfit.config import MEASURED, Config, TraceFormat
 from sealfit.errors import KEPT, NOTED, BadFile, Fault, SealfitError, nearest, shortened
 from sealfit.ingest.cells import OVERLOAD, Trace, cell_faults, listed, numbers_of
 from sealfit.ingest.expression import parse
@@ -23,7 +23,7 @@ Columns = dict[str, Column]
 
 LONGEST_LIST = 400  # characters of the names of columns that a message lists
 NO_COLUMN = "there is no such column."
-SLOTS = ("time_s", "displacement_mm", "force_N", "load_N")  # always numbers
+SLOTS = (*MEASURED, "load_N")  # always numbers
 # Columns that our tables make themselves: a channel of that name gets another, `stroke_file`.
 RESERVED = {*BINS.names(), *RUNS.names(), "line", "steady"} - set(SLOTS)
 
@@ -292,7 +292,7 @@ INSTEAD = {
 }
 
 
-def required(table: Mapping[str, object], layout: FileLayout, names: Sequence[str] = SLOTS[:3]) -> None:
+def required(table: Mapping[str, object], layout: FileLayout, names: Sequence[str] = MEASURED) -> None:
     """Raise `BadFile` if, after everything is computed, a column that a trace needs is not there."""
     found = []
     for name in (name for name in names if name not in table):
