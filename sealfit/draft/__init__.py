@@ -1,7 +1,5 @@
 """From a folder of files to the draft of a rig config."""
 
-from __future__ import annotations
-
 import shlex
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which column of the trace files is time, displacement, force and load: by name, unit and behaviour."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

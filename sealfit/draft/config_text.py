@@ -1,7 +1,5 @@
 """Guesses and doubts as the text of a config: TOML, each key with its evidence above it."""
 
-from __future__ import annotations
-
 import json
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ The data are the lines that hold numbers where the last lines of the sample do; 
 those that leave nothing but numbers there, else the most of them.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -4,14 +4,12 @@ Files whose names are cut alike share a pattern; a name in which a word such as 
 of temperature, compression and days is matched, too.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -92,12 +90,12 @@ class Names:
         pattern = self.settings.name_pattern
         return tuple(file for file in self.files if pattern and not re.fullmatch(pattern, file))
 
-    def changed(self, part: NamePart, **changes: object) -> Names:
+    def changed(self, part: NamePart, **changes: object) -> Self:
         """Return the names with one of the parts changed."""
         parts = tuple(replace(own, **changes) if own is part else own for own in self.parts)
         return replace(self, parts=parts)
 
-    def without(self, part: NamePart) -> Names:
+    def without(self, part: NamePart) -> Self:
         """Return the names without what one of the parts says: it is matched only."""
         return self.changed(part, ours="", unit="", doubt="")
 

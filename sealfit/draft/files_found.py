@@ -1,7 +1,5 @@
 """Which files of a folder are traces, how they are written, and which of the others is a table of runs."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter, defaultdict

@@ -1,7 +1,5 @@
 """The `[files]` of a draft: where traces are, what names or a table of runs say, what makes a condition."""
 
-from __future__ import annotations
-
 import glob
 import os
 import re

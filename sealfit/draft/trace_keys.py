@@ -1,7 +1,5 @@
 """The `[trace]` part of a draft: how files are written, which column goes where, what the header gives."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence

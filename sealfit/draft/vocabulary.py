@@ -3,8 +3,6 @@
 The words are English and German, and the usual French, Italian and Spanish ones.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Strokes of trace files and means: over steady windows, over bins of displacement and over repeats."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """A campaign folder to tables: every file read, split and judged, repeats averaged; part by part."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

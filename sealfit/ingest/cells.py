@@ -1,11 +1,10 @@
 """Data lines of a trace file to columns of numbers, and which of its rows are measurements."""
 
-from __future__ import annotations
-
 import re
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -36,17 +35,17 @@ class Trace:
     number: np.ndarray | None = None
     clock: bool = False
 
-    def where(self, keep: np.ndarray) -> Trace:
+    def where(self, keep: np.ndarray) -> Self:
         """Return the trace with some of its rows."""
         columns = {name: values[keep] for name, values in self.columns.items()}
         number = None if self.number is None else self.number[keep]
         return replace(self, columns=columns, line=self.line[keep], bad=self.bad[keep], number=number)
 
-    def having(self, columns: Mapping[str, np.ndarray]) -> Trace:
+    def having(self, columns: Mapping[str, np.ndarray]) -> Self:
         """Return the trace with further columns."""
         return replace(self, columns={**self.columns, **columns})
 
-    def with_faults(self, faults: Iterable[Fault]) -> Trace:
+    def with_faults(self, faults: Iterable[Fault]) -> Self:
         """Return the trace with further findings."""
         return replace(self, faults=(*self.faults, *faults))
 

@@ -1,10 +1,9 @@
 """Columns of a trace file, columns of a campaign's listing, and the keys of conditions built from them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -118,7 +117,7 @@ class Listing(Sequence[TraceRef]):
         channels = {name: value for name, value in known if value is not None}
         return TraceRef(self.files[i], channels, self.files[i] in self.cut)
 
-    def take(self, files: np.ndarray) -> Listing:
+    def take(self, files: np.ndarray) -> Self:
         """Return some of the files, by their numbers, with the columns in which any of them has a value."""
         columns = taken(self.columns, files)
         filled = {name: c for name, c in columns.items() if any(value is not None for value in c)}

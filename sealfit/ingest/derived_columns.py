@@ -1,7 +1,5 @@
 """What cells of runs.csv say, and what it leaves out: conditions, runs, repeats, specimens, their order."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence

@@ -4,8 +4,6 @@ People pass these files around, so an expression is never run as Python: every n
 against a short list, and only numbers and arrays are ever computed with.
 """
 
-from __future__ import annotations
-
 import ast
 import math
 import warnings

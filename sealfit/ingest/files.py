@@ -1,7 +1,5 @@
 """Files of a campaign as bytes, never one outside it, and their bytes as clean UTF-8 text."""
 
-from __future__ import annotations
-
 import codecs
 import csv
 import os

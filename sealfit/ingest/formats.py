@@ -4,8 +4,6 @@ Every reader gives header lines `name<tab>text`, names of the columns, and a col
 optional (`pip install 'sealfit[formats]'`) and loaded where a file needs them.
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import re

@@ -1,7 +1,5 @@
 """Which trace files a campaign has and what its table or its folder says of each: runs.csv, or a glob."""
 
-from __future__ import annotations
-
 import csv
 import os
 import re

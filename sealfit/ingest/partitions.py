@@ -1,7 +1,5 @@
 """Parts of a campaign, of whole runs each: what one process reads at once, and the tables it gives."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections import defaultdict

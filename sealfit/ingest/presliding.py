@@ -1,7 +1,5 @@
 """Where the pre-sliding rise of the force ends and sliding is steady, from the force over distance."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

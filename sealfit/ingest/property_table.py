@@ -1,7 +1,5 @@
 """A table of property values of specimens: strength, hardness, ... over aging time, without traces."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

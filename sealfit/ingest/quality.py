@@ -4,8 +4,6 @@ Every rule is scaled by the trace itself (its noise, its resolution, its samplin
 commanded speed are judged in `trace_checks.py`, and what needs other traces in `repeat_checks.py`.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 

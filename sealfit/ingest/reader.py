@@ -1,7 +1,5 @@
 """One trace file to a clean table: read, computed, filtered, checked; every fault with its place and fix."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What only comparing strokes shows: a wrong sign, a dead sensor, a repeat that disagrees with its run."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 

@@ -4,8 +4,6 @@ Runs.csv goes before the file name, that before the header lines, and these befo
 trace. Runs, repeats, specimens and the order of the campaign are derived where they are not given.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence

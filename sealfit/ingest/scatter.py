@@ -6,9 +6,8 @@ last (run-in, Mullins) is no scatter and is taken out before. The sensor's accur
 repeats, so it is not in their scatter and is kept apart (`config.sensor`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -67,7 +66,7 @@ class RepeatCodes:
     repeats: int
 
     @classmethod
-    def of(cls, means: pd.DataFrame) -> RepeatCodes:
+    def of(cls, means: pd.DataFrame) -> Self:
         """Return the layout of a table as `repeat_means` returns it."""
         run, names = pd.factorize(means["run_id"])
         repeat, numbers = pd.factorize(means["repeat"], sort=True)

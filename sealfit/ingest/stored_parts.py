@@ -1,7 +1,5 @@
 """Parts of a campaign on disk: written by whoever reads them, and samples of strokes read from them again."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -6,8 +6,6 @@ reached its plateau and the pre-sliding rise of the force is over, and ends befo
 rests are left out with what follows them until sliding is steady again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

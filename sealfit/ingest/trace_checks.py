@@ -1,7 +1,5 @@
 """Checks of a trace: single samples that cannot be right, and a speed that is not the commanded one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from contextlib import suppress

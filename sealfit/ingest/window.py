@@ -1,7 +1,5 @@
 """The steady window of a stroke: its speed is on the plateau and its force past the pre-sliding rise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

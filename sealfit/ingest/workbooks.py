@@ -3,8 +3,6 @@
 The number of a line is that of the sheet's row. Numbers are written without loss, dates in ISO 8601.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager

@@ -4,8 +4,6 @@ OUT may come from somebody else: a document whose checksum is right may still la
 place of a number, or a matrix of another size. Keys that are not listed here are ignored.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, make_dataclass

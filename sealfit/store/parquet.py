@@ -1,7 +1,5 @@
 """Tables to Parquet and back, with the schemas of `tables.py`; units and meanings are in the metadata."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

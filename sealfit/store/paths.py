@@ -1,7 +1,5 @@
 """The folders and files named on the command line, including the folder of the user's effects."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
