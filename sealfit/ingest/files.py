@@ -212,19 +212,15 @@ def _latin_1(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error("as_latin_1", _latin_1)
 
 
-def refuse_marked_up(text: bytes) -> None:
-    """Raise `BadFile` for text of a format that is not a table: HTML, XML or JSON."""
-    begin = text[:256].lstrip().lower()
-    for mark, what in _MARKED_UP.items():
-        if begin.startswith(mark):
-            raise bad_file("no_table", f"is {what}, not a table.", "Export the trace as CSV.")
-
-
 def find_layout(text: bytes, settings: TraceFormat) -> FileLayout:
     """Return where the data of a trace file begin; ConfigError as `found_by`.
 
-    BadFile if no line matches `header_ends_at`, or the header is shorter than the config says.
+    BadFile if it is no table (HTML, XML or JSON), if no line matches `header_ends_at`, or if the header is
+    shorter than the config says.
     """
+    begin = text[:256].lstrip().lower()
+    if what := next((what for mark, what in _MARKED_UP.items() if begin.startswith(mark)), None):
+        raise bad_file("no_table", f"is {what}, not a table.", "Export the trace as CSV.")
     lines = text[:HEAD_BYTES].decode("utf-8", "ignore").split("\n")
     count = _header_lines(lines, settings)
     parts = text.split(b"\n", count)

@@ -32,7 +32,6 @@ from sealfit.ingest.files import (
     in_file,
     placed,
     read_bytes,
-    refuse_marked_up,
     split_line,
     whole_lines,
     without_footer,
@@ -82,7 +81,6 @@ def _content(
         return FileLayout(found.header, found.names, None, 0, 1), found, settings
     if kind == "csv":
         text = as_utf8(raw, settings.encoding, head=head)
-        refuse_marked_up(text)
     else:
         text = read_sheet(raw, settings.sheet, decimal=settings.decimal, head=head)
         settings = settings.model_copy(update={"delimiter": "tab"})
