@@ -12,7 +12,7 @@ from sealfit.pipeline import MADE
 from sealfit.progress import Silent
 from sealfit.store import Store, paths
 from sealfit.store.manifest import ConfigCopy
-from sealfit.store.paths import OPTION, own_effects_folder, what_differs
+from sealfit.store.paths import OPTION, own_effects_folder
 from sealfit.store.staged_writes import replace_file
 from sealfit.units import Units
 
@@ -222,7 +222,7 @@ def _note_on_effects(store: Store) -> str | None:
     if store.effects is None and store.state.own_effects:
         files = ", ".join(store.state.own_effects)
         return f"your own effects ({files}) are listed only from a folder that you name: add {OPTION} FOLDER."
-    return what_differs(store.kept_effects, store.state.own_effects) or None
+    return store.changed_effects() or None
 
 
 def simulate(spec: Path, out: Path, *, force: bool = False) -> dict:

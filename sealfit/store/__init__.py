@@ -17,7 +17,7 @@ from sealfit.engine import undisturbed
 from sealfit.errors import ConfigError, OutError, RequestError, StaleError, did_you_mean, disk, quoted
 from sealfit.store import manifest
 from sealfit.store.manifest import STATE, ConfigCopy, Fingerprint, Properties, State, fingerprint, to_json
-from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder, what_differs
+from sealfit.store.paths import OPTION, effect_hashes, effects_seen, needed, own_effects_folder
 from sealfit.store.staged_writes import COMPLETE, PARQUET, PROVENANCE, Staged, file_size, held
 
 if TYPE_CHECKING:
@@ -146,10 +146,11 @@ class Store:
             finally:
                 staged.clear()
 
-    @property
-    def kept_effects(self) -> dict[str, str | None]:
-        """Hashes of the user's own effects used for the results, by file name."""
-        return self._kept.own_effects if self._kept is not None else {}
+    def changed_effects(self) -> str:
+        """Return what to say of the user's own effects that are not those of the results; "" of none."""
+        kept, now = self._kept.own_effects if self._kept is not None else {}, self.state.own_effects
+        names = sorted(name for name in kept.keys() | now.keys() if kept.get(name) != now.get(name))
+        return f"your own effects are not those it was made with ({_first(names)})" if names else ""
 
     # ------------------------------------------------------------ current or stale
     def why_stale(self, step: str) -> str:
@@ -204,11 +205,10 @@ class Store:
         known = self.state.inputs
         changed = sorted(n for n, mark in self._changed.items() if not _same_content(mark, known.get(n)))
         if changed:
-            more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
-            return f"inputs changed ({', '.join(changed[:3])}{more})"
+            return f"inputs changed ({_first(changed)})"
         if self._kept is not None and self._kept.properties != self.state.properties:
             return "other columns are asked for"
-        own = what_differs(self.kept_effects, self.state.own_effects) if step == "close-loop" else ""
+        own = self.changed_effects() if step == "close-loop" else ""
         return own or f"the config ({self.state.config.name}) changed"
 
     def require(self, step: str) -> None:
@@ -331,6 +331,10 @@ def _status_of(out: Path) -> tuple | None:
     except OSError:
         return None
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def _first(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _same_content(mark: Fingerprint, known: Fingerprint | None) -> bool:

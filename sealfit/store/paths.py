@@ -112,13 +112,6 @@ def effects_seen(
     return effect_hashes(named) if config.path.is_file() and named.is_dir() else dict(kept)
 
 
-def what_differs(kept: Mapping[str, str | None], now: Mapping[str, str | None]) -> str:
-    """Return a message on the changed files of the user's own effects; empty if there are none."""
-    names = sorted(name for name in kept.keys() | now.keys() if kept.get(name) != now.get(name))
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return f"your own effects are not those it was made with ({', '.join(names[:3])}{more})" if names else ""
-
-
 def needed(what: str, names: Mapping[str, str | None] | list[str]) -> RequestError:
     """Return the error of a command that needs the user's own effects and was given none."""
     files = f" ({', '.join(sorted(names))})" if names else ""
