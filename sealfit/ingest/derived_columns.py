@@ -62,9 +62,11 @@ def with_constants(columns: Columns, rows: int, config: Config) -> Columns:
     return overlaid({name: [value] * rows for name, value in config.runs.constants.items()}, columns)
 
 
-def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
-    """Return the columns with the config's computed columns, without helpers ("_name"), and faults.
+def to_values(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
+    """Return the columns as numbers or as labels, those that the config computes, and faults of cells.
 
+    A column of numbers is one whose name says so, one of the config's condition columns or a channel where
+    more than half of the cells are numbers, and any where all are. Helpers ("_name") are left out.
     CampaignError if an expression reads a column that is not there, or words as numbers.
     """
 
@@ -72,7 +74,9 @@ def with_computed(entries: list[Entry], columns: Columns, config: Config) -> tup
         none = "" if any(isinstance(value, str) for value in column) else math.nan
         return np.array([none if value is None else value for value in column])
 
-    columns, faults = dict(columns), []
+    made = {name: _column(name, cells, entries, config) for name, cells in columns.items()}
+    faults = [fault for _, found in made.values() for fault in found]
+    columns = {name: column for name, (column, _) in made.items()}
     for name, text in config.runs.compute.items():
         expression = parse(text)
         read = {column: columns[column] for column in expression.names if column in columns}
@@ -110,17 +114,6 @@ def of_its_kind(name: str, value: float) -> float | str:
     if name in COUNTS and value == int(value):
         return int(value)
     return f"{value:.12g}" if name in TEXT_COLUMNS else value
-
-
-def to_values(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
-    """Return the columns as numbers or as labels, and faults of cells that are neither.
-
-    A column of numbers is one whose name says so, one of the config's condition columns or a channel where
-    more than half of the cells are numbers, and any where all are.
-    """
-    made = {name: _column(name, cells, entries, config) for name, cells in columns.items()}
-    faults = [fault for _, found in made.values() for fault in found]
-    return {name: column for name, (column, _) in made.items()}, faults
 
 
 def _column(name: str, cells: Column, entries: list[Entry], config: Config) -> tuple[Column, list[Fault]]:

@@ -42,8 +42,6 @@ def read_properties(
     words = {name: columns.pop(name) for name in {*LABELS, batch} if name in columns}
     columns, found = derived.to_values(entries, columns, config)
     faults += found
-    columns, found = derived.with_computed(entries, columns, config)
-    faults += found
     if DAYS not in columns:
         fix = suggestion(DAYS, [*columns, *words]) + " Name it in files.runs_columns of a --config."
         raise stopped("missing_column", NO_COLUMN, fix.strip(), file=table, column=DAYS)

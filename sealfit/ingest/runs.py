@@ -198,8 +198,6 @@ def list_traces(campaign: Path, config: Config) -> tuple[Listing, list[Fault]]:
     columns = derived.with_day_0(derived.with_constants(columns, len(entries), config), config)
     columns, found = derived.to_values(entries, columns, config)
     faults += found
-    columns, found = derived.with_computed(entries, columns, config)
-    faults += found
     of_config = [name for name in columns if name not in cells]
     faults += misspelt(of_config, columns, config, {"file": f"config '{config.name}'"})
     columns, measured, left_out, found = _from_traces(campaign, entries, columns, config)
