@@ -31,7 +31,6 @@ class Draft:
 
 def draft(folder: Path) -> Draft:
     """Return the draft of a config that reads the trace files in a folder; errors as `look`."""
-    folder = Path(folder)
     found = look(folder)
     notes = Notes()
     tables = read_tables(found)

@@ -111,7 +111,6 @@ def ingest_campaign(
     CampaignError
         For faults that concern the whole campaign, or where not one stroke can be used.
     """
-    campaign = Path(campaign)
     place = place or Place()
     with timed("listing trace files") as part:
         listing, faults = list_traces(campaign, config)

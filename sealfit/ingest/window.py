@@ -77,7 +77,8 @@ def steady_window(
     fast = speed >= (1.0 - tolerance) * plateau
     stroke, since = _StrokeMotion(time_s, along_mm, speed, fast, plateau, half), 0 if blurred else origin
     for first, last in stroke.moving(moves):
-        still = stroke.standstill(since, first)
+        rest = _last(stroke.slow[since:first])
+        still = since if rest is None else since + rest
         begin, end = stroke.ramp_end(still, first, last), stroke.stop_begin(first, last)
         if blurred:  # neither the rest nor the ramp can be seen: the force says better when the motion begins
             still = max(still, first_motion(force_N[:end], still))
@@ -286,11 +287,6 @@ class _StrokeMotion:
                     continue
             joined.append((first, last))
         return [(first, last) for first, last in joined if last - first > 2 * half + 3]
-
-    def standstill(self, since: int, first: int) -> int:
-        """Return the last row from `since` to before `first` where the platform still stood, else `since`."""
-        still = _last(self.slow[since:first])
-        return since if still is None else since + still
 
     def ramp_end(self, still: int, first: int, last: int) -> int:
         """Return the row from which the speed is on its plateau."""
