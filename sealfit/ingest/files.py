@@ -33,18 +33,9 @@ def inside(campaign: Path, file: str) -> Path | None:
     return path if resolved != root and resolved.is_relative_to(root) else None
 
 
-def read_marked(campaign: Path, file: str) -> tuple[bytes, Fingerprint]:
-    """Return the file's bytes, and the fingerprint of these very bytes; raises as `read_bytes`."""
-    raw, status = _read(campaign, file)
-    return raw, fingerprint_of(raw, status)
-
-
 def read_bytes(campaign: Path, file: str, *, head: bool = False) -> bytes:
-    """Return the file's bytes, or with `head` its first ones.
-
-    BadFile if it is missing, outside the campaign, no file, not readable or empty.
-    """
-    return _read(campaign, file, HEAD_BYTES if head else -1)[0]
+    """Return the file's bytes, or with `head` its first ones; raises as `read_marked`."""
+    return read_marked(campaign, file, head=head)[0]
 
 
 def cut_files(campaign: Path, texts: Sequence[str]) -> frozenset[str]:
@@ -97,7 +88,11 @@ def in_file(file: str) -> Iterator[None]:
         raise BadFile(*placed(error.faults, file)) from error
 
 
-def _read(campaign: Path, file: str, size: int = -1) -> tuple[bytes, os.stat_result]:
+def read_marked(campaign: Path, file: str, *, head: bool = False) -> tuple[bytes, Fingerprint]:
+    """Return the file's bytes, or with `head` its first ones, and the fingerprint of these very bytes.
+
+    BadFile if it is missing, outside the campaign, no file, not readable or empty.
+    """
     with in_file(file):
         path = inside(campaign, file)
         if path is None:
@@ -107,7 +102,7 @@ def _read(campaign: Path, file: str, size: int = -1) -> tuple[bytes, os.stat_res
             if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for
                 raise bad_file("unreadable_file", "is not a file.", "Check the path.")
             with path.open("rb") as opened:
-                status, raw = os.fstat(opened.fileno()), opened.read(size)
+                status, raw = os.fstat(opened.fileno()), opened.read(HEAD_BYTES if head else -1)
         except FileNotFoundError:
             reason, fix = "does not exist.", did_you_mean(path, Path.is_file, campaign)
             if path.is_symlink():
@@ -122,7 +117,7 @@ def _read(campaign: Path, file: str, size: int = -1) -> tuple[bytes, os.stat_res
         if not raw[max(marks, default=0) :].strip(b" \t\r\n\0"):
             fix = "Export it again, or leave it out: of runs.csv, or by files.exclude in the rig config."
             raise bad_file("empty_file", "is empty.", fix)
-        return raw, status
+        return raw, fingerprint_of(raw, status)
 
 
 # ---------------------------------------------------------------- text
