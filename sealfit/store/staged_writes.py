@@ -179,14 +179,6 @@ def taken(path: Path, option: str = "--out") -> Iterator[int]:
 
     OutError, whose fix names the `option`, if another process has locked it, or if it cannot be written.
     """
-    handle = _take(path, option)
-    try:
-        yield handle
-    finally:
-        os.close(handle)
-
-
-def _take(path: Path, option: str) -> int:
     while True:
         with disk(path.parent, option):
             if path.is_symlink():  # what it leads to would be written
@@ -196,11 +188,10 @@ def _take(path: Path, option: str) -> int:
             locked = _locked(handle)
             if _same_file(handle, path):  # otherwise its owner has just removed it: try again
                 _refuse_owner(handle, path, option, locked)
-                return handle
-        except BaseException:
+                yield handle
+                return
+        finally:
             os.close(handle)
-            raise
-        os.close(handle)
 
 
 def _locked(handle: int) -> bool | None:
