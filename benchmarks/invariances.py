@@ -342,11 +342,11 @@ def split(given: Campaign, rng: np.random.Generator) -> Campaign:
         trace = given.traces[row["file"]].reset_index(drop=True)
         slots = (trace[name].to_numpy() for name in ("time_s", "displacement_mm", "force_N"))
         strokes = find_strokes(*slots, settings)
-        for stroke in strokes if len(strokes) > 1 else ():
+        for number, stroke in enumerate(strokes, start=1) if len(strokes) > 1 else ():
             own = trace.iloc[stroke.start : stroke.stop]
-            file = f"{row['file'].removesuffix('.csv')}_{stroke.number}.csv"
+            file = f"{row['file'].removesuffix('.csv')}_{number}.csv"
             traces[file] = own.assign(time_s=own["time_s"] - own["time_s"].iloc[0])
-            rows.append({**row, "file": file, "stroke": stroke.number})
+            rows.append({**row, "file": file, "stroke": number})
     return replace(given, runs=pd.DataFrame(rows), traces=traces) if rows else given
 
 

@@ -298,7 +298,7 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         middle = [np.median(displacement[stroke.start : stroke.stop]) for stroke in strokes]
         turns = turn * np.floor(np.array(middle) / turn)
     return {
-        "stroke": np.repeat([stroke.number for stroke in strokes], size) + before,
+        "stroke": np.repeat(np.arange(len(strokes)), size) + before + 1,
         "time_s": time_s - np.repeat(since, size),
         "displacement_mm": displacement - np.repeat(turns, size),
         "force_N": force,
@@ -317,7 +317,7 @@ def _stroke_rows(
     """Return a row for every stroke, and what was found in them."""
     several, unit = len(strokes) > 1, config.units.unit("force")
     rows, faults = [], []
-    for stroke in strokes:
+    for number, stroke in enumerate(strokes, start=1):
         row = {**trace.channels, **_means(stroke, samples), "file": file}
         row |= {"stroke": int(samples["stroke"][stroke.start]), "direction": stroke.direction}
         row |= {"speed_mm_s": config.units.speed_factor * stroke.speed_mm_s}
@@ -329,8 +329,7 @@ def _stroke_rows(
         if used and OWN_SPEED in row:
             found += speed_column_faults(row["speed_mm_s"], row[OWN_SPEED], config)
         rows.append({**row, "used": used})
-        number = stroke.number if several else None
-        faults += [replace(fault, stroke=number) for fault in found]
+        faults += [replace(fault, stroke=number if several else None) for fault in found]
     return tuple(rows), faults + load_checks(trace, rows, config)
 
 

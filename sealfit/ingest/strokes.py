@@ -46,7 +46,6 @@ class Stroke:
     `several_speeds` is true for a steady speed of a motion with several.
     """
 
-    number: int
     start: int
     stop: int
     origin: int
@@ -91,7 +90,7 @@ def find_strokes(
     smooth = smoothed(displacement_mm, settings.smooth_samples)
     if settings.whole_file:
         whole = _whole_file(time_s, displacement_mm, settings)
-        return _numbered(_turns(time_s, displacement_mm, smooth, whole, settings))
+        return _turns(time_s, displacement_mm, smooth, whole, settings)
     noise = displacement_noise_mm(displacement_mm)
     span = float(np.ptp(smooth))
     if span <= 8.0 * noise:  # the range of some hundred samples of noise alone is about six SDs
@@ -115,11 +114,7 @@ def find_strokes(
             stroke = _stroke(motion, settings, own, start + begin, first, way)
             stroke = replace(stroke, several_speeds=len(parts) > 1)
             found += _turns(time_s, displacement_mm, smooth, stroke, settings)
-    return _numbered(found)
-
-
-def _numbered(strokes: list[Stroke]) -> list[Stroke]:
-    return [replace(stroke, number=number) for number, stroke in enumerate(strokes, start=1)]
+    return found
 
 
 def _stroke(
@@ -138,7 +133,7 @@ def _stroke(
     speed = slope(time_s, displacement_mm, steady)
     along = speed_along(time_s, displacement_mm, steady, rise_mm, speed, noise)
     short, ends = _too_short(way * displacement_mm, steady, settings), (rows.start, rows.stop)
-    return Stroke(1, *ends, origin, way, speed, steady, sliding, left_N, along, short, settles)
+    return Stroke(*ends, origin, way, speed, steady, sliding, left_N, along, short, settles)
 
 
 def _turns(
@@ -257,7 +252,7 @@ def _whole_file(time_s: np.ndarray, displacement_mm: np.ndarray, settings: Strok
     way = 1 if displacement_mm[-1] >= displacement_mm[0] else -1
     speed, least = slope(time_s, displacement_mm, every), settings.min_samples
     short = None if n >= least else f"only {n} samples; at least {least} are needed"
-    return Stroke(1, 0, n, 0, way, speed, every, every, np.zeros(n), np.full(n, speed), short)
+    return Stroke(0, n, 0, way, speed, every, every, np.zeros(n), np.full(n, speed), short)
 
 
 def _flat_parts(

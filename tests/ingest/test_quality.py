@@ -85,7 +85,7 @@ def test_clipping_at_the_sensor_s_end_is_named_with_value_and_line():
 def blamed(force):
     every = np.ones(len(force), bool)
     none = np.zeros(len(force))
-    stroke = Stroke(1, 0, len(force), 0, 1, 5.0, every, every, none, none + 5.0)
+    stroke = Stroke(0, len(force), 0, 1, 5.0, every, every, none, none + 5.0)
     time = np.linspace(0.0, 8.0, len(force))
     return [f.check for f in stroke_faults(stroke, rows_of(time, force), Quality())]
 
