@@ -289,7 +289,7 @@ def _without_inertia(trace: Trace, mass: float) -> Trace:
 def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[str, np.ndarray]:
     """Return the samples of a trace with stroke, distance and flags, time from the start of the motion."""
     time_s, displacement, force = (trace.columns[name] for name in MEASURED)
-    before = int(trace.channels.get("stroke", 1)) - 1  # strokes of the record that other files hold
+    first = int(trace.channels.get("stroke", 1))  # other files hold the strokes of the record before it
     size = [stroke.stop - stroke.start for stroke in strokes]
     origin = np.array([stroke.origin for stroke in strokes])
     since = time_s[origin] if len(strokes) > 1 else np.zeros(1)
@@ -298,7 +298,7 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
         middle = [np.median(displacement[stroke.start : stroke.stop]) for stroke in strokes]
         turns = turn * np.floor(np.array(middle) / turn)
     return {
-        "stroke": np.repeat(np.arange(len(strokes)), size) + before + 1,
+        "stroke": np.repeat(np.arange(len(strokes)), size) + first,
         "time_s": time_s - np.repeat(since, size),
         "displacement_mm": displacement - np.repeat(turns, size),
         "force_N": force,

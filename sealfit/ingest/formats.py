@@ -341,7 +341,10 @@ def _parquet(raw: bytes, settings: TraceFormat, head: bool) -> Arrays:
 
 
 def parquet_columns(raw: bytes) -> dict[str, pa.ChunkedArray]:
-    """Return the columns of a Parquet file without an index of pandas's; BadFile if two have one name."""
+    """Return the columns of a Parquet file, but for an index of pandas's.
+
+    BadFile if it has more than `MOST_CELLS` cells, or two columns of one name.
+    """
     opened = pq.ParquetFile(pa.BufferReader(raw), page_checksum_verification=True)
     rows, columns = opened.metadata.num_rows, opened.metadata.num_columns
     if rows * columns > MOST_CELLS:
