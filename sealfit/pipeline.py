@@ -233,8 +233,8 @@ def _close_loop(store: Store, staged: Staged, options: Options, progress: Silent
         _write(staged, {**closure.tables, **after})
     started = store.read("runs", ["started_at"])["started_at"].dropna()
     first = min(started, key=_instant) if len(started) else None
-    staged.json("model", {**closure.model, "first_started_at": first})
-    staged.json("closure", closure.document)
+    staged.file("model.json", manifest.to_json({**closure.model, "first_started_at": first}))
+    staged.file("closure.json", manifest.to_json(closure.document))
     return len(closure.tables["residuals_before"]), "bins"
 
 

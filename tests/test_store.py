@@ -305,7 +305,7 @@ def test_a_file_with_one_changed_bit_makes_its_step_stale(out, campaign, name):
             with store.step(step) as staged:
                 staged.table(OUTPUTS[step], small(OUTPUTS[step], 2))
                 if step == "close-loop":
-                    staged.json("closure", {"rmse_N": 0.90})
+                    staged.file("closure.json", '{"rmse_N": 0.90}')
     raw = bytearray((out / name).read_bytes())
     raw[len(raw) // 2] ^= 1
     (out / name).write_bytes(raw)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from sealfit.engine import undisturbed
 from sealfit.errors import OutError, disk
-from sealfit.store.manifest import STAGING, STATE, Fingerprints, State, fingerprint, to_json
+from sealfit.store.manifest import STAGING, STATE, Fingerprints, State, fingerprint
 from sealfit.tables import SCHEMAS
 from sealfit.units import Units
 
@@ -49,10 +49,6 @@ class Staged:
 
         made = parquet.to_arrow(frame, SCHEMAS[name], self._units)
         self._write(f"{name}{PARQUET}", lambda path: parquet.write_arrow(made, path))
-
-    def json(self, name: str, document: Mapping) -> None:
-        """Write `document` as `<name>.json`; numbers that are not finite become null."""
-        self.file(f"{name}.json", to_json(document))
 
     def file(self, name: str, content: str | bytes) -> None:
         """Write a file; bytes of paths that are not UTF-8 become escapes, which JSON reads back."""
