@@ -13,7 +13,7 @@ from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.columns import condition_columns, force_inputs
-from sealfit.ingest.partitions import SAMPLED, STEADY_ONLY, Asked, PartitionResult, plan_parts, shaped
+from sealfit.ingest.partitions import SAMPLED, Asked, PartitionResult, plan_parts, shaped
 from sealfit.ingest.quality import computed_force, improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import judged, outlying_files, settings_within_runs, turned_sign
 from sealfit.ingest.runs import FIX, list_traces
@@ -22,7 +22,7 @@ from sealfit.progress import timed
 from sealfit.store.manifest import Fingerprint, Fingerprints, fingerprint
 from sealfit.store.parquet import as_words
 from sealfit.store.staged_writes import file_size
-from sealfit.tables import CALENDAR, RUNS, STEADY
+from sealfit.tables import RUNS, STEADY
 
 
 def inputs_table(
@@ -53,8 +53,6 @@ def inputs_table(
     return table, {file: mark for file, mark in marks.items() if mark.sha256 is not None}
 
 
-# Columns of samples, and of their scatter, whose means are in `steady`.
-OF_SAMPLES = ("time_s", "displacement_mm", "distance_mm", "force_N", "presliding_N", "force_sd_N", "n")
 SHOWN = 20  # faults that a campaign without a single usable stroke lists, those that files share as one
 
 
@@ -148,7 +146,7 @@ def ingest_campaign(
     seen = steady.drop(columns=[*config.loop.ignore_channels, *inputs], errors="ignore")
     faults += incomplete_columns(seen, config.series_columns if config.aging else ())
     faults += improbable_loads(steady, config) + computed_force(inputs & {*steady.columns})
-    faults += settings_within_runs(seen, {*STEADY.names(), *CALENDAR, *condition_columns(config)})
+    faults += settings_within_runs(seen, {*STEADY.names(), *condition_columns(config)})
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)
     strokes = strokes.assign(used=used)
@@ -163,7 +161,7 @@ def ingest_campaign(
     inputs, marks = inputs_table(campaign, marks, counts, used, faults)
     tables = {
         "inputs": inputs,
-        "runs": shaped(strokes, RUNS, drop=(*STEADY_ONLY, *OF_SAMPLES)),
+        "runs": shaped(strokes, RUNS, drop=STEADY.names()),
         "quality": quality_table(faults, inputs["file"].tolist()),
         "steady": shaped(steady, STEADY),
     }

@@ -21,7 +21,7 @@ from sealfit.ingest.strokes import several_speeds
 from sealfit.store import parquet
 from sealfit.store.manifest import Fingerprints
 from sealfit.store.parquet import as_words, to_arrow
-from sealfit.tables import BINS, BOOL, FLOAT, INT, RUNS, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
+from sealfit.tables import BINS, BOOL, FLOAT, INT, STEADY, TEXT, TRACES, TRACES_MEAN, Schema
 
 # Columns that serve the ingest only.
 INNER = (
@@ -29,7 +29,6 @@ INNER = (
     "by_itself",
 )  # fmt: skip
 IN_PANDAS = {FLOAT: float, INT: np.int64, TEXT: "str", BOOL: bool}
-STEADY_ONLY = set(STEADY.names()) - {*RUNS.names(), *BINS.names()}
 
 
 def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.DataFrame:
@@ -40,7 +39,7 @@ def shaped(table: pd.DataFrame, schema: Schema, drop: Sequence[str] = ()) -> pd.
         if column.dtype == FLOAT:
             values = pd.to_numeric(values, errors="coerce")
         fixed[column.name] = values.astype(IN_PANDAS[column.dtype])
-    taken = {*fixed, *INNER, *(name for name in drop if name not in fixed)}
+    taken = {*fixed, *INNER, *drop}
     return pd.DataFrame({**fixed, **{name: table[name] for name in table.columns if name not in taken}})
 
 
@@ -274,7 +273,7 @@ def _bins(samples: Mapping[str, np.ndarray], strokes: Mapping[str, list], config
         declared = np.array(known["load_N"], float)[place]
         made["load_N"] = np.where(np.isnan(made["load_N"]), declared, made["load_N"])
     kinds = {column.name: column.dtype for column in BINS.columns}
-    left_out = {*INNER, *STEADY_ONLY, "used", *kinds}
+    left_out = {*INNER, *STEADY.names(), *kinds}
     columns = {name: _array(values) for name, values in known.items() if name not in left_out}
     for name, kind in kinds.items():
         values = known.get(name, [None] * len(binned))
