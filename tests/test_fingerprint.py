@@ -1,10 +1,11 @@
 import os
+from pathlib import Path
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sealfit.config import Config, Files, parse_config
-from sealfit.store.manifest import Fingerprint, changes, fingerprint, step_keys
+from sealfit.store.manifest import ConfigCopy, Fingerprint, State, changes, fingerprint, step_keys
 
 files = st.sampled_from([f"{folder}{name}.csv" for folder in ("", "one/", "two/") for name in "abcd"])
 marks = st.one_of(
@@ -18,9 +19,10 @@ many = st.dictionaries(files, marks)
 def test_keys_do_not_depend_on_the_order_of_the_inputs(known, random):
     shuffled = list(known.items())
     random.shuffle(shuffled)
-    keys = step_keys(known, Config())
-    assert step_keys(dict(shuffled), Config()) == keys
-    assert step_keys(known | {"new.csv": Fingerprint(1, 1, "new")}, Config()) != keys
+    state = State(Path("campaign"), ConfigCopy.at(None))
+    keys = step_keys(state, known, Config())
+    assert step_keys(state, dict(shuffled), Config()) == keys
+    assert step_keys(state, known | {"new.csv": Fingerprint(1, 1, "new")}, Config()) != keys
 
 
 def test_changes_are_what_is_new_other_or_gone(tmp_path):

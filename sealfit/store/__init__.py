@@ -156,7 +156,7 @@ class Store:
     def why_stale(self, step: str) -> str:
         """Return the reason why `step` is out of date, or "" if it is current."""
         if self._keys is None:
-            self._keys = self._step_keys(self.marks)
+            self._keys = manifest.step_keys(self.state, self.marks, self.config)
         for name in self.up_to(step):
             done = self.state.steps.get(name)
             if done is None:
@@ -167,9 +167,6 @@ class Store:
                 if not self.is_whole(file, done):
                     return f"{name} is stale: its {file} is missing or was changed"
         return ""
-
-    def _step_keys(self, inputs: Mapping[str, Fingerprint]) -> dict[str, str]:
-        return manifest.step_keys(inputs, self.config, self.state.own_effects, self.state.properties)
 
     def up_to(self, step: str) -> tuple[str, ...]:
         """Return the steps up to `step`, in order; RequestError if these results have no such step."""
@@ -310,7 +307,8 @@ class Store:
         inputs = self.state.inputs if staged.inputs is None else staged.inputs
         # Copied, as the files below are those of no step.
         files, checksums, steps = dict(staged.files), dict(staged.checksums), self.state.steps
-        now, key = datetime.now(UTC).isoformat(timespec="seconds"), self._step_keys(inputs)[name]
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        key = manifest.step_keys(self.state, inputs, self.config)[name]
         done = manifest.Done(key, __version__, now, round(seconds, 3), files, checksums)
         earlier = {step: steps[step] for step in self.up_to(name)[:-1] if step in steps}
         state = replace(self.state, inputs=inputs, steps={**earlier, name: done})

@@ -112,28 +112,23 @@ def seen_config(step: str, config: Config) -> Config:
     return config.model_copy(update=UNSEEN.get(step, {}))
 
 
-def step_keys(
-    inputs: Fingerprints,
-    config: Config,
-    effects: Mapping[str, str | None] | None = None,
-    properties: Properties | None = None,
-) -> dict[str, str]:
+def step_keys(state: State, inputs: Fingerprints, config: Config) -> dict[str, str]:
     """Return the key of every step, in order, for these inputs, this config and this version of the program.
 
-    `effects` are the hashes of the user's own effects; where their folder lies does not matter. `properties`
-    says what is asked of a table of properties.
+    Of the state, what is asked of a table of properties counts, and the user's own effects: their content,
+    not where their folder lies.
     """
     config = config.model_copy(update={"loop": config.loop.model_copy(update={"effects_folder": None})})
     keys: dict[str, str] = {}
     names = sorted(inputs)
     known = "\0".join([*names, *(inputs[name].sha256 or "" for name in names)])  # no path contains \0
     before = hashlib.sha256(os.fsencode(known)).hexdigest()
-    for step in STEPS if properties is None else STEPS_OF_PROPERTIES:
+    for step in state.order:
         seen = [__version__, step, seen_config(step, config).model_dump(mode="json"), before]
-        if step == "close-loop" and effects:
-            seen.append(dict(effects))
-        if properties is not None:
-            seen.append(asdict(properties))
+        if step == "close-loop" and state.own_effects:
+            seen.append(state.own_effects)
+        if state.properties is not None:
+            seen.append(asdict(state.properties))
         keys[step] = before = hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()
     return keys
 
