@@ -69,7 +69,7 @@ class Store:
             raise OutError(what, file=out, fix=fix or f"Make it: sealfit run CAMPAIGN --out {quoted(out)}")
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
-        hashes = effects_seen(effects, state.own_effects, state.config, config)
+        hashes = effects_seen(effects, state, config)
         store = cls(out, replace(state, config=config, own_effects=hashes), state, effects)
         store._opened = opened
         return store

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sealfit.config import Config
 from sealfit.errors import RUNS_TABLES, CampaignError, ConfigError, Fault, RequestError, did_you_mean, quoted
-from sealfit.store.manifest import ConfigCopy, fingerprint
+from sealfit.store.manifest import ConfigCopy, State, fingerprint
 
 RUNS = "runs.csv"
 FIX_PATH = "Fix the path."
@@ -96,20 +96,18 @@ def effect_hashes(folder: Path) -> dict[str, str | None]:
     return {path.name: fingerprint(path).sha256 for path in sorted(folder.glob("*.py"))}
 
 
-def effects_seen(
-    given: Path | None, kept: Mapping[str, str | None], kept_config: ConfigCopy, config: ConfigCopy
-) -> dict[str, str | None]:
+def effects_seen(given: Path | None, kept: State, config: ConfigCopy) -> dict[str, str | None]:
     """Return the present hashes of the user's own effects, as far as known; nothing is run.
 
-    `given` is the folder that the command line names, `kept` and `kept_config` are what OUT keeps, and
-    `config` is that config as it stands now.
+    `given` is the folder that the command line names, `kept` what OUT keeps, and `config` its config as it
+    stands now.
     """
     if given is not None:
         return effect_hashes(given)
     named = config.effects_folder()
     if named is None:  # given by the option, or removed from the config
-        return dict(kept) if kept_config.effects_folder() is None else {}
-    return effect_hashes(named) if config.path.is_file() and named.is_dir() else dict(kept)
+        return kept.own_effects if kept.config.effects_folder() is None else {}
+    return effect_hashes(named) if config.path.is_file() and named.is_dir() else kept.own_effects
 
 
 def needed(what: str, names: Mapping[str, str | None] | list[str]) -> RequestError:
