@@ -17,15 +17,12 @@ from sealfit.draft.file_names import FEW, HEIGHT_FROM, NamePart, Names
 from sealfit.draft.files_found import Found, RunsTable
 from sealfit.errors import ConfigError
 from sealfit.ingest.files import as_number
-from sealfit.ingest.listing import channels_of, name_parts, natural
+from sealfit.ingest.listing import KNOWN, channels_of, name_parts, natural
 from sealfit.ingest.runs import excel_time, usual_formats
 from sealfit.store.paths import RUNS as RUNS_CSV
 from sealfit.units import Units, conversion
 
-NO_CONDITION = {
-    "repeat", "specimen_id", "speed_mm_s", "load_N", "started_at", "run_id", "direction", "direction_set",
-    "rubber", "file", "stroke", "speed_rpm",
-}  # fmt: skip
+NO_CONDITION = {*KNOWN, "direction", "direction_set", "rubber", "file", "stroke", "speed_rpm"}
 OF_NAMES = {
     "columns": "made of parts of the name",
     "values": "how these are written in the names",
