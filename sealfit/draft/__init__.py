@@ -43,7 +43,7 @@ def draft(folder: Path) -> Draft:
     speeds = measured_speeds(roles, units, list(tables))
     table = find_table(folder, [*found.others, *found.otherwise], found.traces)
     names = run_keys.suited_to(read_names(found.traces), roles)
-    names = run_keys.improved(names, speeds, found, notes)
+    names = run_keys.improved(names, speeds, notes)
     if table is not None:
         names = run_keys.beside_table(names, table)
     given = names.given | (set() if table is None else table.given)

@@ -46,7 +46,7 @@ def values_by_file(names: Names, files: Collection[str]) -> dict[str, dict[str, 
     return found
 
 
-def improved(names: Names, speeds: Mapping[str, float], found: Found, notes: Notes) -> Names:
+def improved(names: Names, speeds: Mapping[str, float], notes: Notes) -> Names:
     """Return the names with speeds that agree with the measured ones, and repeats that tell files apart.
 
     `speeds` are the measured ones, negative backward.
@@ -54,7 +54,7 @@ def improved(names: Names, speeds: Mapping[str, float], found: Found, notes: Not
     if names.settings.name_pattern is None:
         return names
     names = _with_direction(_with_speed(names, speeds, notes), speeds)
-    return _unaged_apart(_told_apart(names, found, notes), found)
+    return _unaged_apart(_told_apart(names, notes))
 
 
 def _with_direction(names: Names, speeds: Mapping[str, float]) -> Names:
@@ -127,7 +127,7 @@ def _speed_in_unit(names: Names, ratio: float, notes: Notes) -> Names:
     return names.changed(part, unit=unit, why=why)
 
 
-def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
+def _told_apart(names: Names, notes: Notes) -> Names:
     """Return the names without a repeat that does not tell files of the same settings apart.
 
     Where settings, repeat and unknown words do so, each word has runs of its own.
@@ -135,7 +135,7 @@ def _told_apart(names: Names, found: Found, notes: Notes) -> Names:
     repeat = next((part for part in names.parts if part.ours == "repeat"), None)
     if repeat is None:
         return names
-    said = values_by_file(names, found.traces)
+    said = values_by_file(names, names.files)
     of_run = names.given - {"started_at"}
     if aging := names.given & set(AGING_CONDITION):
         of_run = {*aging, "rubber", "specimen_id", "speed_mm_s", "speed_rpm", "load_N", "repeat"}
@@ -159,13 +159,13 @@ def _keys(said: Mapping[str, dict], columns: Collection[str]) -> Counter:
     return Counter(tuple((name, one.get(name)) for name in sorted(columns)) for one in said.values() if one)
 
 
-def _unaged_apart(names: Names, found: Found) -> Names:
+def _unaged_apart(names: Names) -> Names:
     """Return the names with a specimen for each series, where files of unaged rubber are alike otherwise."""
     series = [part for part in names.parts if part.ours in AGING_CONDITION]
     if "specimen_id" in names.given or "aging_days" not in names.given or len(series) < 2:
         return names
     alike = sorted(names.given - {*AGING_CONDITION, "started_at", "run_id"})
-    unaged = [one for one in values_by_file(names, found.traces).values() if one.get("aging_days") == 0]
+    unaged = [one for one in values_by_file(names, names.files).values() if one.get("aging_days") == 0]
     both = {tuple(tuple(map(one.get, own)) for own in (alike, AGING_CONDITION)) for one in unaged}
     if len(both) == len({otherwise for otherwise, _ in both}):
         return names
@@ -215,7 +215,7 @@ def source_keys(
         _glob_keys(found, names, notes)
     if table is None or not set(AGING_CONDITION) <= table.given:
         told = table is not None or bool(set(header) & set(AGING_CONDITION))
-        _name_keys(names, len(found.traces), told, notes)
+        _name_keys(names, told, notes)
     _otherwise({f: one for f, one in found.otherwise.items() if table is None or f != table.file}, notes)
     for file, reason in list(found.unreadable.items())[:3]:
         notes.doubt("files", f"{file} {reason}", "It is in no run.")
@@ -280,7 +280,7 @@ def _excluded(surplus: set[str], matched: set[str]) -> list[str]:
     return list(dict.fromkeys(globs))
 
 
-def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
+def _name_keys(names: Names, told: bool, notes: Notes) -> None:
     """Add what names say; that they say nothing matters only where nothing else has `told` the conditions."""
     settings = names.settings
     if settings.name_pattern is None:
@@ -290,9 +290,10 @@ def _name_keys(names: Names, files: int, told: bool, notes: Notes) -> None:
         fix = f"Write a {RUNS_CSV} with a line for each file, or name_pattern by hand."
         notes.doubt("files", reason, fix)
         return
-    ours, matched = [part for part in names.parts if part.ours], files - len(names.unmatched)
+    ours, files = [part for part in names.parts if part.ours], len(names.files)
     said = "; ".join(f"{_example(part)} -> {part.ours} ({part.why}: {_values(part)})" for part in ours)
-    notes.guess("files.name_pattern", settings.name_pattern, f"matches {matched} of {files} files. {said}")
+    matched = f"matches {files - len(names.unmatched)} of {files} files. {said}"
+    notes.guess("files.name_pattern", settings.name_pattern, matched)
     for part in ours:
         if part.doubt:
             reason = f"'{_example(part)}': {part.doubt}."
