@@ -250,21 +250,21 @@ class RunsTable:
         return set(self.ours.values())
 
 
-def find_table(folder: Path, others: Sequence[str], traces: Sequence[str]) -> RunsTable | None:
+def find_table(found: Found) -> RunsTable | None:
     """Return the table of runs among files other than traces: runs.csv, else the one that names most."""
-    tables = [table for file in others if (table := _table(folder, file, traces)) is not None]
+    tables = [own for file in (*found.others, *found.otherwise) if (own := _table(found, file)) is not None]
     return max(tables, key=lambda table: (table.file == RUNS_CSV, table.named), default=None)
 
 
-def _table(folder: Path, file: str, traces: Sequence[str]) -> RunsTable | None:
+def _table(found: Found, file: str) -> RunsTable | None:
     try:
-        if (folder / file).stat().st_size > MAX_BYTES:
+        if (found.folder / file).stat().st_size > MAX_BYTES:
             return None
-        _, columns, _ = read_table(folder, file, Config())
+        _, columns, _ = read_table(found.folder, file, Config())
     except (CampaignError, OSError):
         return None
     cells = {name: [cell or "" for cell in column] for name, column in columns.items()}
-    naming = {name: _names_files(column, traces) for name, column in cells.items()}
+    naming = {name: _names_files(column, found.traces) for name, column in cells.items()}
     best = max(naming, key=naming.get, default=None)
     if best is None or not cells[best] or naming[best] < NAMING * len(cells[best]):
         return None

@@ -133,11 +133,8 @@ def _shown(line: str) -> str:
     return f"'{text[:70]}...'" if len(text) > 70 else f"'{text}'"
 
 
-def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], read: int, notes: Notes) -> None:
-    """Add which column goes into which slot, and what is done with the others.
-
-    `units` are those of `settled_units`, `read` is the number of files whose columns were read.
-    """
+def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], notes: Notes) -> None:
+    """Add which column goes into which slot, in the `settled_units`, and what is done with the others."""
     helpers: list[str] = []
     for role, slot in SLOTS.items():
         column = getattr(roles, role)
@@ -147,7 +144,7 @@ def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], read: int
         negated |= role == "load" and np.mean([np.mean(values) for values in column.values]) < 0
         name = slot.replace("_", "_raw_") if negated else slot
         value = file_column(column.key, units.get(role), slot)
-        notes.guess(f"trace.columns.{name}", value, _evidence(column, role, roles, read))
+        notes.guess(f"trace.columns.{name}", value, _evidence(column, role, roles))
         if negated:
             notes.guess(f"trace.compute.{slot}", f"-{name}", NEGATED[role])
             helpers.append(name)
@@ -174,10 +171,10 @@ def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], read: int
     _other_columns(found, roles, clock or "", notes)
 
 
-def _evidence(column: TraceColumn, role: str, roles: Roles, read: int) -> str:
+def _evidence(column: TraceColumn, role: str, roles: Roles) -> str:
     by = ["its name"] if column.role == role else []
     by += ["its unit"] if column.in_unit_of(role) else []
-    follows = f"it follows the direction of motion in {roles.signed_files} of {read} files"
+    follows = f"it follows the direction of motion in {roles.signed_files} of {len(column.values)} files"
     follows += ", with the other sign" if roles.sign < 0 else ""
     behaves = {"time": "it rises evenly", "displacement": "it goes along strokes", "force": follows}
     text = f"{column.place}: by {' and '.join(by) or 'behaviour'}"
@@ -325,12 +322,11 @@ def _assumed(column: TraceColumn, role: str, slot: str, notes: Notes) -> Unit | 
     return None
 
 
-def header_keys(found: Found, given: set[str], measures_load: bool, notes: Notes) -> list[str]:
+def header_keys(found: Found, given: set[str], notes: Notes) -> list[str]:
     """Add the date and the settings that header lines give and nothing else does; return their columns."""
     headers = [one.header for one in found.sniffed]
     if not headers[0]:
         return []
-    given = given | ({"load_N"} if measures_load else set())
     when = started_in(headers)
     if when is not None and "started_at" not in given:
         if when.format:
