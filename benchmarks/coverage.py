@@ -156,11 +156,11 @@ def laws(settings: dict, seed: int) -> Iterator[Entry]:
         yield Entry(
             f"{quantity}: the true law is the likeliest or a rival", ("log", "rate") in likely, None, None
         )
-        yield from _lives(quantity, law, fitted, chosen, middle, seed)
+        yield from _lives(quantity, law, fitted, chosen, middle)
 
 
 def _lives(
-    quantity: str, law: dict, fitted: JointLaw, chosen: Sequence[JointLaw], middle: tuple, seed: int
+    quantity: str, law: dict, fitted: JointLaw, chosen: Sequence[JointLaw], middle: tuple
 ) -> Iterator[Entry]:
     """Yield lifetimes within and beyond the tests: a loss that takes 10 days in the middle, and 100 days."""
     celsius, percent = middle[0] - 5.0, middle[1]
@@ -171,7 +171,7 @@ def _lives(
         found = lifetime(fitted, goal, *place)
         yield Entry(f"{quantity} {title}", truth, found.low, found.high)
         yield Entry(f"{quantity} {title}, over all laws", truth, *over_laws(chosen, goal, *place))
-        yield Entry(f"{quantity} {title}, resampled", truth, *resampled(fitted, goal, *place, seed=seed))
+        yield Entry(f"{quantity} {title}, resampled", truth, *resampled(fitted, goal, *place))
         _, low, high = temperature_for(fitted, goal, truth / DAYS_PER_YEAR, place[1])
         yield Entry(f"{quantity} temperature, {title}", celsius, low, high)
 
