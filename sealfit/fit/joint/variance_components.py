@@ -35,7 +35,7 @@ MOST_GAIN = 0.5
 # A component below this share of the residual variance counts as zero.
 LEAST = 1e-5
 # A component of zero is no minimum if half the restricted deviance falls by more than this per share of the
-# residual variance. Of 290 estimates in seven campaigns three had such a component, and fell by 1.1 to 76.
+# residual variance. Of 289 estimates in six campaigns three had such a component, and fell by 1.1 to 76.
 FALLS = 1.0
 # Largest number of starts of an estimate.
 STARTS = 3
