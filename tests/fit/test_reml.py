@@ -144,7 +144,7 @@ def test_rounding_moves_no_variance_and_scatter_that_is_not_there_is_nothing():
     tangent = Tangent.dense(np.column_stack([np.ones(force.size), force]))
     kinds = [("file", "offset"), ("file", "gain"), ("run", "offset"), ("run", "gain"), ("specimen", "gain")]
     moved, none = [], 0
-    for _ in range(10):
+    for _ in range(40):
         residual = rng.normal(0, 0.05, force.size) + rng.normal(0, 0.2, 200)[codes["run"]]
         near = residual * (1 + 1e-12 * rng.normal(size=residual.size))
         one, other = (
@@ -164,7 +164,7 @@ def test_rounding_moves_no_variance_and_scatter_that_is_not_there_is_nothing():
         moved.append(np.abs(one - other).max() / one.max())
         none += one[4] == 0
     assert max(moved) < 1e-5
-    assert none >= 4  # a variance whose best value is at or below zero: half of all, and more beside others
+    assert none >= 16  # a variance whose best value is at or below zero: half of all, and more beside others
 
 
 def test_next_to_no_noise_beside_the_scatter_of_files_with_one_stroke_is_no_error():
