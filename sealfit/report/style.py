@@ -188,10 +188,17 @@ def compose(plot: Plot, kind: type[Figure] = Figure) -> Figure:
             _draw(panel, next(axes))
         for ax in axes:
             ax.remove()
-        spaces = {"handlelength": 1.8, "columnspacing": 1.4, "labelspacing": 0.35, "fontsize": 8}
-        title = {"title": plain(plot.title), "title_fontproperties": {"weight": "bold", "size": 10}}
-        handles = [_handle(key) for key in plot.legend]
-        legend = figure.legend(handles=handles, loc="outside upper left", ncols=entries, **title, **spaces)
+        legend = figure.legend(
+            handles=[_handle(key) for key in plot.legend],
+            loc="outside upper left",
+            title=plain(plot.title),
+            title_fontproperties={"weight": "bold", "size": 10},
+            ncols=entries,
+            handlelength=1.8,
+            columnspacing=1.4,
+            labelspacing=0.35,
+            fontsize=8,
+        )
         legend.set_alignment("left")
         return figure
 

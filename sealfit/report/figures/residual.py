@@ -243,9 +243,19 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
         spread = rows[f"{stage}_half_N"].fillna(0.0).to_numpy(float)
         places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
         face, above = ("white", 2) if stage == "before" else (colour, 3)
-        look = {"color": colour, "marker": marker, "markerfacecolor": face, "zorder": above, "linewidth": 0.8}
-        look |= {"linestyle": "-" if numeric else "", "rasterized": len(rows) > style.MOST_MARKS}
-        points, *_ = ax.errorbar(places, mean, spread, **look, **size)
+        points, *_ = ax.errorbar(
+            places,
+            mean,
+            spread,
+            color=colour,
+            marker=marker,
+            markerfacecolor=face,
+            zorder=above,
+            linestyle="-" if numeric else "",
+            linewidth=0.8,
+            rasterized=len(rows) > style.MOST_MARKS,
+            **size,
+        )
         if len(rows) <= style.MOST_MARKS:
             names = [number(value, 4) for value in x] if numeric else categories(rows, channel)
             texts = (f"{number(m, 3)} ± {number(s, 2)}" for m, s in zip(mean, spread, strict=True))
@@ -350,9 +360,17 @@ def draw_shape(ax: Axes, rows: pd.DataFrame, points: pd.DataFrame, effect: Mappi
         style.category_ticks(ax, categories(rows, channel))
     if len(points):
         places = points["x"] if numeric else np.arange(len(points)) + 0.15
-        look = {"fmt": "o", "markersize": 2.6, "elinewidth": 0.8, "capsize": 1.5, "zorder": 1.5}
-        mean, half = scale * points["value"], Z95 * scale * points["se"]
-        ax.errorbar(places, mean, half, color=style.FLOOR, **look)
+        ax.errorbar(
+            places,
+            scale * points["value"],
+            Z95 * scale * points["se"],
+            color=style.FLOOR,
+            fmt="o",
+            markersize=2.6,
+            elinewidth=0.8,
+            capsize=1.5,
+            zorder=1.5,
+        )
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
     ax.set_ylabel(shape_label(rows, effect, units, symbol_math))
 

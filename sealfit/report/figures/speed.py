@@ -58,10 +58,19 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
             ax.plot(speed, curve["after"], color=line.colour, linestyle="--" if backward else "-")
         for direction, points in line.points.groupby("direction"):
             marker, face = ("o", line.colour) if direction > 0 else ("<", "white")
-            look = {"fmt": marker, "markersize": 3.4, "markerfacecolor": face, "markeredgewidth": 0.9}
-            look |= {"elinewidth": 0.8, "capsize": 0.0 if dense else 1.5, "rasterized": dense}
-            speed, force, sd = points["speed"], points["force"], points["sd"].fillna(0.0)
-            drawn, *_ = ax.errorbar(speed, force, sd, color=line.colour, **look)
+            drawn, *_ = ax.errorbar(
+                points["speed"],
+                points["force"],
+                points["sd"].fillna(0.0),
+                color=line.colour,
+                fmt=marker,
+                markersize=3.4,
+                markerfacecolor=face,
+                markeredgewidth=0.9,
+                elinewidth=0.8,
+                capsize=0.0 if dense else 1.5,
+                rasterized=dense,
+            )
             if not dense:
                 explain(drawn, [_of_run(row, line.label, units) for row in points.to_dict("records")])
     if log:
