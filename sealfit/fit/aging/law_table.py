@@ -263,12 +263,18 @@ def law_rows(curve: SeriesCurve, found: Estimate, ends: CurveInterval, df: float
         ("b", b, b * se[2], b * move[2], ends["b"]),
         ("c", -a * u, found.error_of_c(), -u * move[1] - a * move[2], ends["c"]),
     ):
-        known, why = judged[name]
-        row = {"quantity": curve.quantity, "parameter": name, "unit": "d" if name == "b" else curve.unit}
-        row |= {"identified": known, "reason": " ".join(filter(None, (why, beside)))}
-        row |= {"value": value, "se": error, "u_sys": abs(systematic), "hi95": high}
-        lowest = None if name == "b" and low == 0.0 else low
-        yield table_row(**row, lo95=lowest) | {"series": curve.series}
+        yield table_row(
+            quantity=curve.quantity,
+            parameter=name,
+            value=value,
+            se=error,
+            lo95=None if name == "b" and low == 0.0 else low,
+            hi95=high,
+            u_sys=abs(systematic),
+            unit="d" if name == "b" else curve.unit,
+            identified=judged[name][0],
+            reason=" ".join(filter(None, (judged[name][1], beside))),
+        ) | {"series": curve.series}
 
 
 def _judge(curve: SeriesCurve, found: Estimate, ends: CurveInterval, t: float) -> dict[str, tuple[bool, str]]:
