@@ -122,12 +122,22 @@ def build_report(tables: Tables, closure: Mapping | None, provenance: Mapping, c
         images[name] = inline(figures[name]["svg"], name, alt)
     # "<" is escaped, as a name could otherwise end the script.
     runs = json.dumps(run_traces(tables, config), separators=(",", ":")).replace("<", "\\u003c")
-    units = config.units
-    about = {"tables": tables, "closure": closure, "provenance": provenance, "config": config}
-    about |= {"units": units, "unit": units.unit("force"), "force": units.quantity("force")}
-    about |= {"name": name_of(provenance, config), "names": ConditionNames(config)}
-    shown = {"plots": plots, "images": images, "runs": Markup(runs), "fitted": _fitted(tables, config)}
-    html = TEMPLATES.get_template("template.html").render(**about, **shown, **opening)
+    html = TEMPLATES.get_template("template.html").render(
+        tables=tables,
+        closure=closure,
+        provenance=provenance,
+        config=config,
+        units=config.units,
+        unit=config.units.unit("force"),
+        force=config.units.quantity("force"),
+        name=name_of(provenance, config),
+        names=ConditionNames(config),
+        plots=plots,
+        images=images,
+        runs=Markup(runs),
+        fitted=_fitted(tables, config),
+        **opening,
+    )
     return Report(html, figures)
 
 
