@@ -122,18 +122,16 @@ def _stroke(
 ) -> Stroke:
     """Return the stroke that takes these rows of a trace; before `begin` it slides at another speed."""
     time_s, displacement_mm, force_N = (values[begin : rows.stop] for values in motion[:3])
-    noise, tolerance, first = motion.noise_mm, settings.speed_tolerance, max(origin - begin, 0)
-    steady, sliding, left_N, rise_mm, settles = steady_window(
-        time_s, way * displacement_mm, way * force_N, first, noise, tolerance
-    )
+    along, noise, tolerance = way * displacement_mm, motion.noise_mm, settings.speed_tolerance
+    window = steady_window(time_s, along, way * force_N, max(origin - begin, 0), noise, tolerance)
     before = np.zeros(begin - rows.start)  # it slides there, at another speed
-    steady, sliding = np.r_[before > 0.0, steady], np.r_[before == 0.0, sliding]
-    left_N = way * np.r_[before, left_N]
+    steady, sliding = np.r_[before > 0.0, window.steady], np.r_[before == 0.0, window.sliding]
+    left_N = way * np.r_[before, window.left_N]
     time_s, displacement_mm = (values[rows] for values in motion[:2])
     speed = slope(time_s, displacement_mm, steady)
-    along = speed_along(time_s, displacement_mm, steady, rise_mm, speed, noise)
+    along = speed_along(time_s, displacement_mm, steady, window.rise_mm, speed, noise)
     short, ends = _too_short(way * displacement_mm, steady, settings), (rows.start, rows.stop)
-    return Stroke(*ends, origin, way, speed, steady, sliding, left_N, along, short, settles)
+    return Stroke(*ends, origin, way, speed, steady, sliding, left_N, along, short, window.settles)
 
 
 def _turns(

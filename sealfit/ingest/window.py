@@ -42,6 +42,22 @@ PARTS, MOST_PARTS, COMPARED = 20, 2, 8
 OFF = ((20.0, 0.002), (8.0, 0.1))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """The steady window of one stroke; arrays of shape (n,).
+
+    `steady` marks its rows, `sliding` those that move at all; `left_N` is what is left there of the
+    pre-sliding rise, positive against the motion, and `rise_mm` its length, 0 without one. `settles` is false
+    where the speed on the plateau changes by more than the tolerance.
+    """
+
+    steady: np.ndarray
+    sliding: np.ndarray
+    left_N: np.ndarray
+    rise_mm: float
+    settles: bool = True
+
+
 def steady_window(
     time_s: np.ndarray,
     along_mm: np.ndarray,
@@ -49,21 +65,17 @@ def steady_window(
     origin: int,
     noise_mm: float,
     tolerance: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]:
-    """Return `steady`, `sliding`, `left_N`, `rise_mm` and `settles` of one stroke.
+) -> Window:
+    """Return the steady window of one stroke, which may move from row `origin` on.
 
-    `steady` marks the rows of its steady window, `sliding` those that move at all; `left_N` is what is left
-    there of the pre-sliding rise, positive against the motion, and `rise_mm` its length, 0 without one.
-    `settles` is false where the speed on the plateau changes by more than the tolerance.
-
-    The stroke may move from row `origin` on. The arrays have shape (n,); displacement rises with the motion,
-    force is positive against it. `noise_mm` is the standard deviation of a displacement sample, `tolerance`
-    the share by which the speed may be off its plateau.
+    The arrays have shape (n,); displacement rises with the motion, force is positive against it. `noise_mm`
+    is the standard deviation of a displacement sample, `tolerance` the share by which the speed may be off
+    its plateau.
     """
     n = len(time_s)
     steady, sliding, left, length, settles = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n), 0.0, True
     if n < LEAST_SAMPLES:
-        return steady, sliding, left, length, settles
+        return Window(steady, sliding, left, length)
     # A glitch of one sample is not a rest.
     smooth = median_filter(along_mm, 5, mode="nearest")
     speed, half, blurred = local_speed(time_s, smooth, noise_mm, tolerance)
@@ -73,7 +85,7 @@ def steady_window(
     sliding = speed > STANDSTILL * plateau
     sliding[:origin] = moves[:origin] = False
     if plateau <= 0.0:
-        return steady, sliding, left, length, settles
+        return Window(steady, sliding, left, length)
     fast = speed >= (1.0 - tolerance) * plateau
     stroke, since = _StrokeMotion(time_s, along_mm, speed, fast, plateau, half), 0 if blurred else origin
     for first, last in stroke.moving(moves):
@@ -101,7 +113,7 @@ def steady_window(
             rows = slice(near[0], near[-1] + 1)
             settles &= _settles(time_s[rows], along_mm[rows], noise_mm, tolerance)
         since = last
-    return steady, sliding, left, length, settles
+    return Window(steady, sliding, left, length, settles)
 
 
 def _distance(time_s: np.ndarray, along_mm: np.ndarray, ramp_end: int, averaged: int) -> np.ndarray:
