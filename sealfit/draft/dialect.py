@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from sealfit.config import AGING_CONDITION
 from sealfit.draft.vocabulary import column_role, name_and_unit, plain, setting
-from sealfit.ingest.derived_columns import UNAGED_WORDS
+from sealfit.ingest.derived_columns import UNAGED_WORDS, means_unaged
 from sealfit.ingest.files import as_number, split_line
 from sealfit.ingest.listing import NUMBERS
 from sealfit.ingest.runs import formats_that_fit
@@ -239,7 +239,7 @@ def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Settin
         name, unit = name_and_unit(match["key"])
         value = match["value"].strip()
         number, ours = _NUMBER.match(value), setting(name)
-        is_word = ours in AGING_CONDITION and value.strip(STRAYS + '"').lower() in UNAGED_WORDS
+        is_word = ours in AGING_CONDITION and means_unaged(value.strip(STRAYS + '"'))
         if _SPECIMEN.fullmatch(plain(match["key"])):
             ours, pattern = "specimen_id", _after(match["key"], r'([^\s;,"][^;,\t"]*)')
         elif is_word or (number and as_number(number.group(), decimal or ".") is not None):

@@ -14,7 +14,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from sealfit.config import AGING_CONDITION, Files
-from sealfit.draft.vocabulary import AFTER, BEFORE, DIRECTIONS, RUBBERS, UNAGED, said_by
+from sealfit.draft.vocabulary import AFTER, BEFORE, DIRECTIONS, RUBBERS, said_by
+from sealfit.ingest.derived_columns import means_unaged
 
 # The ending of a file's name: with a letter, as in `v0.5` the last figure is none.
 SUFFIX = re.compile(r"\.(?=[^./]*[^\W\d])[^./]*$")
@@ -203,7 +204,7 @@ def read_names(files: Sequence[str]) -> Names:
     for file, pieces in cut.items():
         groups[shape_of(pieces)].append(file)
     # A word for unaged rubber may stand for what other names spell out, not the other way round.
-    unaged = {id(own) for own in groups.values() if any(one.text.lower() in UNAGED for one in cut[own[0]])}
+    unaged = {id(own) for own in groups.values() if any(means_unaged(one.text) for one in cut[own[0]])}
     main = max(groups.values(), key=lambda own: len(own) * (ALIKE if id(own) in unaged else 1.0))
     sign = None
     for base in sorted(groups.values(), key=lambda members: len(cut[members[0]])):
@@ -379,7 +380,7 @@ def _unaged(
 ) -> tuple[tuple[int, int] | None, list[str]]:
     """Return the range of pieces that a word such as `unaged` replaces, and these words."""
     days = [part.at for part in parts if part.ours == "aging_days"]
-    instead = [one for pieces in others for one in _words_instead(pieces, main) if one[2].lower() in UNAGED]
+    instead = [one for pieces in others for one in _words_instead(pieces, main) if means_unaged(one[2])]
     ranges = Counter((first, last) for first, last, _ in instead)
     first, last = ranges.most_common(1)[0][0] if ranges else (0, 0)
     if not days or not first <= days[0] < last:

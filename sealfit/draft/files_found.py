@@ -12,8 +12,9 @@ import numpy as np
 from sealfit.config import AGING_CONDITION, Config, TraceFormat
 from sealfit.draft.dialect import MIN_ROWS, SETTINGS, STRAYS, Dialect, sniff
 from sealfit.draft.file_names import shape_of, tokens
-from sealfit.draft.vocabulary import UNAGED, name_and_unit, setting
+from sealfit.draft.vocabulary import name_and_unit, setting
 from sealfit.errors import BadFile, CampaignError, RequestError, did_you_mean
+from sealfit.ingest.derived_columns import means_unaged
 from sealfit.ingest.files import as_number, as_utf8, read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of, read_arrays, value_text
 from sealfit.ingest.listing import is_utf8, natural, read_table
@@ -309,5 +310,5 @@ def _fits(meaning: str, column: Sequence[str]) -> bool:
     if meaning in ("specimen_id", "run_id", "rubber", "file"):
         return True
     if meaning in AGING_CONDITION:  # the words for unaged rubber
-        full = [cell for cell in full if cell.lower() not in UNAGED]
+        full = [cell for cell in full if not means_unaged(cell)]
     return sum(as_number(cell) is not None for cell in full) > 0.8 * len(full)

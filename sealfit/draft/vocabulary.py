@@ -153,10 +153,6 @@ AFTER = _by_word({
     ("speed_rpm", ""): "rpm",
     ("frequency_Hz", ""): "Hz",
 })  # fmt: skip
-UNAGED = {
-    "unaged", "fresh", "new", "virgin", "neu", "ungealtert", "frisch", "ref", "reference", "rt", "initial",
-    "neuf", "nuovo", "nuevo", "nieuw",
-}  # fmt: skip
 RUBBERS = {
     "nbr", "hnbr", "xnbr", "fkm", "ffkm", "epdm", "vmq", "fvmq", "acm", "aem", "nr", "sbr", "cr", "pu", "tpu",
     "ptfe",

@@ -19,7 +19,11 @@ from sealfit.units import Conversion
 
 COUNTS = {"repeat": "repeats", "stroke": "strokes"}  # whole numbers
 _MOSTLY = 0.5  # a column with more numbers than this is one of numbers, and the rest of its cells are slips
-UNAGED_WORDS = ("unaged", "fresh", "new", "rt")  # RT: kept at room temperature
+# Words for unaged rubber, in lower case. RT: kept at room temperature.
+UNAGED_WORDS = (
+    "unaged", "fresh", "new", "virgin", "rt", "ref", "reference", "initial", "ungealtert", "frisch", "neu",
+    "neuf", "nuovo", "nuevo", "nieuw",
+)  # fmt: skip
 _AGED_ONLY = ("temperature_C", "compression_ratio_pct")  # of unaged rubber nobody reads them
 
 
@@ -39,21 +43,22 @@ def with_day_0(columns: Columns, config: Config) -> Columns:
         return columns
     files = len(next(iter(columns.values())))
     days = columns.get("aging_days", [None] * files)
-    said = where(days, _means_unaged)
+    said = where(days, means_unaged)
     for name in others:
-        said |= ~known(days) & where(columns[name], _means_unaged)
+        said |= ~known(days) & where(columns[name], means_unaged)
     unaged = said | where(days, lambda value: _number(value) == 0)
     if not unaged.any():
         return columns
     changed = {"aging_days": put(days, dict.fromkeys(np.flatnonzero(said).tolist(), 0.0))}
     for name in others:
-        is_word = (lambda cell: math.isnan(_number(cell))) if name in _AGED_ONLY else _means_unaged
+        is_word = (lambda cell: math.isnan(_number(cell))) if name in _AGED_ONLY else means_unaged
         words = where(columns[name], is_word)
         changed[name] = put(columns[name], dict.fromkeys(np.flatnonzero(unaged & words).tolist()))
     return columns | changed
 
 
-def _means_unaged(cell: float | str) -> bool:
+def means_unaged(cell: float | str) -> bool:
+    """Return whether a cell, or a piece of a name, is one of `UNAGED_WORDS`."""
     return isinstance(cell, str) and cell.strip().lower() in UNAGED_WORDS
 
 

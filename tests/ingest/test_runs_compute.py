@@ -118,7 +118,16 @@ TABLE = "file,temperature_C,compression_ratio_pct,aging_days"
 
 @pytest.mark.parametrize(
     "row",
-    ["RT,none,unaged", "60,80,fresh", "room,free,0", "unaged,80,", "RT,RT,New", ",,0", "23,fresh,rt"],
+    [
+        "RT,none,unaged",
+        "virgin,virgin,Virgin",
+        "60,80,fresh",
+        "room,free,0",
+        "unaged,80,",
+        "RT,RT,New",
+        ",,0",
+        "23,fresh,rt",
+    ],
 )
 def test_unaged_rubber_in_words_is_day_0(tmp_path, row):
     folder = campaign(tmp_path, f"{TABLE}\na.csv,{row}\nb.csv,60,80,4\nc.csv,60,80,8")
