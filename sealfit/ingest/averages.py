@@ -57,12 +57,14 @@ def standard_error(values: np.ndarray) -> float:
 
 
 def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """Return the most frequent label in each group, shape (groups,); None for a group without one."""
-    codes, labels = pd.factorize(values)
+    """Return the most frequent label in each group, shape (groups,), the first in order of equally frequent
+    ones; None for a group without a label.
+    """
+    codes, labels = pd.factorize(values, sort=True)
     known = codes >= 0
     pairs, count = np.unique(group[known] * max(len(labels), 1) + codes[known], return_counts=True)
     made = np.full(groups, None, object)
-    order = np.argsort(count, kind="stable")  # the most frequent is written last
+    order = np.lexsort((-pairs, count))  # what is kept is written last
     owner, label = np.divmod(pairs[order], max(len(labels), 1))
     made[owner] = np.asarray(labels, object)[label] if len(labels) else None
     return made
@@ -359,5 +361,4 @@ def _mean_or_label(values: np.ndarray) -> float | str | None:
     """Return the mean of numbers, or the most frequent of labels; null of nothing."""
     if values.dtype.kind in "fiub":
         return float(values.mean()) if len(values) else np.nan
-    found = pd.Series(values).mode()
-    return found.iloc[0] if len(found) else None
+    return common_by_group(values, np.zeros(len(values), int), 1)[0]

@@ -92,6 +92,7 @@ def test_labels_of_a_bin_are_the_most_frequent_and_further_channels_are_averaged
         None,
         None,
     ]
+    assert common_by_group(np.array(["y", "x"], object), np.array([0, 0]), 1).tolist() == ["x"]
 
 
 @given(
