@@ -41,6 +41,7 @@ from sealfit.report.summary import (
     split_channels,
     verdict_clauses,
 )
+from sealfit.report.summary_lines import has_weak_evidence
 
 MOST_TESTS = 40
 CURVE_PLACES = 7  # of a free shape that a card lists
@@ -145,6 +146,8 @@ def left_over(closure: Mapping, config: Config) -> Markup:
         said.append(Markup("a significant residual remains{}").format(where))
     elif left["channel"] and any(effect["candidate"] for effect in closure["effects"]):
         said.append(Markup("the evidence rests on too few specimens: it varies{}").format(where))
+    elif left["channel"] and has_weak_evidence(left):
+        said.append(Markup("the evidence of what remains{} is weak").format(where))
     elif left["channel"]:
         said.append(Markup("no variable is significant. The smallest p-value:{}").format(where))
     else:

@@ -222,6 +222,10 @@ def test_what_is_left_is_called_scatter_only_if_it_is():
     text = left_over(document("unexplained", **left), Config())
     assert "A significant residual remains along displacement (mm) along strokes (p = 0.0005)." in text
     assert "scatter" not in text
+    weak = left_over(document(**left | {"significant": False}), Config())
+    assert "The evidence of what remains along displacement (mm) along strokes (p = 0.0005) is weak." in weak
+    none = left_over(document(**left | {"significant": False, "p_value": 0.3}), Config())
+    assert "No variable is significant. The smallest p-value: along displacement (mm)" in none
 
 
 def test_why_the_lack_of_fit_is_not_known_is_said():
