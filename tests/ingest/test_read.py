@@ -332,6 +332,7 @@ def test_units_rows_are_recognised_for_what_they_are(tmp_path):
     [
         "%Y-%m-%d %H:%M:%S.%f",
         "%Y-%m-%dT%H:%M:%S.%fZ",
+        "%Y-%m-%dT%H:%M:%S.%f+01:00",
         "%d.%m.%Y %H:%M:%S.%f",
         "%H:%M:%S.%f",
         "%I:%M:%S.%f %p",
