@@ -146,7 +146,8 @@ TARGET_POWER = 0.8  # Power (probability of detection) at the smallest effect.
 SIZE_MARGIN = 1.25  # Factor on `LEAST_SIZE`, found with `TARGET_POWER` at a standard error of a fifth.
 REAL_SHARE = 0.1  # Least share of a variable's variance at a level at which it varies.
 REAL_RATIO = 3.0  # Least ratio of its mean square at that level to that at finer levels.
-MATERIAL_SCATTER = 0.02  # Scatter between units, as a share of the force, that would matter as an effect.
+# Scatter between units or within strokes, as a share of the force, that would matter as an effect.
+MATERIAL_SCATTER = 0.02
 LEAST_POWER = 0.3  # Least exponent with which the margin of an effect is taken to increase with its size.
 FEW_UNITS = 30  # With fewer groups the sandwich covariance gets Satterthwaite's degrees of freedom.
 LEAST_SPARE_RUNS = 0.5  # Fewest residual degrees of freedom between runs to estimate their scatter.

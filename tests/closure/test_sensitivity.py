@@ -107,6 +107,19 @@ def test_a_campaign_of_nine_specimens_can_tell():
     assert undetectable_variables(selection, sensitivity(selection, 0.005), []) == []
 
 
+@pytest.mark.parametrize("slope", [0.01, 0.2])
+def test_strokes_that_differ_much_hide_an_effect_along_them(slope):
+    bins = make_bins(1, temperatures=(), speeds=(1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0), repeats=1, bins=6)
+    place = bins["displacement_mm"].abs() / bins["displacement_mm"].abs().max() - 0.5
+    own = dict(zip(bins["file"].unique(), np.random.default_rng(1).normal(0.0, slope, 99), strict=False))
+    bins["force_N"] *= 1 + bins["file"].map(own) * place
+    selection = searched(bins)
+    found = sensitivity(selection, 0.005)
+    (entry,) = [e for e in found if e["variable"] == "displacement_mm"]
+    assert entry["smallest_N"] is not None
+    assert ("displacement_mm" in undetectable_variables(selection, found, [])) == (slope == 0.2)
+
+
 def test_a_variable_of_an_effect_in_the_model_is_not_said_to_be_undecided():
     bins = make_bins(1, temperatures=(), speeds=(1.0, 4.0, 16.0, 64.0), repeats=1, bins=6)
     selection = searched(bins)
