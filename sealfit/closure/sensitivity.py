@@ -342,7 +342,7 @@ def undetectable_variables(
     fitted = selection.after
     rows, starts = fitted.rows, fitted.rows.groups.starts
     sd_N = float(np.sqrt(rows.weight @ about_means(fitted.residual, rows, "stroke") ** 2))
-    in_strokes = {"sd_N": sd_N, "sd_rel": sd_N / float(np.sqrt(rows.weight @ fitted.force**2))}
+    within_strokes = {"sd_N": sd_N, "sd_rel": sd_N / float(np.sqrt(rows.weight @ fitted.force**2))}
     in_model = _channels_in_model(selection)
     undetectable = []
     for entry in entries:
@@ -354,12 +354,12 @@ def undetectable_variables(
         if aside or entry["level"] != LEVEL_NAMES[channel.unit]:
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
-        in_stroke = channel.unit == "sample"
-        count = None if in_stroke else starts[channel.unit].size
-        own = [in_strokes] if in_stroke else [s for s in scatter if starts[s["level"]].size == count]
+        along = channel.unit == "sample"
+        count = None if along else starts[channel.unit].size
+        own = [within_strokes] if along else [s for s in scatter if starts[s["level"]].size == count]
         much = any(s["sd_rel"] > criteria.MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
         few_specimens = channel.unit == "specimen" and count < criteria.LEAST_UNITS_OF_SLOPES
-        decisive = in_stroke or channel.name == "direction" or few_specimens
+        decisive = along or channel.name == "direction" or few_specimens
         if much or (decisive and not np.isfinite(smallest)):
             undetectable.append(channel.name)
     return undetectable

@@ -57,14 +57,15 @@ def standard_error(values: np.ndarray) -> float:
 
 
 def common_by_group(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """Return the most frequent label in each group, shape (groups,), the first in order of equally frequent
-    ones; None for a group without a label.
+    """Return the most frequent label in each group, shape (groups,); None for a group without one.
+
+    Of equally frequent labels it is the first in alphabetical order.
     """
     codes, labels = pd.factorize(values, sort=True)
     known = codes >= 0
     pairs, count = np.unique(group[known] * max(len(labels), 1) + codes[known], return_counts=True)
     made = np.full(groups, None, object)
-    order = np.lexsort((-pairs, count))  # what is kept is written last
+    order = np.lexsort((-pairs, count))  # the most frequent is written last
     owner, label = np.divmod(pairs[order], max(len(labels), 1))
     made[owner] = np.asarray(labels, object)[label] if len(labels) else None
     return made

@@ -130,7 +130,7 @@ def _out_of_order(time_s: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------- cells
 OVERLOAD = 1e24  # no rig measures this; instruments write 9.9e37 for overload and 9.91e37 for no value (SCPI)
 LISTED = 20  # faults of one kind that are written out for a file; the rest is counted in one more
-# A time of day, after a date or not; with am or pm, or with a time zone, which is the same in the whole file.
+# A time of day, after a date or not, with am, pm or a time zone after it. One zone holds for a whole file.
 _CLOCK = re.compile(
     r"(?:.*[\sT])?(\d+):(\d\d):(\d\d(?:[.,]\d+)?)(?:\s*([ap])\.?m\.?|Z|[+-]\d\d:?\d\d)?", re.IGNORECASE
 )
