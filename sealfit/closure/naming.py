@@ -22,7 +22,7 @@ from sealfit.closure.linearised import ZERO_OFFSET, Proposal, linearised
 from sealfit.closure.ripples import Peak
 from sealfit.closure.score_test import Candidate
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.fit.joint import Fitted, fit, fitted_at, reestimated
+from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening
@@ -284,7 +284,7 @@ def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
 
 
 def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
-    """Yield the fitted proposals, likeliest first, under another scatter, from the better of two starts.
+    """Yield the fitted proposals, likeliest first, fitted under another scatter: the better of two starts.
 
     One is their own fit. The other has v_s and b searched anew, with the likeliest effect on each quantity.
     """
@@ -294,12 +294,12 @@ def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter)
         model = fitted.model.with_term(proposal.term, proposal.values)
         target = proposal.term.target
         if target in begun:
-            model = replace(model, theta=begun[target])
+            model = solve_linear(replace(model, theta=begun[target]), rows, scatter, loads)
         else:
             model = search_nonlinear(model, rows, scatter)
-        starts = [solve_linear(start, rows, scatter, loads) for start in (model, proposal.fitted.model)]
-        best = min(starts, key=lambda start: fitted_at(start, rows, scatter, loads).deviance)
-        anew = fit(best, rows, scatter, turns=0, loads=loads)
+        starts = [model, proposal.fitted.model]
+        fits = [fit(start, rows, scatter, turns=0, loads=loads) for start in starts]
+        anew = min(fits, key=lambda f: f.deviance)
         begun.setdefault(target, anew.model.theta)
         yield replace(proposal, fitted=anew)
 
