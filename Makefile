@@ -2,11 +2,12 @@
 PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 BIN := .venv/bin
+PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -rs -n auto --dist loadfile --no-loadscope-reorder
 NO_NETWORK = echo "make: the packages that sealfit needs could not be installed; pip says why above." >&2
 CODE := $(wildcard sealfit tests benchmarks docs/generate.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test golden torture torture-rivals lint audit check docs bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean
+.PHONY: help demo test test-long golden torture torture-rivals lint audit check docs bench bench-null bench-effects bench-coverage bench-loop bench-loop-cost bench-start bench-speed bench-worlds paper clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST)
@@ -14,8 +15,11 @@ help: ## list these targets
 demo: .venv/.installed ## analyse the simulated campaign in sample_data, and say where the report is
 	@$(BIN)/sealfit run sample_data/simulated --out demo-out
 
-test: lint ## lint and run every test
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -rs -n auto --dist loadfile --no-loadscope-reorder
+test: lint ## lint and run the tests
+	$(PYTEST)
+
+test-long: .venv/.installed-test ## counts over many simulated campaigns, and large campaigns: what make test leaves out
+	$(PYTEST) -m long
 
 golden: .venv/.installed-test ## compare ten campaigns with what is on record; after every step that is to move no number (three minutes)
 	$(BIN)/python -m pytest -rs -n auto -m golden tests/golden

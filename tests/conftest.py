@@ -27,7 +27,7 @@ def pytest_xdist_auto_num_workers():
     return len(os.sched_getaffinity(0)) + 1 if hasattr(os, "sched_getaffinity") else None
 
 
-# Files of a minute and more, and of one long test or fixture: begun last they would be waited for alone.
+# Files of half a minute and more: begun last they would be waited for alone.
 LONG_FILES = (
     "test_measured_samples.py",
     "test_docs.py",

@@ -182,7 +182,7 @@ SHORT = {
 
 @pytest.mark.parametrize(
     ("name", "effect"),
-    [("short", "ripple"), ("there_and_back", "zero_offset")],
+    [pytest.param("short", "ripple", marks=pytest.mark.long), ("there_and_back", "zero_offset")],
 )
 def test_claims_do_not_hang_on_what_does_not_matter(name, effect):
     given = campaign(name).told(loop={"folds": 2})

@@ -59,6 +59,7 @@ def test_every_published_number_stands_beside_ours():
     assert [line.ours for line in lines[-2:]] == [49.0, 35.0]
 
 
+@pytest.mark.long
 def test_the_page_of_the_paper_is_made_in_short(tmp_path):
     script = Path(__file__).resolve().parent.parent / "benchmarks" / "paper.py"
     folders = ["--work", str(tmp_path / "work"), "--docs", str(tmp_path / "docs")]

@@ -25,6 +25,7 @@ def sliding(out):
     return rows.sort_values("condition")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "part", [PRESSURE, '"', '- pressure_bar * 55.6"'], ids=["author's area", "no area", "7 % more"]
 )

@@ -45,6 +45,7 @@ def tilted(level, size_N, seed):
     return shape
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("days", "level"),
     [((1.0, 4.0, 16.0), ["condition"]), ((4.0,), ["condition"]), ((1.0, 4.0), ["run_id"])],

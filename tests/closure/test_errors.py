@@ -1,5 +1,6 @@
 import numpy as np
 import pandas as pd
+import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.errors_and_intervals import lack_of_fit
@@ -18,6 +19,7 @@ def test_repeats_show_a_slope_along_strokes_that_the_model_lacks():
     assert p_value(0, slope_N=0.3) < 1e-6
 
 
+@pytest.mark.long
 def test_without_a_misfit_p_values_are_not_small_more_often_than_by_chance():
     """One specimen at eight speeds, three times each.
 

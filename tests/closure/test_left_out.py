@@ -80,6 +80,7 @@ def test_few_files_that_scatter_are_no_outliers():
         assert outlier_files(make_rows(bins, has_aging=True)) == []
 
 
+@pytest.mark.long
 def test_no_file_is_left_out_where_another_may_be_the_wrong_one():
     """Twelve files, three speeds both ways: without either of two files the others agree."""
     design = {"days": (4.0,), "temperatures": (60.0,), "speeds": (1.0, 10.0, 100.0), "directions": (1, -1)}
@@ -90,6 +91,7 @@ def test_no_file_is_left_out_where_another_may_be_the_wrong_one():
         assert files[number] in (one.file, *one.instead)
 
 
+@pytest.mark.long
 def test_no_file_is_left_out_where_the_rest_does_not_predict_it_without_another():
     """Two days of four speeds: without the wrong file, one other file determines v_s of the condition."""
     design = {"days": (1.0, 12.0), "temperatures": (40.0, 100.0), "speeds": (2.35, 9.4, 37.5, 150.0)}

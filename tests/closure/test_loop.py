@@ -127,6 +127,7 @@ def test_a_repeat_of_the_loop_gives_the_same_to_the_last_digit(null):
     assert json.dumps(again.document) == json.dumps(closure.document)
 
 
+@pytest.mark.long
 def test_a_search_of_a_part_ends_with_the_numbers_of_a_search_of_all(warming, monkeypatch):
     bins, whole = warming
     monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)
@@ -209,6 +210,7 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     assert any("second specimen" in run["why"] for run in document["next_runs"])
 
 
+@pytest.mark.long
 def test_an_effect_of_sliding_power_is_found_and_predicted_from_load_and_speed():
     def warm_when_hard_driven(table, force):
         load = 50.0 * 2.0 ** (table["repeat"].to_numpy() - 2.0)
@@ -284,6 +286,7 @@ def of_two_loads(**options):
     return pd.concat(tables, ignore_index=True)
 
 
+@pytest.mark.long
 def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load():
     bins = of_two_loads(temperatures=(60.0,), days=(4.0,), bins=3, repeats=2, **SCATTER)
     (found,) = close(bins).document["effects"]

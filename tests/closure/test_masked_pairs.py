@@ -41,6 +41,7 @@ def test_a_slope_along_strokes_and_its_change_with_pressure_hide_each_other():
     )
 
 
+@pytest.mark.long
 def test_pairs_of_chance_are_not_found_too_often():
     """By chance in 10 %: in more than 5 of 20 with p 0.01; were it 40 %, in more than 5 of 20 with p 0.87."""
     bins = (make_bins(seed, speeds=FOUR, repeats=1, run_channels=PRESSURE, **ONE) for seed in range(20))

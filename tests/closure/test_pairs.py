@@ -41,6 +41,7 @@ def test_product_of_two_columns_is_found_and_predicted():
     assert forces[1] / forces[0] - 1 == pytest.approx(0.04, rel=0.2)
 
 
+@pytest.mark.long
 def test_slope_in_one_batch_only_is_found():
     def in_b(table, force):
         return (

@@ -80,6 +80,7 @@ def test_residuals_of_friction_count_along_the_motion_where_strokes_go_both_ways
     assert np.ptp(own["before_N"]) == pytest.approx(1.0, rel=0.2)
 
 
+@pytest.mark.long
 def test_intervals_of_mean_residuals_hold_zero_where_nothing_is_missing():
     held = []
     for seed in range(12):

@@ -32,6 +32,7 @@ def test_an_induction_time_is_found_though_the_declared_law_bends_towards_it():
     assert proposal.values["A"] == pytest.approx(0.15, rel=0.15)
 
 
+@pytest.mark.long
 def test_specimens_that_scatter_show_no_law():
     few = {"speeds": (1.0, 4.0, 16.0, 64.0), "bins": 2, "specimen": 0.02}
     smallest = [min(c.p_value for c, _ in laws_of(seed + 40, **few)) for seed in range(12)]

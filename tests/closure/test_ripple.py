@@ -93,11 +93,13 @@ def test_hum_in_time_is_not_taken_for_position():
     assert peak.wavelength == pytest.approx(0.3, rel=0.02)
 
 
+@pytest.mark.long
 def test_noise_alone_seldom_looks_like_a_ripple():
     white = [find_ripple(make_samples(seed=s, files=10), common_phase=True).p_value for s in range(60)]
     assert np.mean(np.array(white) < 0.05) <= 0.1  # nominal 5 %; 60 draws: at most 6
 
 
+@pytest.mark.long
 def test_correlated_noise_is_not_a_ripple():
     found = []
     for seed in range(25):
@@ -156,6 +158,7 @@ def test_a_smooth_shape_of_all_strokes_is_no_wave(shape, back):
     assert peak.p_value > 1e-3
 
 
+@pytest.mark.long
 def test_smooth_shapes_of_files_seldom_look_like_a_wave():
     found = [find_ripple(short_strokes(s, files=8, each=0.5), common_phase=True).p_value for s in range(60)]
     assert np.mean(np.array(found) < 0.05) <= 0.1  # nominal 5 %
@@ -176,6 +179,7 @@ def test_a_ripple_of_one_file_is_the_same_in_all_of_its_strokes():
     assert peak.p_value < 1e-4
 
 
+@pytest.mark.long
 def test_noise_of_one_file_seldom_looks_like_a_ripple():
     white = [find_ripple(one_file(seed), common_phase=True).p_value for seed in range(60)]
     assert np.mean(np.array(white) < 0.05) <= 0.1  # nominal 5 %

@@ -144,6 +144,7 @@ def test_hotelling_p_is_students_t_for_one_column():
     assert np.exp(log_p_of_score(np.array([441 / 91]), 1, 6)[0]) == pytest.approx(t.pvalue, rel=1e-9)
 
 
+@pytest.mark.long
 def test_p_values_of_nulls_are_not_too_small():
     smallest = []
     for seed in range(24):
@@ -264,6 +265,7 @@ def test_a_drift_between_repeats_of_few_runs_is_seen_and_named_by_the_calendar()
     assert named.fitted.model.values[-1]["A"] == pytest.approx(0.02, rel=0.25)
 
 
+@pytest.mark.long
 def test_repeats_of_few_runs_that_drift_each_its_own_way_are_no_drift():
     """Each run has a slope of its own along its repeats: the files of one run scatter unequally."""
     alarms = 0

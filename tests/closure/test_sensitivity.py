@@ -44,6 +44,7 @@ def p_with(bins, size_pct):
     return min(c.p_value for c in searched(made).last if c.channels[-1] == "oil_ppm")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("repeats", [1, 2], ids=["twenty-four runs", "with repeats"])
 def test_the_evidence_is_weak_for_half_the_stated_effect_and_strong_for_twice_as_much(repeats):
     bins = make_bins(4, repeats=repeats, run_channels=OIL, **SMALL)

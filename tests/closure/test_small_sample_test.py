@@ -71,6 +71,7 @@ def test_many_units_are_made_independent_as_few_are():
     assert many @ numbers[:, 0] == pytest.approx(found[:, 0], rel=1e-12)
 
 
+@pytest.mark.long
 def test_p_values_along_a_dozen_specimens_are_not_too_small():
     smallest = []
     for seed in range(24):

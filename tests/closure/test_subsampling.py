@@ -142,6 +142,7 @@ def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatc
         assert not effect.rivals
 
 
+@pytest.mark.long
 def test_what_only_all_strokes_show_has_all_of_them_searched(monkeypatch):
     monkeypatch.setattr("sealfit.closure.subsampling.STROKES", 60)
     monkeypatch.setattr("sealfit.closure.subsampling.RUNS", 1)

@@ -187,6 +187,7 @@ def test_profile_of_b_is_that_of_the_whole_problem():
         npt.assert_allclose(2 * refitted.cost - fit.chi2, 3.84, rtol=0.01)
 
 
+@pytest.mark.long
 def test_specimen_scatter_is_found_by_paule_and_mandel():
     found = []
     for seed in range(40):
@@ -230,6 +231,7 @@ def test_the_sensor_moves_mu_0_and_leaves_a_and_b(aged):
     assert law(aged, "mu_s", "b").u_sys < 1e-4
 
 
+@pytest.mark.long
 def test_intervals_cover_with_scatter_between_specimens(campaign):
     """24 campaigns of two series with 2 % between specimens make 48 intervals.
 

@@ -70,6 +70,7 @@ def test_recovers_the_law_without_noise():
     assert np.abs(fitted.residual).max() < 1e-3
 
 
+@pytest.mark.long
 def test_standard_errors_match_the_scatter_of_estimates():
     values, errors = [], []
     for seed in range(40):

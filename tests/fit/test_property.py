@@ -144,6 +144,7 @@ def test_values_that_the_other_specimens_contradict_are_named_with_what_to_do():
     assert "line 32" in property_sentences(one)
 
 
+@pytest.mark.long
 def test_values_are_rarely_far_off_by_chance_and_rounded_ones_never():
     named = [len(far_off(specimens(law, count=3, seed=seed))) for seed in range(300)]
     assert sum(named) <= 2

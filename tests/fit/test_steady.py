@@ -102,6 +102,7 @@ def test_strokes_of_a_file_are_averaged_before_its_repeats(campaign):
     pd.testing.assert_frame_equal(run_means(uneven), run_means(table))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("setup", [0.0, 0.02])
 def test_intervals_cover(campaign, setup):
     """40 campaigns of three conditions: 95 % intervals cover, with and without scatter between set-ups."""
@@ -258,6 +259,7 @@ def test_without_repeats_the_residual_is_the_scatter_and_lack_of_fit_is_null(cam
     npt.assert_allclose(row.value, 0.7, atol=4 * row.se)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("noise", "constant"), [(0.01, 0.0), (0.0, 0.3)], ids=["relative", "constant"])
 def test_without_repeats_the_residuals_say_how_scatter_goes_with_force(campaign, noise, constant):
     """mu_s is seen where the force is largest.
@@ -385,6 +387,7 @@ def test_units_of_parameters_are_those_of_their_numbers(speed, load, mu, sigma_2
     assert (units["mu_s"], units["sigma_2"]) == (mu, sigma_2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("speeds", "setup"), [((1, 5, 25), 0.0), ((1, 5, 25), 0.01), ((0.5, 3), 0.0)])
 def test_few_speeds_give_the_mean_over_them_and_intervals_that_cover(campaign, speeds, setup):
     """Too few speeds for a Stribeck curve: its fall, the same every day, is no scatter between runs."""

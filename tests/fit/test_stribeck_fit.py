@@ -188,6 +188,7 @@ def test_flat_friction_has_open_intervals():
     assert high[0, 0] > 100  # mu_s: a spike below the slowest speed cannot be excluded
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("df", [np.inf, 12])
 def test_no_stribeck_is_rejected_as_often_as_its_level_says(df):
     """2000 flat campaigns, nominal 5 %: 3 standard errors of the count are 1.5 %."""

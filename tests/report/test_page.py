@@ -311,6 +311,7 @@ def test_traces_of_runs_are_in_the_page_thinned_where_they_are_many(small):
     assert run_traces({**small.tables, **unfitted}, small.config)["runs"] == {}
 
 
+@pytest.mark.long
 def test_paper_sized_campaign_gives_a_page_that_can_be_mailed(only_drawings):
     made = paper_sized()
     assert made.tables["steady"]["file"].nunique() == 1752

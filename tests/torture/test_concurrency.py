@@ -24,6 +24,7 @@ def test_an_answer_is_that_of_one_state_or_a_refusal(said, state):
     assert concurrency.state_of(said, ["5 d", "6 d"]) == state
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(concurrency.os, "fork"), reason="needs fork")
 def test_the_short_form(tmp_path):
     words = ["--writers", "1", "--rounds", "1", "--readers", "5", "--seconds", "0.2", "--losses", "0"]

@@ -123,6 +123,7 @@ def test_a_store_that_does_not_sync_is_found(tmp_path):
     assert unsound.endswith("is neither the old nor the new one (0 bytes)") or "no JSON" in unsound
 
 
+@pytest.mark.long
 def test_the_short_form():
     scenes = ["--scenes", "fit-aging --values", "predict", "fit-steady"]
     words = ["--points", "12", "--limits", "0", "--kills", "0", "--jobs", "1", "--seed", "5"]

@@ -32,12 +32,14 @@ def peak_MiB(folder: Path) -> float:
     return json.loads(done.stdout)["MiB"]
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_number_of_files(tmp_path):
     write_campaign(tmp_path / "few", 50, rows=load.TINY)
     write_campaign(tmp_path / "many", 500, rows=load.TINY)
     assert peak_MiB(tmp_path / "many") < peak_MiB(tmp_path / "few") + 60
 
 
+@pytest.mark.long
 def test_memory_of_a_long_trace_is_a_small_multiple_of_its_file(tmp_path):
     load.write_long(tmp_path / "short", 1_000)
     load.write_long(tmp_path / "long", 200_000)
@@ -50,6 +52,7 @@ def test_a_hundred_columns_are_read(tmp_path):
     assert peak_MiB(tmp_path / "wide") < 300
 
 
+@pytest.mark.long
 def test_nothing_grows_and_nothing_is_left_after_runs_in_a_row(tmp_path):
     found = load.in_a_child(12, tmp_path, report=False)
     assert found["growth_MiB"] < 8
