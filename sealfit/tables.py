@@ -265,7 +265,7 @@ RESIDUALS_AFTER = table("residuals_after", *_RESIDUALS, open_=True)
 LEVELS = table(
     "levels",
     Column("stage", "before | after", TEXT),
-    Column("level", "sample | stroke | file | run | specimen", TEXT),
+    Column("level", "sample | stroke | file | run | set_up | specimen", TEXT),
     Column("channel", "null for the whole level; else a channel that varies at it", TEXT),
     Column(
         "sd_N", "standard deviation of the residual at this level, or of the part that the channel explains"

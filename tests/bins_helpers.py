@@ -129,6 +129,17 @@ def warm(table: pd.DataFrame, force: np.ndarray) -> np.ndarray:
     return force * (1 - 0.05 * (1 - np.exp(-table["time_s"].to_numpy() / 3)))
 
 
+def mounted_anew(seed: int, sd: float = 0.01, **options) -> pd.DataFrame:
+    """Return bins whose files of a specimen and repeat have a gain in common, in the order of mounts."""
+    bins = make_bins(seed, temperatures=(60.0,), bins=4, **options)
+    mount = bins["specimen_id"] + bins["repeat"].astype(str)
+    bins["run_order"] = bins.groupby([mount, "file"], sort=True).ngroup() + 1.0
+    bins["elapsed_h"] = 0.1 * bins["run_order"]
+    number = bins.groupby(mount, sort=True).ngroup()
+    gains = 1 + np.random.default_rng(seed + 1000).normal(0, sd, number.max() + 1)
+    return bins.assign(force_N=bins["force_N"] * gains[number], mount=number + 1.0)
+
+
 def make_traces(bins: pd.DataFrame) -> pd.DataFrame:
     """Return the bins themselves as steady samples: what the ripple search sees."""
     return bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(

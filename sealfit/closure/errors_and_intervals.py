@@ -197,7 +197,8 @@ def level_table(
     parts = [("sample", noise, free), *_scatter_by_level(fitted)]
     total = sum(variance for _, variance, _ in parts) or 1.0
     records = [
-        (stage, level, None, np.sqrt(variance), variance / total, df, None) for level, variance, df in parts
+        (stage, rows.level_name(level), None, np.sqrt(variance), variance / total, df, None)
+        for level, variance, df in parts
     ]
     best: dict[tuple, Candidate] = {}
     for candidate in candidates:
@@ -209,7 +210,7 @@ def level_table(
         share = variance / max(searched.rmse_N**2, 1e-300)
         found = (np.sqrt(variance), share, float(candidate.test_result.df), candidate.p_value)
         units = [channels[own].unit for own in candidate.channels if own in channels] or [candidate.unit]
-        records.append((stage, min(units, key=FINER.get), name, *found))
+        records.append((stage, rows.level_name(min(units, key=FINER.get)), name, *found))
     return pd.DataFrame(records, columns=TABLE_OF_LEVELS.names())
 
 
@@ -228,7 +229,7 @@ def scatter_list(fitted: Fitted) -> list[dict]:
     for level, variance, df in _scatter_by_level(fitted):
         if variance > 0:
             sizes = {"sd_rel": float(np.sqrt(variance / mean_square)), "sd_N": float(np.sqrt(variance))}
-            found.append({"level": level, **sizes, "df": df})
+            found.append({"level": fitted.rows.level_name(level), **sizes, "df": df})
     return found
 
 

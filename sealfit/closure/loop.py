@@ -35,7 +35,8 @@ from sealfit.effects.user import load_user_effects
 from sealfit.engine.run_map import run_map
 from sealfit.fit.joint import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate, shape_of
-from sealfit.fit.joint.rows import LEVELS, Rows, make_rows
+from sealfit.fit.joint.rows import LEVELS, SET_UP, Rows, make_rows
+from sealfit.fit.joint.set_ups import with_set_ups
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import Silent, timed
 
@@ -68,7 +69,9 @@ def close_loop(
     context = Context(config, effects, say, workers=workers)
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins
-    rows = make_rows(counted, has_aging=config.aging)
+    rows = make_rows(with_set_ups(counted), has_aging=config.aging)
+    if rows.level_name("run") == SET_UP:
+        say("files of a specimen with the same repeat scatter alike: they are one set-up")
     outliers = outlier_files(rows)
     left_out = [one.file for one in outliers if not one.instead]
     if left_out:
@@ -96,7 +99,8 @@ def close_loop(
             say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
             continue
         repeated = ": the search repeated without each fold" if heldout.repeats else ""
-        say(f"held out by {heldout.level}{repeated}")
+        unit = rows.level_name(heldout.level).replace("_", "-")
+        say(f"held out by {unit}{repeated}")
         with timed("held out", rows=len(heldout.masks), of="folds"):
             held_before, held_after, determined, found = heldout.forces(selection, say)
             within = heldout.covered(after.model)
@@ -107,7 +111,7 @@ def close_loop(
         break
     before, after = models.before, models.after
     drawn = _drawn_tables(selection, before, after, config)
-    document = closure_document(selection, models, heldout.level, config, effects, outliers)
+    document = closure_document(selection, models, unit, config, effects, outliers)
     bins = rows.table[columns].iloc[np.argsort(rows.order)]  # in their original order
     tables = {
         "effects": effect_table(document["effects"], selection.added),

@@ -242,7 +242,7 @@ def channels_of(term: Term, rows: Rows) -> list[str]:
 def effect_level(term: Term, rows: Rows) -> str:
     """Return the finest level at which one of the effect's channels varies, in closure.json's words."""
     units = [unit_of(rows.values(name), rows) for name in channels_of(term, rows)]
-    return LEVEL_NAMES[min(units, key=FINER.get)]
+    return LEVEL_NAMES[rows.level_name(min(units, key=FINER.get))]
 
 
 def form_of(term: Term) -> str:
@@ -310,10 +310,11 @@ def _left(selection: Selection) -> tuple[str | None, str | None, float | None]:
     if left is None:
         return None, None, min((c.p_value for c in selection.left_over), default=None)
     names = [selection.channels[n].unit for n in left.channels if n in selection.channels]
-    level = LEVEL_NAMES[min(names or [left.unit], key=FINER.get)]
+    level = min(names or [left.unit], key=FINER.get)
     if left.channels[0] == "direction" and len(left.channels) > 1:
-        level = LEVEL_NAMES[max(names, key=FINER.get)]  # offsets differ along the other channel
-    return level, " ".join(left.channels), left.p_value
+        level = max(names, key=FINER.get)  # offsets differ along the other channel
+    name = LEVEL_NAMES[selection.after.rows.level_name(level)]
+    return name, " ".join(left.channels), left.p_value
 
 
 def _unsteady_offset(selection: Selection) -> Candidate | None:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri, stdtrit
 
 from sealfit.closure import criteria
-from sealfit.closure.channels import Channel, scatter_level, too_short
+from sealfit.closure.channels import FINER, Channel, scatter_level, too_short
 from sealfit.closure.confirm import about_means
 from sealfit.closure.multiplicity import critical_many, critical_small_sample
 from sealfit.closure.score_test import Candidate, ScoreTests, project
@@ -32,7 +32,7 @@ from sealfit.closure.small_sample_test import (
     moderated,
 )
 from sealfit.fit.joint import Fitted
-from sealfit.fit.joint.rows import ALONG, LEVELS
+from sealfit.fit.joint.rows import ALONG, LEVELS, SET_UP
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
@@ -49,7 +49,10 @@ FRICTION = ("mu", "multiply")
 
 # Channels that describe the order of the tests. They do not make the verdict `cannot_tell`.
 ASIDE = ("run_order", "elapsed_h", "repeat")
-LEVEL_NAMES = {"sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "specimen": "condition"}
+LEVEL_NAMES = {
+    "sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", SET_UP: SET_UP,
+    "specimen": "condition",
+}  # fmt: skip
 
 
 def sensitivity(selection: Selection, alpha: float) -> list[dict]:
@@ -90,7 +93,7 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 if channel.unit == "sample" and specimens > 1:
                     units = min(units, specimens)
                 needed = int(np.ceil(files * least / units)) if units < least else None
-            entry = {"variable": name, "level": LEVEL_NAMES[level], "acts_on": target[0]}
+            entry = {"variable": name, "level": LEVEL_NAMES[rows.level_name(level)], "acts_on": target[0]}
             percent = None if smallest is None else 100 * smallest / force
             entries.append({**entry, "smallest_N": smallest, "smallest_pct": percent, "files_needed": needed})
     # No variable describes how specimens differ.
@@ -111,7 +114,7 @@ def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
     Effect and error are taken about the means of the groups within which the effect varies.
     """
     rows = fitted.rows
-    around = dict(zip(LEVEL_NAMES, (*LEVELS, None), strict=True))[level]
+    around = dict(zip(FINER, (*LEVELS, None), strict=True))[level]
     own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit  # not explained by the model
     squares = [rows.weight @ about_means(x, rows, around) ** 2 for x in (own, fitted.residual)]
     size, left = np.sqrt(squares).tolist()
@@ -132,7 +135,7 @@ def _parts(
     means = [column, *(groups.means(column, level)[groups.codes[level]] for level in LEVELS), 0 * column]
     sizes = [column.size, *(groups.starts[level].size for level in LEVELS), 1]
     parts, real, finer = {}, [], 0.0
-    for k, level in enumerate(LEVEL_NAMES):
+    for k, level in enumerate(FINER):
         parts[level] = means[k] - means[k + 1]
         square = weight @ parts[level] ** 2
         each = square / max(sizes[k] - sizes[k + 1], 1)  # mean square
@@ -341,6 +344,7 @@ def undetectable_variables(
     """
     fitted = selection.after
     rows, starts = fitted.rows, fitted.rows.groups.starts
+    sizes = {rows.level_name(level): start.size for level, start in starts.items()}
     sd_N = float(np.sqrt(rows.weight @ about_means(fitted.residual, rows, "stroke") ** 2))
     within_strokes = {"sd_N": sd_N, "sd_rel": sd_N / float(np.sqrt(rows.weight @ fitted.force**2))}
     in_model = _channels_in_model(selection)
@@ -351,12 +355,12 @@ def undetectable_variables(
             continue
         channel: Channel = selection.channels[entry["variable"]]
         aside = channel.grouping or channel.name in in_model or channel.name in ASIDE
-        if aside or entry["level"] != LEVEL_NAMES[channel.unit]:
+        if aside or entry["level"] != LEVEL_NAMES[rows.level_name(channel.unit)]:
             continue
         smallest = np.inf if entry["smallest_N"] is None else entry["smallest_N"]
         along = channel.unit == "sample"
         count = None if along else starts[channel.unit].size
-        own = [within_strokes] if along else [s for s in scatter if starts[s["level"]].size == count]
+        own = [within_strokes] if along else [s for s in scatter if sizes[s["level"]] == count]
         much = any(s["sd_rel"] > criteria.MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
         few_specimens = channel.unit == "specimen" and count < criteria.LEAST_UNITS_OF_SLOPES
         decisive = along or channel.name == "direction" or few_specimens

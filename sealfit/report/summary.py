@@ -266,7 +266,7 @@ def of_effects(effects: Iterable[Effect], units: Units) -> list[dict]:
 LEVEL_WORDS = {
     "trace": "along strokes", "sample": "along strokes", "stroke": "between strokes",
     "repeat": "between files", "file": "between files", "run": "between runs",
-    "condition": "between specimens", "specimen": "between specimens",
+    "set_up": "between set-ups", "condition": "between specimens", "specimen": "between specimens",
 }  # fmt: skip
 NAMED = 3  # variables whose smallest effect a sentence gives
 

@@ -6,7 +6,17 @@ import numpy as np
 import numpy.testing as npt
 import pandas as pd
 import pytest
-from bins_helpers import LOAD_N, MANY_SPEEDS, THREE_FOLDS, TRUE, TWO_FOLDS, make_bins, make_traces, warm
+from bins_helpers import (
+    LOAD_N,
+    MANY_SPEEDS,
+    THREE_FOLDS,
+    TRUE,
+    TWO_FOLDS,
+    make_bins,
+    make_traces,
+    mounted_anew,
+    warm,
+)
 
 from sealfit.closure.confirm import TOO_SMALL
 from sealfit.closure.loop import close_loop
@@ -293,6 +303,19 @@ def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load():
     assert (found["id"], found["channels"][-1]) == ("power_viscous", "speed_mm_s")
     values = {p["name"]: p["value"] for p in found["parameters"]}
     assert values["n"] == pytest.approx(2.0, abs=0.3)
+
+
+def test_an_effect_between_set_ups_is_found_and_its_level_is_theirs():
+    bins = mounted_anew(3)
+    oil = 2.0 * (bins["mount"].to_numpy() % 4)
+    bins = bins.assign(oil_ppm=oil, force_N=bins["force_N"] * (1 + 0.03 * oil))
+    made = close(bins)
+    (found,) = made.document["effects"]
+    assert (found["channels"], found["level"]) == (["oil_ppm"], "set_up")
+    assert made.document["heldout_unit"] == "set-up"
+    assert {"set_up", "file"} <= {scatter["level"] for scatter in made.document["scatter"]}
+    assert "run" not in set(made.tables["levels"]["level"])
+    assert "run" not in {entry["level"] for entry in made.document["sensitivity"]}
 
 
 def test_a_speed_held_out_of_three_is_not_determined_by_the_other_two():

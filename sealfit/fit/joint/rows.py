@@ -106,6 +106,8 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
 # ---------------------------------------------------------------- rows
 # Grouping levels, finest first. A row of `bins` is a mean of samples of a stroke.
 LEVELS = ("stroke", "file", "run", "specimen")
+# Column of the set-up of each row, if repeats are set-ups. The groups of level "run" are then set-ups.
+SET_UP = "set_up"
 # Channels that increase along a stroke, so that they vary within a bin.
 ALONG = ("displacement_mm", "distance_mm", "time_s")
 # Derived channel if loads differ: load times |speed|, the power of friction over its coefficient.
@@ -118,7 +120,7 @@ SAME_SPEED_OF_RUN = 0.05
 SAME_LOAD = 1.05
 NOT_CHANNELS = {
     "file", "record", "run_id", "bin", "stroke_id", "n", "force_N", "force_sd_N", "presliding_N",
-    "speed_bin_mm_s", "specimen_id", "condition", "series", "rubber", "speed_set_mm_s",
+    "speed_bin_mm_s", "specimen_id", "condition", "series", "rubber", "speed_set_mm_s", SET_UP,
 }  # fmt: skip
 
 
@@ -205,6 +207,10 @@ class Rows:
         """Return each row's group number at a level."""
         return self.groups.codes[level]
 
+    def level_name(self, level: str) -> str:
+        """Return the name of a level in the results."""
+        return SET_UP if level == "run" and SET_UP in self.table else level
+
     @cached
     def sparse(self, most: int) -> Rows:
         """Return about `most` or fewer rows of each stroke, evenly spread, for effects on whole strokes."""
@@ -244,8 +250,9 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
     run = nesting_run(table, table["record"])
+    unit = table.get(SET_UP, run)
     # A run on several specimens is of the first: groups are nested.
-    keys = [table["record"], run, table["specimen_id"].groupby(run).transform("min")]
+    keys = [table["record"], unit, table["specimen_id"].groupby(unit).transform("min")]
     codes = [table["stroke"].to_numpy(), *(pd.factorize(key, sort=True)[0] for key in keys)]
     order = np.lexsort(codes)
     table = table.iloc[order].reset_index(drop=True)
@@ -266,7 +273,7 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
     files = groups.codes["file"]
     per_file = np.bincount(files)[files]
     measured = table["speed_mm_s"].to_numpy(dtype=float)
-    speed = set_speeds(measured, groups.codes["run"])
+    speed = set_speeds(measured, pd.factorize(run.iloc[order])[0])
     pace = table["speed_bin_mm_s"].to_numpy(dtype=float) if "speed_bin_mm_s" in table else measured
     load = table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table))
     return Rows(
@@ -384,7 +391,7 @@ def _unsigned(run: pd.Series) -> pd.Series:
 
 def open_columns(table: pd.DataFrame) -> list[str]:
     """Return the channels that the campaign added to `bins`."""
-    fixed = {*BINS.names(), "record"}
+    fixed = {*BINS.names(), "record", SET_UP}
     return [name for name in table.columns if name not in fixed]
 
 

@@ -33,7 +33,7 @@ from sealfit.report.summary import by_gain
 from sealfit.tables import CALENDAR
 from sealfit.units import Units
 
-LEVELS = ("specimen", "run", "file", "stroke", "sample")
+LEVELS = ("specimen", "set_up", "run", "file", "stroke", "sample")
 ERRORS = (("rmse_N", "all bins"), ("rmse_runs_N", "run means"), ("heldout_rmse_N", "held out"))
 MOST_CHANNELS = 18
 MANY_CATEGORIES = 24

@@ -1,0 +1,61 @@
+"""Set-ups that several runs share: the files of a specimen with the same repeat, if these scatter alike.
+
+A run is one set-up at one speed, and its repeats are recorded without a new one. If the specimen is mounted
+anew for every repeat instead, all speeds are measured in one set-up, and their files scatter together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from scipy.sparse import csr_array, hstack
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import lsmr
+from scipy.special import fdtrc
+
+from sealfit.fit.joint.rows import SET_UP, nesting_run, records
+
+# Level of the F test of set-ups. Campaigns whose files scatter independently have set-ups that often.
+SET_UP_P = 0.001
+# Smallest scatter of set-ups, as a share of the force, that matters; below lies the rounding of equal files.
+LEAST_SET_UP = 1e-4
+
+
+def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return table `bins` with a column `SET_UP` if repeats are set-ups, else as it is.
+
+    The logarithms of the files' mean forces are fitted by an effect of each run and one of each repeat. If
+    set-ups, of a specimen and a repeat, explain more by F, they scatter. A change with the repeat that all
+    specimens have in common is none of set-ups, unless each repeat is another specimen.
+    """
+    record = records(bins)
+    strokes = pd.DataFrame({"run": nesting_run(bins, record), "specimen": bins["specimen_id"].astype(str)})
+    strokes = strokes.assign(repeat=bins["repeat"].astype(str), force=bins["force_N"].abs())
+    files = strokes.groupby(record, sort=True).agg(
+        {"run": "first", "specimen": "first", "repeat": "first", "force": "mean"}
+    )
+    set_up = files["specimen"] + " repeat " + files["repeat"]
+    known = [files["run"]]
+    if files.groupby("run")["specimen"].nunique().max() == 1:
+        known.append(files["repeat"])
+    force = np.log(np.maximum(files["force"].to_numpy(), 1e-300))
+    (less, few), (more, many) = _fitted(force, known), _fitted(force, [files["run"], set_up])
+    added, left = few - many, many
+    if added <= 0 or left <= 0:
+        return bins
+    explained, noise = (less - more) / added, more / left
+    scatter = explained > LEAST_SET_UP**2 and fdtrc(added, left, explained / max(noise, 1e-300)) < SET_UP_P
+    return bins.assign(**{SET_UP: record.map(set_up)}) if scatter else bins
+
+
+def _fitted(values: np.ndarray, factors: Sequence[pd.Series]) -> tuple[float, int]:
+    """Return the residual sum of squares of up to two factors' effects, and its degrees of freedom."""
+    codes = [pd.factorize(factor)[0] for factor in factors]
+    each = np.arange(values.size)
+    columns = hstack([csr_array((np.ones(values.size), (each, code))) for code in codes], format="csr")
+    residual = values - columns @ lsmr(columns, values, atol=1e-12, btol=1e-12)[0]
+    # Effects of two factors are determined up to a constant in each connected part of their table.
+    tied = connected_components(columns.T @ columns)[0] if len(codes) > 1 else 0
+    return float(residual @ residual), values.size - columns.shape[1] + tied

@@ -1,0 +1,75 @@
+"""Repeats that are set-ups: all speeds of a specimen measured before it is mounted anew."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from bins_helpers import make_bins, mounted_anew
+
+from sealfit.closure.channels import find_channels
+from sealfit.closure.score_test import ScoreTests
+from sealfit.closure.search import search
+from sealfit.fit.joint import fit_declared
+from sealfit.fit.joint.rows import SET_UP, make_rows
+from sealfit.fit.joint.set_ups import with_set_ups
+
+SMALL = {"temperatures": (60.0,), "bins": 4}
+
+
+def test_files_that_scatter_by_themselves_or_by_run_have_no_set_ups():
+    found = [SET_UP in with_set_ups(make_bins(seed, setup=0.01 * (seed % 2), **SMALL)) for seed in range(30)]
+    assert not any(found)  # nominal 0.001
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_files_of_a_specimen_and_repeat_that_scatter_alike_are_a_set_up(seed):
+    bins = with_set_ups(mounted_anew(seed))
+    assert bins.groupby(["specimen_id", "repeat"])[SET_UP].nunique().eq(1).all()
+    assert bins[SET_UP].nunique() == 15
+    rows = make_rows(bins, has_aging=True)
+    assert rows.groups.starts["run"].size == 15
+    assert rows.level_name("run") == SET_UP
+    assert SET_UP not in rows.channels
+
+
+def test_a_change_with_the_repeat_that_specimens_have_in_common_is_none_of_set_ups():
+    bins = make_bins(1, **SMALL)
+    bins["force_N"] *= 1 - 0.03 * np.log(bins["repeat"])
+    assert SET_UP not in with_set_ups(bins)
+
+
+def test_with_another_specimen_for_every_repeat_a_change_in_common_is_their_scatter():
+    bins = make_bins(1, temperatures=(), days=(), bins=4)
+    bins["force_N"] *= 1 - 0.03 * np.log(bins["repeat"])
+    assert SET_UP not in with_set_ups(bins)
+    others = bins.assign(specimen_id=bins["repeat"].astype(str))
+    assert with_set_ups(others)[SET_UP].nunique() == 3
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-6])
+def test_forces_that_are_the_same_to_the_last_digits_show_no_set_ups(jitter):
+    bins = make_bins(1, noise_N=0.0, gain=0.0, **SMALL)
+    mount = pd.factorize(bins["specimen_id"] + bins["repeat"].astype(str))[0]
+    bins["force_N"] *= 1 + jitter * np.sin(mount)
+    assert SET_UP not in with_set_ups(bins)
+
+
+def test_without_repeats_there_is_nothing_to_find():
+    bins = make_bins(1, repeats=1, **SMALL)
+    assert with_set_ups(bins) is bins
+
+
+def test_nothing_is_significant_where_only_set_ups_scatter():
+    def least_p(bins, seed):
+        rows = make_rows(bins, has_aging=True)
+        found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(seed))
+        return min(c.p_value for c in found)
+
+    campaigns = [mounted_anew(seed) for seed in range(3)]
+    by_runs, by_set_ups = (
+        [least_p(make(bins), seed) for seed, bins in enumerate(campaigns)]
+        for make in (lambda bins: bins, with_set_ups)
+    )
+    assert (
+        sum(p < 0.005 for p in by_runs) >= 4
+    )  # repeats, mounts and the calendar, by files taken for independent
+    assert min(by_set_ups) > 0.005
