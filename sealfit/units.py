@@ -243,6 +243,8 @@ _SPELLINGS = {
     ("time", "h"): ("h", "hr", "hours", "std", "stunden"),
     ("time", "d"): ("d", "days", "day", "tage", "tag"),
     ("time", "week"): ("wk", "week", "weeks", "woche", "wochen", "semaines"),
+    ("time", "month"): ("month", "months", "monat", "monate", "mois", "mes", "meses", "mesi"),
+    ("time", "year"): ("yr", "year", "years", "jahr", "jahre"),
     ("length", "ft"): ("ft",),
     ("force", "N"): ("N",),
     ("force", "kN"): ("kN",),

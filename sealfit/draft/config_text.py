@@ -67,13 +67,13 @@ def is_own_unit(unit: Unit | None, ours: str) -> bool:
     return unit is None or unit == unit_of(Units().of(ours))
 
 
-def date_lines(when: When) -> list[str]:
-    """Return the lines of config that a date needs which is not ISO 8601; those of `[files]` come last."""
-    lines = [("started_at", when.pattern)]
-    if when.clock:
-        lines = [("started_day", when.pattern), ("started_clock", when.clock)]
-        lines.append(("started_at", {"date": "started_day", "time": "started_clock"}))
-    return [f"{key} = {toml(value)}" for key, value in [*lines, ("date_format", when.format)]]
+def date_keys(when: When) -> dict[str, Value]:
+    """Return the keys of the config that a date in header lines needs."""
+    fields, files = "trace.header_fields", {"files.date_format": when.format} if when.format else {}
+    if not when.clock:
+        return {f"{fields}.started_at": when.pattern, **files}
+    together = {"files.started_at": {"date": "started_day", "time": "started_clock"}}
+    return {f"{fields}.started_day": when.pattern, f"{fields}.started_clock": when.clock, **together, **files}
 
 
 def literal(text: str) -> str:

@@ -29,7 +29,10 @@ DELIMITERS = ("tab", ";", ",", "|", "whitespace")  # of equally good ones the fi
 # What header lines may set, and what its unit measures.
 SETTINGS = {name: unit_of(Units().of(name)).dimension for name in NUMBERS}
 _LINE = re.compile(r'^\W*(?P<key>[^\W\d][^:=;\t"]*?)"?\s*[:=;,\t]+\s*"?(?P<value>.*)$')
-_SPECIMEN = re.compile(r"(specimen|probe|sample|pruefling|muster)( (id|nr|no|number|nummer|name))?")
+_SPECIMEN = re.compile(
+    r"(specimen|probe|sample|pruefling|muster)"
+    r"( (id|nr|no|number|nummer|name|label|code|kennung|bezeichnung))?"
+)
 _SIZE = r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?"
 _NUMBER = re.compile(rf"{_SIZE}(?=$|[\s;,\t\"°%A-Za-zµ])")
 _SAMPLED = r"(?:sampl|abtast|mess|scan|acqui|logg|data|daten|campion|echantillon|muestre)"
@@ -217,6 +220,7 @@ class Setting:
     values: tuple[str, ...]  # of each of the files
     line: int  # of the first file
     text: str  # of that line
+    unknown: str = ""  # a word behind the number that is no unit known here
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +231,7 @@ class When:
     format: str  # "" for ISO 8601
     line: int
     text: str
+    sure: bool  # whether no other order of day and month fits all files
     clock: str = ""  # pattern of the time of day, where that stands in a line of its own
 
 
@@ -237,18 +242,23 @@ def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Settin
         if match is None or match["key"].count("/") > 1:
             continue  # group/channel/property of a TDMS file: it is about the channel
         name, unit = name_and_unit(match["key"])
-        value = match["value"].strip()
+        value, unknown = match["value"].strip(), ""
         number, ours = _NUMBER.match(value), setting(name)
+        if ours == "specimen_id":  # Sample rate, Number of samples
+            ours = ""
         is_word = ours in AGING_CONDITION and means_unaged(value.strip(STRAYS + '"'))
         if _SPECIMEN.fullmatch(plain(match["key"])):
             ours, pattern = "specimen_id", _after(match["key"], r'([^\s;,"][^;,\t"]*)')
         elif is_word or (number and as_number(number.group(), decimal or ".") is not None):
             pattern = _after(match["key"], rf"({_SIZE})")
-            words = _found(_after(match["key"], rf"{_SIZE}([^;,\t\"]*)"), headers)
+            # The unit stands behind the number, or in the next cell.
+            words = _found(_after(match["key"], rf"{_SIZE}(?:\"?[;,\t]\"?)?([^;,\t\"]*)"), headers)
             said = {_unit_at_start(text, ours) for text in words if text.strip()}
+            unknown = next((text.split()[0] for text in words if text.strip()), "")
             if len(said) > 1:  # 24 h in one file, 7 d in another: one config cannot say it
                 continue
             unit = unit or (said.pop() if said else None)
+            unknown = unknown if unit is None and unknown[:1].isalpha() else ""
         else:
             continue
         values = tuple(_found(pattern, headers))
@@ -256,7 +266,7 @@ def _settings(headers: Sequence[Sequence[str]], decimal: str) -> Iterator[Settin
             pattern = _after(match["key"], rf"({_SIZE}|(?i:{'|'.join(UNAGED_WORDS)})\b)")
             values = tuple(_found(pattern, headers))
         if "" not in values:
-            yield Setting(ours, name, pattern, unit, values, line, text.strip())
+            yield Setting(ours, name, pattern, unit, values, line, text.strip(), unknown)
 
 
 def _unit_at_start(text: str, ours: str) -> Unit | None:
@@ -318,16 +328,17 @@ def _date_in(headers: Sequence[Sequence[str]], number: int, line: str) -> When |
     pattern = f"{_leading(line[:start])}({numbers})"
     pattern = re.sub(r"[AP]M\)$", "[AP]M)", pattern).replace(r"\ ", " ")
     days = [_DATE.search(text) or [""] for text in _found(pattern, headers)]
-    spelled = next(formats_that_fit([day[0] for day in days], _DATES), None)
-    if spelled is None:
+    fitting = list(formats_that_fit([day[0] for day in days], _DATES))
+    if not fitting:
         return None
+    spelled, sure = fitting[0], len(fitting) == 1
     following = headers[0][number] if number < len(headers[0]) else ""
     if clock is not None:
         spelled += line[match.end() : clock.start()].replace("%", "%%") + _clock_format(clock)
     elif clock := CLOCK.search(following):
         own = _leading(following[: clock.start()]) + r"(\d+:\d+(?::\d+)?)"
-        return When(pattern, f"{spelled} {_clock_format(clock)}", number, line.strip(), own)
-    return When(pattern, "" if spelled in _ISO else spelled, number, line.strip())
+        return When(pattern, f"{spelled} {_clock_format(clock)}", number, line.strip(), sure, own)
+    return When(pattern, "" if spelled in _ISO else spelled, number, line.strip(), sure)
 
 
 def _clock_format(clock: re.Match) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sealfit.draft.columns import BY_BEHAVIOUR, DIMENSION, Roles, TraceColumn, rises
-from sealfit.draft.config_text import Notes, date_lines, file_column, is_own_unit
-from sealfit.draft.dialect import RATE, STRAYS, rate_in, settings_in, started_in
+from sealfit.draft.config_text import Notes, date_keys, file_column, is_own_unit
+from sealfit.draft.dialect import RATE, SETTINGS, STRAYS, rate_in, settings_in, started_in
 from sealfit.draft.files_found import Found
 from sealfit.draft.run_keys import compressed
 from sealfit.draft.vocabulary import name_and_unit, plain
@@ -16,7 +16,7 @@ from sealfit.ingest.cells import seconds_of_day
 from sealfit.ingest.files import read_bytes, split_line
 from sealfit.ingest.formats import OF_ARRAYS, kind_of
 from sealfit.ingest.workbooks import rows_of_sheets
-from sealfit.units import UNITS, Unit, conversion
+from sealfit.units import UNITS, Unit, Units, conversion
 
 LONG_S = 3600.0  # longer traces without a unit of time, at a sample per second or slower, are taken as ms
 BAD_ROWS = 2  # with a missing value, that may stand above the first whole row of data
@@ -329,14 +329,13 @@ def header_keys(found: Found, given: set[str], notes: Notes) -> list[str]:
         return []
     when = started_in(headers)
     if when is not None and "started_at" not in given:
-        if when.format:
-            reason = f"header line {when.line} gives a date that is not ISO 8601: {_shown(when.text)}."
-            of_files = "started_at and date_format" if when.clock else "date_format"
-            fix = f"If day and month are in this order, uncomment its lines, and move {of_files} to [files]."
-            notes.doubt("trace.header_fields", reason, fix, date_lines(when))
-        else:
-            evidence = f"header line {when.line}, in every file looked at: '{when.text}'"
-            notes.guess("trace.header_fields.started_at", when.pattern, evidence)
+        evidence = f"header line {when.line}, in every file looked at: {_shown(when.text)}"
+        for key, value in date_keys(when).items():
+            notes.guess(key, value, evidence)
+        if not when.sure:
+            month = "month" if when.format.startswith("%m") else "day"
+            reason = f"the {month} is taken to stand first in header line {when.line}: {_shown(when.text)}."
+            notes.doubt("files.date_format", reason, "If it is the other way round, change date_format.")
     settings = [one for one in settings_in(headers, found.dialect.decimal) if one.ours not in given]
     for one in settings:
         evidence = f"header line {one.line}, in every file looked at: {_shown(one.text)}"
@@ -347,6 +346,11 @@ def header_keys(found: Found, given: set[str], notes: Notes) -> list[str]:
             reason = f"every file looked at has a specimen of its own: {_shown(one.text)}."
             fix = "If that counts the tests, delete this line."
             notes.doubt("trace.header_fields.specimen_id", reason, fix)
+        if one.unknown and one.ours in SETTINGS:
+            reason = f"'{one.unknown}' in header line {one.line} is no unit that is known here"
+            reason += f"; {Units().of(one.ours)} is assumed."
+            fix = f"If it is a unit, name it as files.units.{one.ours}, or convert under runs.compute."
+            notes.doubt(f"trace.header_fields.{one.ours}", reason, fix)
         if not is_own_unit(one.unit, one.ours):
             notes.guess(f"files.units.{one.ours}", one.unit.name, f"the unit in header line {one.line}")
     return [one.ours for one in settings]

@@ -118,12 +118,10 @@ def test_dates_in_names_are_read(tmp_path):
     assert made.doubts == ()
 
 
-def test_a_german_date_in_the_header_is_a_doubt_with_the_lines_that_would_read_it(tmp_path):
-    exports.german_daq(tmp_path)
-    (doubt,) = draft(tmp_path).doubts
-    assert "header line 2" in doubt.reason
-    assert "14.03.2024" in doubt.reason
-    assert any("%d.%m.%Y %H:%M:%S" in line for line in doubt.lines)
+def test_a_date_whose_order_is_not_sure_is_a_doubt():
+    when = started_in([["Date\t03/02/2024 09:19:33"], ["Date\t04/02/2024 10:19:33"]])
+    assert (when.format, when.sure) == ("%m/%d/%Y %H:%M:%S", False)
+    assert started_in([["Date\t03.02.2024 09:19:33"]]).sure
 
 
 @pytest.mark.parametrize(
@@ -133,7 +131,7 @@ def test_a_german_date_in_the_header_is_a_doubt_with_the_lines_that_would_read_i
 def test_the_order_of_day_and_month_is_the_one_that_fits_all_files(dates, order):
     lines = [f"Date\t{date} 09:19:33.25" for date in dates]
     when = started_in([(line,) for line in lines])
-    assert when.format == f"{order} %H:%M:%S"
+    assert (when.format, when.sure) == (f"{order} %H:%M:%S", True)
     assert [re.search(when.pattern, line)[1] for line in lines] == [f"{date} 09:19:33" for date in dates]
 
 
@@ -148,14 +146,11 @@ def test_the_order_of_day_and_month_is_the_one_that_fits_all_files(dates, order)
     ],
 )
 def test_the_format_of_a_date_in_the_header_is_found(name, date_format, tmp_path):
-    exports.EXPORTS[name](tmp_path)
-    (doubt,) = [doubt for doubt in draft(tmp_path).doubts if "ISO 8601" in doubt.reason]
-    assert doubt.lines[-1] == f"date_format = '{date_format}'"
-    moved = 1 + ("started_at and date_format" in doubt.fix)  # lines that the fix moves to [files]
-    lines = ["[trace.header_fields]", *doubt.lines[:-moved], "[files]", *doubt.lines[-moved:]]
-    config = parse_config("\n".join(lines), "rig.toml")
-    two = config.files.started_at
-    assert set(config.trace.header_fields) == ({"started_at"} if two is None else {two.date, two.time})
+    written = exports.EXPORTS[name](tmp_path)
+    made, _, ingested = read(tmp_path)
+    assert f"date_format = '{date_format}'" in made.text
+    assert not any("header line" in doubt.reason for doubt in made.doubts)
+    assert_settings(ingested, written, ("started_at",))
 
 
 @pytest.mark.parametrize(
