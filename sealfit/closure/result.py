@@ -118,14 +118,14 @@ def closure_document(
     floor, scatter = noise_floor(after), scatter_list(after)
     quality = fit_quality(numbers["after"], floor)
     seen = sensitivity(selection, config.loop.family_error)
-    undetectable = set(undetectable_variables(selection, seen, scatter))
+    undetectable = undetectable_variables(selection, seen, scatter)
     unclaimable = isinstance(selection.left, Candidate) and not selection.left.claimable
     only_unclaimable = unclaimable and not selection.added
     significant = bool(selection.worse) or (selection.left is not None and not only_unclaimable)
     # What remains beside effects that were found may be less than repeats scatter by.
     small = bool(selection.added) and not selection.worse and (quality["ratio"] or np.inf) <= 1.0
     undecided = only_unclaimable or any(not item.negligible for item in selection.refused)
-    unseen = undetectable and quality["state"] != "within_scatter"
+    unseen = any(undetectable.values()) or (undetectable and quality["state"] != "within_scatter")
     if significant and not small:
         verdict = "unexplained"
     elif selection.added:

@@ -334,8 +334,11 @@ def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
 
 def undetectable_variables(
     selection: Selection, entries: Sequence[dict], scatter: Sequence[dict]
-) -> list[str]:
+) -> dict[str, bool]:
     """Return the variables whose effects are not detectable in this campaign.
+
+    The value is whether specimens scatter that strongly. An error within the scatter of repeats does not
+    exclude an effect then, as repeats are of one specimen.
 
     An effect is not detectable if it cannot reach the required p-value, and the variable varies along
     strokes, is the direction, or varies between fewer than five specimens; or if the units between which it
@@ -348,10 +351,10 @@ def undetectable_variables(
     sd_N = float(np.sqrt(rows.weight @ about_means(fitted.residual, rows, "stroke") ** 2))
     within_strokes = {"sd_N": sd_N, "sd_rel": sd_N / float(np.sqrt(rows.weight @ fitted.force**2))}
     in_model = _channels_in_model(selection)
-    undetectable = []
+    undetectable = {}
     for entry in entries:
         if entry["variable"] == SPECIMEN:
-            undetectable.append(SPECIMEN)
+            undetectable[SPECIMEN] = False
             continue
         channel: Channel = selection.channels[entry["variable"]]
         aside = channel.grouping or channel.name in in_model or channel.name in ASIDE
@@ -365,5 +368,5 @@ def undetectable_variables(
         few_specimens = channel.unit == "specimen" and count < criteria.LEAST_UNITS_OF_SLOPES
         decisive = along or channel.name == "direction" or few_specimens
         if much or (decisive and not np.isfinite(smallest)):
-            undetectable.append(channel.name)
+            undetectable[channel.name] = much and channel.unit == "specimen"
     return undetectable

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
+from sealfit.config import AGING_CONDITION
 from sealfit.effects.contract import CHANNEL, Effect
 from sealfit.report.summary_lines import has_weak_evidence
 from sealfit.units import Units
@@ -295,7 +296,10 @@ def quality_clause(closure: Mapping) -> str:
             return "the model has too many parameters for these runs to test its lack of fit"
         return "without repeats it is not known whether the error exceeds the scatter"
     if quality["state"] == "within_scatter":
-        return "the error is within the scatter of repeats"
+        floor = closure["noise_floor_N"]
+        between = any(s["level"] == "specimen" and s["sd_N"] > floor for s in closure["scatter"])
+        apart = "apart from differences between specimens, " if between else ""
+        return f"{apart}the error is within the scatter of repeats"
     times = f"the error is {quality['ratio']:.2g} times the scatter of repeats"
     if quality["ratio"] < 1:
         times += ", but a part of it is the same in all repeats"
@@ -303,13 +307,20 @@ def quality_clause(closure: Mapping) -> str:
 
 
 def power_clause(closure: Mapping, units: Units) -> str:
-    """Return the smallest detectable effects of the least sensitive variables, in a clause; or ""."""
-    known = [s for s in closure["sensitivity"] if s["smallest_N"] is not None]
-    texts = [
-        f"{_two_digits(s['smallest_pct'])} % for {units.label(s['variable'])} {level_words(s['level'])}"
-        for s in sorted(known, key=lambda s: -s["smallest_N"])[:NAMED]
-    ]
-    return f"the largest detection limits, in percent of the force, are {', '.join(texts)}" if texts else ""
+    """Return the smallest detectable effects of the least sensitive variables, in a clause; or "".
+
+    Variables that show no effect of any size come last, without those that make the conditions.
+    """
+    entries = [(f"{units.label(s['variable'])} {level_words(s['level'])}", s) for s in closure["sensitivity"]]
+    sized = [one for one in entries if one[1]["smallest_N"] is not None]
+    sized.sort(key=lambda one: -one[1]["smallest_N"])
+    texts = [f"{_two_digits(s['smallest_pct'])} % for {name}" for name, s in sized[:NAMED]]
+    said = f"the largest detection limits, in percent of the force, are {', '.join(texts)}" if texts else ""
+    none = [name for name, s in entries if s["smallest_N"] is None and s["variable"] not in AGING_CONDITION]
+    if none:
+        more = f" and {len(none) - NAMED} more" if len(none) > NAMED else ""
+        said += f"{'; ' if said else ''}no effect is detectable for {', '.join(none[:NAMED])}{more}"
+    return said
 
 
 def _two_digits(value: float) -> str:

@@ -8,6 +8,7 @@ from bins_helpers import TWO_FOLDS, make_bins, make_traces
 
 from sealfit.closure.channels import channels_of
 from sealfit.closure.criteria import WEAK_P
+from sealfit.closure.errors_and_intervals import scatter_list
 from sealfit.closure.loop import close_loop
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
@@ -105,7 +106,15 @@ def test_two_specimens_of_one_condition_that_differ_cannot_be_told():
 
 def test_a_campaign_of_nine_specimens_can_tell():
     selection = searched(make_bins(3, repeats=2, bins=6, run_channels=OIL))
-    assert undetectable_variables(selection, sensitivity(selection, 0.005), []) == []
+    assert undetectable_variables(selection, sensitivity(selection, 0.005), []) == {}
+
+
+@pytest.mark.parametrize(("specimen", "hidden"), [(0.005, False), (0.06, True)])
+def test_specimens_that_scatter_much_hide_an_effect_between_them_from_repeats(specimen, hidden):
+    selection = searched(make_bins(3, repeats=2, bins=6, specimen=specimen))
+    scatter = scatter_list(selection.after)
+    undetectable = undetectable_variables(selection, sensitivity(selection, 0.005), scatter)
+    assert any(undetectable.values()) == hidden
 
 
 @pytest.mark.parametrize("slope", [0.01, 0.2])

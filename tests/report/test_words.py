@@ -112,6 +112,14 @@ def test_nothing_missing_states_the_sensitivity():
     assert "in percent of the force, are 1.2 % for displacement (mm) along strokes." in text
 
 
+def test_nothing_missing_names_variables_that_show_no_effect_of_any_size():
+    names = ("humidity_pct", "oil temp", "batch", "run_order", "aging_days")  # the last makes the conditions
+    none = [{**SEEN, "variable": name, "level": "run", "smallest_N": None} for name in names]
+    text = said({**document("nothing_missing", effects=()), "sensitivity": [SEEN, *none]})
+    others = "humidity (%) between runs, oil temp between runs, batch between runs and 1 more"
+    assert f"displacement (mm) along strokes; no effect is detectable for {others}." in text
+
+
 def test_cannot_tell_says_of_what_and_what_would_do():
     unseen = {
         **SEEN,
@@ -216,6 +224,8 @@ def test_what_is_not_decided_has_names_in_words():
 
 def test_what_is_left_is_called_scatter_only_if_it_is():
     within = document() | {"fit_quality": {"state": "within_scatter", "ratio": 1.0, "p_value": 0.4}}
+    apart = {"scatter": [{"level": "specimen", "sd_N": 1.0}], "noise_floor_N": 0.4}
+    assert quality_clause(within | apart).startswith("apart from differences between specimens, the error is")
     assert "consistent with scatter" in left_over(within, Config())
     assert left_over(document(), Config()).endswith("No variable explains it.")
     left = {"channel": "displacement_mm", "level": "trace", "p_value": 0.0005, "significant": True}
