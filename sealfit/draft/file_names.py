@@ -16,6 +16,8 @@ import numpy as np
 from sealfit.config import AGING_CONDITION, Files
 from sealfit.draft.vocabulary import AFTER, BEFORE, DIRECTIONS, RUBBERS, said_by
 from sealfit.ingest.derived_columns import means_unaged
+from sealfit.ingest.listing import NUMBERS
+from sealfit.units import Units
 
 # The ending of a file's name: with a letter, as in `v0.5` the last figure is none.
 SUFFIX = re.compile(r"\.(?=[^./]*[^\W\d])[^./]*$")
@@ -258,7 +260,7 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     """Return a number with what the letters around it say; without `ours` where they say nothing."""
     pattern = _number_pattern(texts)
     after, before = _around(rows, at)
-    unit = ""
+    unit = doubt = ""
     if after and (said := said_by(AFTER, re.sub(r"[-_ /]", "", after))):
         (ours, unit), why = said, f"'{after}' stands after the number"
     else:
@@ -266,7 +268,9 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
         why = f"'{before}' stands before the number" if before else "a bare number"
         if ours in NO_COUNTS and _counts_up(texts):
             ours = ""
-    return _as_height(NamePart(at, ours, pattern, texts, why, unit=unit), before)
+        if ours in NUMBERS and rows[0][at + 1 : at + 2] and rows[0][at + 1].text == after:
+            doubt = f"'{after}' behind it is no unit that is known here; {Units().of(ours)} is assumed"
+    return _as_height(NamePart(at, ours, pattern, texts, why, unit=unit, doubt=doubt), before)
 
 
 def _counts_up(texts: Sequence[str]) -> bool:

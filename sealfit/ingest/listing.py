@@ -4,7 +4,7 @@ import csv
 import os
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import SequenceMatcher, get_close_matches
 from fnmatch import fnmatchcase
@@ -19,9 +19,10 @@ from sealfit.ingest.files import TEXT_COLUMNS, as_number, found_by, inside, spli
 from sealfit.ingest.workbooks import text_of_runs
 from sealfit.store.manifest import found_by_glob, glob_names
 from sealfit.store.paths import runs_tables
-from sealfit.units import Conversion
+from sealfit.units import Conversion, other_unit
 
 NUMBERS = (*AGING_CONDITION, "load_N", "speed_mm_s")
+UNIT_IN_BRACKETS = re.compile(r"[\[(]([^\])]+)[\])]\s*$")
 KNOWN = (*TEXT_COLUMNS, *NUMBERS, "repeat")
 # Words, and codes of loggers, for no value.
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?", "-999", "-9999", "-99999"}
@@ -189,7 +190,23 @@ def _our_names(
     for theirs in (name for name in ours if name not in header):
         reason = "there is no such column, but files.runs_columns names it."
         add("missing_column", theirs, reason, suggestion(theirs, header))
+    faults += _units_in_header(header, config, place)
     return names, faults + misspelt(names, names, config, place)
+
+
+def _units_in_header(
+    header: Sequence[str], config: Config, place: Mapping[str, str | int]
+) -> Iterator[Fault]:
+    """Yield a warning for each column whose name has a unit in brackets other than the config's."""
+    for ours, theirs in config.files.runs_columns.items():
+        said, taken = UNIT_IN_BRACKETS.search(str(theirs.name)), theirs.unit or config.units.of(ours)
+        if str(theirs.name) in header and said and taken and (unit := other_unit(said[1], taken)) is not None:
+            reason = f"the header says '{said[1]}', and the config takes the numbers in {taken}."
+            fix = f'set {ours} = {{name = "{theirs.name}", unit = "{unit}"}} under [files.runs_columns].'
+            if not unit:
+                fix = f"name the column otherwise under [files.runs_columns], and compute {ours} from it."
+            fix = f"If the header is right, {fix}"
+            yield Fault("unit", reason, column=str(theirs.name), fix=fix, **place, **KEPT)
 
 
 def misspelt(

@@ -52,6 +52,14 @@ def test_a_counter_is_no_time_and_a_later_time_is(tmp_path):
     assert slots(made)["time_s"] == "Zeit"
 
 
+@pytest.mark.parametrize("step", [0.1, 1.0])
+def test_a_time_whose_clock_is_coarse_is_the_time_all_the_same(tmp_path, step):
+    def columns(one):
+        return [np.floor(one.time_s / step) * step, one.displacement_mm, one.force_N]
+
+    assert slots(campaign(tmp_path, columns, "Time,Position,Force\n"))["time_s"] == "Time"
+
+
 def test_a_counter_without_a_name_is_no_time(tmp_path):
     made = campaign(tmp_path, lambda one: [np.arange(len(one.time_s)), *exports.slots(one)], strokes=2)
     assert slots(made) == {"time_s": 2, "displacement_mm": 3, "force_N": 4}

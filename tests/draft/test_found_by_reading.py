@@ -55,6 +55,34 @@ def test_the_unit_of_a_header_line_stands_before_other_words(tmp_path):
     assert config(made).files.units["speed_mm_s"] == "mm/min"
 
 
+@pytest.mark.parametrize(
+    ("lines", "factor"),
+    [
+        ('"Aging time","{}","h"\n"Normal load","2.0394","kgf"\n', 24),
+        ("Aging time\t{}\tweeks\nNormal load\t4.4962\tlbf\n", 1 / 7),
+        ("Aging time;{};months\nNormal load;0.020;kN\n", 12 / 365.25),
+    ],
+)
+def test_the_unit_of_a_header_line_stands_in_a_cell_of_its_own(tmp_path, lines, factor):
+    path = folder(tmp_path, {f"a{days}.csv": lines.format(days * factor) for days in (7, 14)})
+    made = draft(path)
+    assert conditions(path, made) == pytest.approx([7.0, 14.0], rel=1e-3)
+    assert conditions(path, made, "load_N") == pytest.approx([20.0, 20.0], rel=1e-3)
+
+
+def test_a_word_that_is_no_unit_of_a_header_line_is_a_doubt(tmp_path):
+    path = folder(tmp_path, {f"a{days}.csv": f"Aging: {days} fortnights\n" for days in (1, 2)})
+    assert "'fortnights' in header line 1 is no unit that is known here; d is assumed" in doubts(draft(path))
+
+
+@pytest.mark.parametrize(
+    "line", ["Samples\t{}00\t{}00", "Number of samples: {}", "Sample rate: {} Hz", "Sample thickness: {} mm"]
+)
+def test_samples_of_a_logger_are_no_specimens(tmp_path, line):
+    files = {f"a{days}.csv": f"Aging: {days} d\n{line.replace('{}', str(days))}\n" for days in (1, 2)}
+    assert "specimen_id" not in config(draft(folder(tmp_path, files))).trace.header_fields
+
+
 def test_a_header_line_whose_unit_differs_between_files_is_not_used(tmp_path):
     path = folder(tmp_path, {"a.csv": "Aging: 24 h\n", "b.csv": "Aging: 7 d\n"})
     made = draft(path)

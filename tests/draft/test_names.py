@@ -58,6 +58,8 @@ def test_a_way_of_naming_files_is_read(template, expected):
         (made("{v}mmmin_d{d}.csv", v=(300, 60), d=(1, 2)), {"speed_mm_s": 5.0, "aging_days": 1.0}),
         (made("{N}N_d{d}.csv", N=(50, 100), d=(1, 2)), {"load_N": 50.0, "aging_days": 1.0}),
         (made("{N}kg_d{d}.csv", N=(5, 10), d=(1, 2)), {"load_N": 49.03325, "aging_days": 1.0}),
+        (made("load{N}lb_d{d}.csv", N=(10, 20), d=(1, 2)), {"load_N": 44.4822, "aging_days": 1.0}),
+        (made("aged{m}months_v{v}.csv", m=(1, 4), v=(1, 2)), {"aging_days": 30.4375, "speed_mm_s": 1.0}),
         (made("d{d}_v{v}.csv", d=(1, 2), v=("0,5", "5")), {"speed_mm_s": 0.5, "aging_days": 1.0}),
         (made("d{d}_v{v}.csv", d=(1, 2), v=("0p5", "5")), {"speed_mm_s": 0.5, "aging_days": 1.0}),
         (made("d{d}_v{v}.csv", d=(1, 2), v=("0.5", "5")), {"speed_mm_s": 0.5, "aging_days": 1.0}),
@@ -73,6 +75,15 @@ def test_a_way_of_naming_files_is_read(template, expected):
 )
 def test_units_and_signs_in_names(files, expected):
     assert told(files) == pytest.approx(expected)
+
+
+def test_letters_behind_a_number_that_are_no_unit_are_a_doubt():
+    (days,) = [
+        part
+        for part in read_names(made("aged{d}fn_v{v}.csv", d=(1, 4), v=(1, 2))).parts
+        if part.ours == "aging_days"
+    ]
+    assert days.doubt == "'fn' behind it is no unit that is known here; d is assumed"
 
 
 @pytest.mark.parametrize("words", [("fwd", "rev"), ("vor", "zurueck"), ("Hin", "Rück")])

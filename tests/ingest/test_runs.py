@@ -66,6 +66,21 @@ def test_semicolons_decimal_commas_and_other_names_of_columns(tmp_path):
     assert found["c.csv"]["humidity_pct"] == 42.5
 
 
+@pytest.mark.parametrize(("name", "warned"), [("Gewicht [kg]", True), ("Last (N)", False), ("Last", False)])
+def test_a_unit_in_the_header_of_the_table_that_the_config_does_not_name_is_warned_of(tmp_path, name, warned):
+    folder = campaign(tmp_path, FULL.strip().replace("load_N", name))
+    found = warnings_of_units(folder, f'"{name}"')
+    assert [fault.column for fault in found] == [name] * warned
+    if warned:
+        assert 'load_N = {name = "Gewicht [kg]", unit = "kgf"} under [files.runs_columns]' in found[0].fix
+        assert warnings_of_units(folder, f'{{name = "{name}", unit = "kgf"}}') == []
+
+
+def warnings_of_units(folder, load):
+    made = config(f"[files.runs_columns]\nload_N = {load}")
+    return [fault for fault in list_traces(folder, made)[1] if fault.check == "unit"]
+
+
 def test_only_file_and_condition_are_needed(tmp_path):
     folder = campaign(tmp_path, "file,aging_days,speed_mm_s\na.csv,4,5\nb.csv,4,5\nc.csv,4,10")
     trace(folder, "c.csv", speed=10)
