@@ -19,6 +19,8 @@ from sealfit.fit.joint.rows import SET_UP, nesting_run, records
 
 # Level of the F test of set-ups. Campaigns whose files scatter independently have set-ups that often.
 SET_UP_P = 0.001
+# Level of the same test without the quarter of the specimens that show most.
+OF_THE_OTHERS_P = 0.05
 # Smallest scatter of set-ups, as a share of the force, that matters; below lies the rounding of equal files.
 LEAST_SET_UP = 1e-4
 
@@ -28,7 +30,8 @@ def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
 
     The logarithms of the files' mean forces are fitted by an effect of each run and one of each repeat. If
     set-ups, of a specimen and a repeat, explain more by F, they scatter. A change with the repeat that all
-    specimens have in common is none of set-ups, unless each repeat is another specimen.
+    specimens have in common is none of set-ups, unless each repeat is another specimen. Nor is what a few
+    specimens show: an effect that begins or ends while they are measured.
     """
     record = records(bins)
     strokes = pd.DataFrame({"run": nesting_run(bins, record), "specimen": bins["specimen_id"].astype(str)})
@@ -36,26 +39,39 @@ def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
     files = strokes.groupby(record, sort=True).agg(
         {"run": "first", "specimen": "first", "repeat": "first", "force": "mean"}
     )
-    set_up = files["specimen"] + " repeat " + files["repeat"]
+    files["set_up"] = files["specimen"] + " repeat " + files["repeat"]
+    p_value, shown = _test(files)
+    if p_value >= SET_UP_P:
+        return bins
+    most = shown.nlargest(max(len(shown) // 4, 1)).index
+    if len(shown) > 2 and _test(files[~files["specimen"].isin(most)])[0] >= OF_THE_OTHERS_P:
+        return bins
+    return bins.assign(**{SET_UP: record.map(files["set_up"])})
+
+
+def _test(files: pd.DataFrame) -> tuple[float, pd.Series]:
+    """Return the p-value of set-ups, 1 for a negligible scatter, and what they explain in each specimen."""
     known = [files["run"]]
     if files.groupby("run")["specimen"].nunique().max() == 1:
         known.append(files["repeat"])
     force = np.log(np.maximum(files["force"].to_numpy(), 1e-300))
-    (less, few), (more, many) = _fitted(force, known), _fitted(force, [files["run"], set_up])
-    added, left = few - many, many
-    if added <= 0 or left <= 0:
-        return bins
-    explained, noise = (less - more) / added, more / left
-    scatter = explained > LEAST_SET_UP**2 and fdtrc(added, left, explained / max(noise, 1e-300)) < SET_UP_P
-    return bins.assign(**{SET_UP: record.map(set_up)}) if scatter else bins
+    (before, few), (after, many) = _fitted(force, known), _fitted(force, [files["run"], files["set_up"]])
+    shown = pd.Series(before**2 - after**2, files.index).groupby(files["specimen"]).sum()
+    added = few - many
+    if added <= 0 or many <= 0:
+        return 1.0, shown
+    explained, noise = shown.sum() / added, after @ after / many
+    if explained <= LEAST_SET_UP**2:
+        return 1.0, shown
+    return float(fdtrc(added, many, explained / max(noise, 1e-300))), shown
 
 
-def _fitted(values: np.ndarray, factors: Sequence[pd.Series]) -> tuple[float, int]:
-    """Return the residual sum of squares of up to two factors' effects, and its degrees of freedom."""
+def _fitted(values: np.ndarray, factors: Sequence[pd.Series]) -> tuple[np.ndarray, int]:
+    """Return the residual of up to two factors' effects, shape (n,), and its degrees of freedom."""
     codes = [pd.factorize(factor)[0] for factor in factors]
     each = np.arange(values.size)
     columns = hstack([csr_array((np.ones(values.size), (each, code))) for code in codes], format="csr")
     residual = values - columns @ lsmr(columns, values, atol=1e-12, btol=1e-12)[0]
     # Effects of two factors are determined up to a constant in each connected part of their table.
     tied = connected_components(columns.T @ columns)[0] if len(codes) > 1 else 0
-    return float(residual @ residual), values.size - columns.shape[1] + tied
+    return residual, values.size - columns.shape[1] + tied
