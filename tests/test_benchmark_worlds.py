@@ -71,6 +71,8 @@ def test_a_world_is_a_campaign_within_its_priors(index):
     assert low <= len(world.files) <= high
     assert 3 <= world.speeds_mm_s.size <= 12
     assert not world.files.duplicated(["run_id", "repeat"]).any()
+    mount = world.files["specimen_id"] + world.files["repeat"].astype(str)
+    assert not world.rig["mounted_anew"] or mount.ne(mount.shift()).sum() == mount.nunique()
     for own in world.series:
         assert own["mu_0s"] > own["mu_0c"] > 0
         assert own["v_s"] > 0

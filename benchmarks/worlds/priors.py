@@ -78,6 +78,7 @@ PRIORS: dict[str, Prior] = {
         "choice", ("blocked", "shuffled", "by_speed", "follows_rubber"), "how tests follow each other"
     ),
     "passes": Prior("chance", (0.4,), "all runs once before any is repeated"),
+    "mounted_anew": Prior("chance", (0.2,), "each repeat is a set-up that all runs of a specimen share"),
     "minutes_per_file": Prior("log", (2.0, 40.0), "time from one test to the next"),
     "nights": Prior("chance", (0.5,), "tests by day only"),
     # ---------------------------------------------------------------- friction

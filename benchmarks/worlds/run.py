@@ -177,6 +177,8 @@ def targets(effects: list[dict], rows: Rows) -> list[Target]:
         added = (e["acts_on"], e["operation"]) == ("force", "add")
         if both_ways and (added or "direction" in e["variables"]):
             levels.add("stroke")  # it shows between the strokes of a file
+        if levels & {"repeat", "run"}:  # where set-ups take the place of runs
+            levels |= {"repeat", "set_up"}
         found.append(Target(e["variables"], e["place"], sorted(levels), e["names"], added))
     return found
 

@@ -8,10 +8,10 @@ sigma_0 and each effect's own noise-free part; d = 0 is the truth, and an effect
 z of an effect: weighted least squares within the groups above its unit of evidence (groups are demeaned, so
 that their scatter has no part): an effect inside files within files, one between repeats within runs, one
 between runs within specimens, one between specimens as it is. The covariance is robust for clusters (CR1) of
-that unit, for an effect inside files runs where there are twelve, else files. The t value has as many degrees
-of freedom as clusters beyond the rank of their means, and is given as the normal z of the same p, at the true
-amplitude and at the measured one; the smaller counts. So z is conservative: what demeaning takes away is not
-used.
+that unit; for an effect inside files of runs where there are twelve, else of files; for an effect between
+repeats that are mounted anew of these set-ups. The t value has as many degrees of freedom as clusters beyond
+the rank of their means, and is given as the normal z of the same p, at the true amplitude and at the measured
+one; the smaller counts. So z is conservative: what demeaning takes away is not used.
 
 z by specimens: the same with specimens as the clusters, and one degree of freedom less than specimens. Nobody
 who does not know whether specimens differ in their slope along a channel can claim more from them than this.
@@ -55,7 +55,7 @@ QUANTITIES_TRIED = (
 )
 TRIED_OF_PAIRS = 2
 GAIN = ("mu_0s", "mu_0c", "a_s", "a_c", "sigma_2")  # quantities that a gain of the whole friction multiplies
-UNIT = {"repeat": "file", "run": "run_id", "specimen": "specimen_id"}
+UNIT = {"repeat": "file", "run": "run_id", "set_up": "set_up", "specimen": "specimen_id"}
 LEVELS = ("stroke", "file", "run_id", "specimen_id")  # nesting, fine to coarse
 CLAIM_LEVEL = {
     "sample": "trace",
@@ -178,6 +178,7 @@ def codes(rows: Rows) -> dict[str, np.ndarray]:
         "stroke": t["file"] + t["stroke"].astype(str),
         "file": t["file"],
         "run_id": t["run_id"] + way,
+        "set_up": t["specimen_id"] + t["repeat"].astype(str),
         "specimen_id": t["specimen_id"],
     }
     return {name: pd.factorize(key)[0] for name, key in keys.items()}
@@ -268,7 +269,8 @@ def _z(rows: Rows, units: dict, unit: str, place: int, world: World) -> dict:
 
     left = less(own)
     power = float(own @ left)
-    cluster = units[{"sample": "run_id", "stroke": "file"}.get(unit, unit)]
+    of_files = "set_up" if world.rig["mounted_anew"] else "file"
+    cluster = units[{"sample": "run_id", "stroke": "file", "file": of_files}.get(unit, unit)]
     if unit == "sample" and np.unique(cluster).size < LEAST_RUNS:
         cluster = units["file"]
     count = int(cluster.max()) + 1

@@ -217,11 +217,15 @@ def _calendar(world: World, rng) -> pd.DataFrame:
         "by_speed": [files["speed_mm_s"], files["run_id"].map(shuffled)],
         "follows_rubber": [files["aging_days"].fillna(0.0), condition, files["run_id"].map(shuffled)],
     }[rig["order"]]
-    keys = (
-        [files["repeat"], *keys]
-        if draw("passes", rng) and rig["order"] != "follows_rubber"
-        else [*keys, files["repeat"]]
-    )
+    passes = draw("passes", rng)
+    rig["mounted_anew"] = files["repeat"].max() > 1 and draw("mounted_anew", world.streams("set-ups"))
+    if rig["mounted_anew"]:
+        days = [files["aging_days"].fillna(0.0)] if rig["order"] == "follows_rubber" else []
+        keys = [*days, condition, files["repeat"], keys[-1]]
+    elif passes and rig["order"] != "follows_rubber":
+        keys = [files["repeat"], *keys]
+    else:
+        keys = [*keys, files["repeat"]]
     order = np.lexsort([np.asarray(k, dtype=float) for k in reversed(keys)])
     files = files.iloc[order].reset_index(drop=True)
     gaps = draw("minutes_per_file", rng) / 60 * np.exp(0.2 * rng.normal(size=len(files)))
@@ -346,18 +350,24 @@ def _scatter_and_noise(world: World, rng) -> None:
     """Draw scatter of repeats, runs and specimens in every kind, and the noise of the force channel."""
     files = world.files
     units = {"repeat": np.arange(len(files)), "run": pd.factorize(files["run_id"])[0],
+             "set_up": files.groupby(["specimen_id", "repeat"]).ngroup().to_numpy(),
              "specimen": pd.factorize(files["specimen_id"])[0]}  # fmt: skip
     drawn = {kind: np.zeros(len(files)) for kind in KINDS}
+
+    def scatters(level: str, kind: str, rng) -> None:
+        sd = draw(f"scatter_{kind}", rng)
+        world.scatter.append({"level": level, "kind": kind, "sd": sd})
+        values = sd * rng.normal(size=units[level].max() + 1)[units[level]]
+        drawn[kind] += values
+        if level == "specimen":
+            files[f"_specimen_{kind}"] = values
+
     for level in LEVELS:
         for kind in KINDS:
-            if not draw("scatter_gain_here" if kind == "gain" else "scatter_other_here", rng):
-                continue
-            sd = draw(f"scatter_{kind}", rng)
-            world.scatter.append({"level": level, "kind": kind, "sd": sd})
-            values = sd * rng.normal(size=units[level].max() + 1)[units[level]]
-            drawn[kind] += values
-            if level == "specimen":
-                files[f"_specimen_{kind}"] = values
+            if draw("scatter_gain_here" if kind == "gain" else "scatter_other_here", rng):
+                scatters(level, kind, rng)
+    if world.rig["mounted_anew"]:
+        scatters("set_up", "gain", world.streams("scatter of set-ups"))
     world.noise = {
         "rel": draw("noise_rel", rng),
         "kind": draw("noise_kind", rng),
@@ -475,6 +485,7 @@ def _features(world: World) -> None:
         "holes": rig["holes"],
         "columns": bool(world.columns),
         "missing cells": any(c["missing"] for c in world.columns),
+        "mounted anew": rig["mounted_anew"],
         "calendar": rig["calendar"],
         "follows rubber": rig["order"] == "follows_rubber" and rig["calendar"],
         "three or four speeds": world.speeds_mm_s.size < 5,
