@@ -29,7 +29,6 @@ def pytest_xdist_auto_num_workers():
 
 # Files of half a minute and more: begun last they would be waited for alone.
 LONG_FILES = (
-    "test_measured_samples.py",
     "test_docs.py",
     "test_search.py",
     "test_cluster.py",
@@ -38,8 +37,6 @@ LONG_FILES = (
     "test_page.py",
     "test_fuzzing.py",
     "test_benchmark_invariances.py",
-    "test_benchmark_paper.py",
-    "test_steady.py",
     "test_faults.py",
     "test_measured_campaigns.py",
     "test_store.py",
@@ -47,11 +44,9 @@ LONG_FILES = (
     "test_subsampling.py",
     "test_pairs.py",
     "test_browser.py",
-    "test_concurrency.py",
     "test_joint.py",
     "test_aging.py",
     "test_masked_pairs.py",
-    "test_load.py",
     "test_pollution.py",
 )
 

@@ -16,6 +16,8 @@ from sealfit.closure.loop import close_loop
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.store.manifest import ConfigCopy
 
+pytestmark = pytest.mark.long  # whole campaigns, and every command of the tutorial
+
 
 @pytest.fixture(scope="module")
 def tutorial(tmp_path_factory):
@@ -74,7 +76,6 @@ def test_hand_edited_cells_of_the_worm_drive_are_named(tutorial):
     assert {str(value).split(",")[0] for value in remarks["value"]} == {"-1200", "-800", "-400"}
 
 
-@pytest.mark.long
 def test_pneumatic_seal_lacks_an_offset_run_in_and_ripples(pneuseal):
     document = pneuseal.document
     effects = {e["id"]: e for e in reversed(document["effects"])}
@@ -95,14 +96,12 @@ def test_pneumatic_seal_lacks_an_offset_run_in_and_ripples(pneuseal):
     assert document["after"]["heldout_rmse_N"] < 0.7 * document["before"]["heldout_rmse_N"]
 
 
-@pytest.mark.long
 def test_pneumatic_seal_has_an_offset_that_depends_on_the_set_up(pneuseal):
     left = pneuseal.document["left"]  # reconnected 1 has half of it
     assert (left["level"], left["channel"]) == ("run", "direction mounting")
     assert left["p_value"] > 0.005  # three mountings prove nothing
 
 
-@pytest.mark.long
 def test_pneumatic_seal_has_no_stribeck_speed_and_no_effect_of_scatter_between_files(pneuseal):
     closure = pneuseal
     assert set(closure.model["declared"]["stribeck"].values()) == {"constant"}
