@@ -79,7 +79,8 @@ _ROW_FAULTS = {  # check: (reason, fix)
     "overload": ("is an instrument's mark for overload.", "Check the sensor's range."),
     "time_order": ("time repeats or runs backwards.", "Check the recorder's clock, or delete the line."),
     "time_anew": ("is after time began anew: several recordings follow each other, or the clock restarted.",
-                  "Save each recording in a file of its own, and what differs between them in runs.csv."),
+                  "Save each recording in a file of its own, and what differs between them in runs.csv. If "
+                  "only the clock restarted, give the rows per second as trace.rate_Hz, without time_s."),
 }  # fmt: skip
 SEVERAL = 0.05  # share of the rows out of order from which time is looked at whether it began anew
 RECORDING = 30  # rows before that, fewer are none

@@ -383,7 +383,7 @@ def _too_short(along_mm: np.ndarray, steady: np.ndarray, settings: Strokes) -> s
     share = covered / max(float(np.ptp(along_mm)), 1e-300)
     if share < settings.min_steady_share:
         needed = f"at least {settings.min_steady_share:.0%} is needed"
-        return f"the steady window is {share:.0%} of the stroke; {needed}"
+        return f"the steady window is {share:.1%} of the stroke; {needed}"
     return None
 
 
