@@ -168,7 +168,21 @@ def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], notes: No
     if helpers:
         evidence = "read for the columns computed below, no channels of their own"
         notes.guess("trace.drop_columns", helpers, evidence)
+    _side_by_side(roles, notes)
     _other_columns(found, roles, clock or "", notes)
+
+
+def _side_by_side(roles: Roles, notes: Notes) -> None:
+    """Add a doubt if further columns are called like displacement and force, but for a number."""
+    again = []
+    for taken in (roles.displacement, roles.force):
+        bare = None if taken is None else re.sub(r"[\W\d_]", "", taken.label)
+        again.append([c for c in roles.others if bare and re.sub(r"[\W\d_]", "", c.label) == bare])
+    if all(again):
+        places, forces = (own[0].place for own in again)
+        reason = f"{forces} is called like the force, and {places} like the displacement."
+        fix = "They are not read. If they are further recordings, save each in a file of its own."
+        notes.doubt("trace.columns.force_N", reason, fix)
 
 
 def _evidence(column: TraceColumn, role: str, roles: Roles) -> str:

@@ -60,6 +60,14 @@ def test_a_time_whose_clock_is_coarse_is_the_time_all_the_same(tmp_path, step):
     assert slots(campaign(tmp_path, columns, "Time,Position,Force\n"))["time_s"] == "Time"
 
 
+def test_recordings_side_by_side_are_a_doubt(tmp_path):
+    def columns(one):
+        return [one.time_s, one.displacement_mm, one.force_N, one.displacement_mm[::-1], 0.9 * one.force_N]
+
+    doubts = campaign(tmp_path, columns, "Time,Pos 1,Force 1,Pos 2,Force 2\n").doubts
+    assert any("further recordings" in doubt.fix for doubt in doubts)
+
+
 def test_a_counter_without_a_name_is_no_time(tmp_path):
     made = campaign(tmp_path, lambda one: [np.arange(len(one.time_s)), *exports.slots(one)], strokes=2)
     assert slots(made) == {"time_s": 2, "displacement_mm": 3, "force_N": 4}
