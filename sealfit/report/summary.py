@@ -309,14 +309,15 @@ def quality_clause(closure: Mapping) -> str:
 def power_clause(closure: Mapping, units: Units) -> str:
     """Return the smallest detectable effects of the least sensitive variables, in a clause; or "".
 
-    Variables that show no effect of any size come last, without those that make the conditions.
+    Variables that show no effect of any size at any level come last, without those of the conditions.
     """
     entries = [(f"{units.label(s['variable'])} {level_words(s['level'])}", s) for s in closure["sensitivity"]]
     sized = [one for one in entries if one[1]["smallest_N"] is not None]
     sized.sort(key=lambda one: -one[1]["smallest_N"])
     texts = [f"{_two_digits(s['smallest_pct'])} % for {name}" for name, s in sized[:NAMED]]
     said = f"the largest detection limits, in percent of the force, are {', '.join(texts)}" if texts else ""
-    none = [name for name, s in entries if s["smallest_N"] is None and s["variable"] not in AGING_CONDITION]
+    known = {*AGING_CONDITION, *(s["variable"] for _, s in sized)}
+    none = [name for name, s in entries if s["variable"] not in known]
     if none:
         more = f" and {len(none) - NAMED} more" if len(none) > NAMED else ""
         said += f"{'; ' if said else ''}no effect is detectable for {', '.join(none[:NAMED])}{more}"

@@ -114,7 +114,9 @@ def test_nothing_missing_states_the_sensitivity():
 
 def test_nothing_missing_names_variables_that_show_no_effect_of_any_size():
     names = ("humidity_pct", "oil temp", "batch", "run_order", "aging_days")  # the last makes the conditions
-    none = [{**SEEN, "variable": name, "level": "run", "smallest_N": None} for name in names]
+    none = [
+        {**SEEN, "variable": name, "level": "run", "smallest_N": None} for name in (*names, SEEN["variable"])
+    ]
     text = said({**document("nothing_missing", effects=()), "sensitivity": [SEEN, *none]})
     others = "humidity (%) between runs, oil temp between runs, batch between runs and 1 more"
     assert f"displacement (mm) along strokes; no effect is detectable for {others}." in text

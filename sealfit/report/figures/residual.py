@@ -201,7 +201,7 @@ def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
             ax.barh(place[1], place[0], 0.34, color=colour, linewidth=0)
             ax.annotate(texts[stage, name], place, (4, 0), textcoords="offset points", va="center", size=7.5)
     unit = plain(units.unit("force"))
-    ax.set_yticks(range(len(names)), names)
+    ax.set_yticks(range(len(names)), [name.replace("_", "-") for name in names])
     ax.set_ylim(-0.6, len(names) - 0.4)
     ax.set_xlim(0.0, 1.2 * largest)
     ax.grid(axis="y", visible=False)
