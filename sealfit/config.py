@@ -330,7 +330,7 @@ class Strokes(Strict):
     speed_tolerance: float = Field(0.1, gt=0, le=1)
     """Steady: smoothed speed within this share of its plateau."""
     min_steady_share: float = Field(0.2, gt=0, lt=1)
-    """A steady window that is a smaller share of its stroke is too short."""
+    """A steady window that is a smaller share of its stroke is too short, unless the speed never settles."""
     whole_file: bool = False
     """Every file is one steady stroke, without ramps."""
     turn: float | None = Field(None, ge=1e-9)

@@ -130,7 +130,8 @@ def _stroke(
     time_s, displacement_mm = (values[rows] for values in motion[:2])
     speed = slope(time_s, displacement_mm, steady)
     along = speed_along(time_s, displacement_mm, steady, window.rise_mm, speed, noise)
-    short, ends = _too_short(way * displacement_mm, steady, settings), (rows.start, rows.stop)
+    short = _too_short(way * displacement_mm, steady, settings, settles=window.settles)
+    ends = (rows.start, rows.stop)
     return Stroke(*ends, origin, way, speed, steady, sliding, left_N, along, short, window.settles)
 
 
@@ -149,7 +150,8 @@ def _turns(
         own, rows = slice(*part), slice(whole.start + part[0], whole.start + part[1])
         cut = {name: getattr(whole, name)[own] for name in OF_ROWS}
         speed = slope(time_s[rows], displacement_mm[rows], cut["steady"])
-        short = _too_short(whole.direction * displacement_mm[rows], cut["steady"], settings)
+        along = whole.direction * displacement_mm[rows]
+        short = _too_short(along, cut["steady"], settings, settles=whole.settles)
         turn = {"start": rows.start, "stop": rows.stop, "speed_mm_s": speed, "short": short}
         made.append(replace(whole, **turn, **cut))
     return made
@@ -374,14 +376,14 @@ def _bounds(smooth_mm: np.ndarray, turns: list[int], near_mm: float, samples: in
     return [0, *starts[1:], len(smooth_mm)], origin
 
 
-def _too_short(along_mm: np.ndarray, steady: np.ndarray, settings: Strokes) -> str | None:
-    """Return why a steady window is too short to be used."""
+def _too_short(along_mm: np.ndarray, steady: np.ndarray, settings: Strokes, *, settles: bool) -> str | None:
+    """Return why a steady window is too short to be used; by its samples alone where no speed settles."""
     samples = int(np.count_nonzero(steady))
     if samples < settings.min_samples:
         return f"the steady window has {samples} samples; at least {settings.min_samples} are needed"
     covered = np.abs(np.diff(along_mm))[steady[1:] & steady[:-1]].sum()
     share = covered / max(float(np.ptp(along_mm)), 1e-300)
-    if share < settings.min_steady_share:
+    if settles and share < settings.min_steady_share:
         needed = f"at least {settings.min_steady_share:.0%} is needed"
         return f"the steady window is {share:.1%} of the stroke; {needed}"
     return None

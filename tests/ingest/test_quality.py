@@ -152,16 +152,26 @@ def test_the_longest_gap_is_told_as_long_as_it_is_over_rows_filtered_out():
     assert "after this line, is 1.61 where 0.00801 is usual" in fault.reason
 
 
-def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
+def fault_of_a_sinusoid(settings):
     time = np.arange(0.0, 2.0, 0.01)
     x = -10.0 * np.cos(0.5 * np.pi * time)
     force = 20.0 + 0.1 * np.gradient(x, time)
-    (stroke,) = find_strokes(time, x, force, Strokes(min_steady_share=0.6))
+    (stroke,) = find_strokes(time, x, force, settings)
     (fault,) = stroke_faults(stroke, rows_of(time, force), Quality())
+    return fault
+
+
+def test_a_stroke_whose_speed_never_settles_is_kept_however_short_its_window_is():
+    fault = fault_of_a_sinusoid(Strokes(min_steady_share=0.6))
+    assert (fault.check, fault.action) == ("no_plateau", "kept")
+
+
+def test_a_speed_that_never_settles_is_said_of_a_stroke_that_is_left_out():
+    fault = fault_of_a_sinusoid(Strokes(min_samples=150))
     assert fault.check == "too_short"
     assert fault.fix.startswith("Drive at a constant speed. ")
     assert "strokes.min_samples" in fault.fix  # of a sinusoidal motion nothing else can be changed
-    assert fault.reason.startswith("the speed never settles: the steady window is ")
+    assert fault.reason.startswith("the speed never settles: the steady window has 25 samples")
 
 
 def test_a_stroke_too_short_says_what_is_needed():
