@@ -70,7 +70,7 @@ def close_loop(
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins
     rows = make_rows(with_set_ups(counted), has_aging=config.aging)
-    if rows.level_name("run") == SET_UP:
+    if SET_UP in rows.table:
         say("files of a specimen with the same repeat scatter alike: they are one set-up")
     outliers = outlier_files(rows)
     left_out = [one.file for one in outliers if not one.instead]

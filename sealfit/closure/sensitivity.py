@@ -32,7 +32,7 @@ from sealfit.closure.small_sample_test import (
     moderated,
 )
 from sealfit.fit.joint import Fitted
-from sealfit.fit.joint.rows import ALONG, LEVELS, SET_UP
+from sealfit.fit.joint.rows import ALONG, LEVELS
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
 
@@ -50,7 +50,7 @@ FRICTION = ("mu", "multiply")
 # Channels that describe the order of the tests. They do not make the verdict `cannot_tell`.
 ASIDE = ("run_order", "elapsed_h", "repeat")
 LEVEL_NAMES = {
-    "sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", SET_UP: SET_UP,
+    "sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "set_up": "set_up",
     "specimen": "condition",
 }  # fmt: skip
 

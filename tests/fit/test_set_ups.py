@@ -27,7 +27,7 @@ def test_files_of_a_specimen_and_repeat_that_scatter_alike_are_a_set_up(seed):
     assert bins[SET_UP].nunique() == 15
     rows = make_rows(bins, has_aging=True)
     assert rows.groups.starts["run"].size == 15
-    assert rows.level_name("run") == SET_UP
+    assert rows.level_name("run") == "set_up"
     assert SET_UP not in rows.channels
 
 
@@ -58,6 +58,13 @@ def test_forces_that_are_the_same_to_the_last_digits_show_no_set_ups(jitter):
     mount = pd.factorize(bins["specimen_id"] + bins["repeat"].astype(str))[0]
     bins["force_N"] *= 1 + jitter * np.sin(mount)
     assert SET_UP not in with_set_ups(bins)
+
+
+def test_a_column_of_the_campaign_with_that_name_is_a_channel():
+    bins = make_bins(1, **SMALL).assign(set_up="A")
+    rows = make_rows(with_set_ups(bins), has_aging=True)
+    assert "set_up" in rows.channels
+    assert rows.groups.starts["run"].size == bins["run_id"].nunique()
 
 
 def test_without_repeats_there_is_nothing_to_find():

@@ -106,8 +106,8 @@ def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
 # ---------------------------------------------------------------- rows
 # Grouping levels, finest first. A row of `bins` is a mean of samples of a stroke.
 LEVELS = ("stroke", "file", "run", "specimen")
-# Column of the set-up of each row, if repeats are set-ups. The groups of level "run" are then set-ups.
-SET_UP = "set_up"
+# Column of the set-up of each row, if repeats are set-ups. No channel of a campaign begins with `_`.
+SET_UP = "_set_up"
 # Channels that increase along a stroke, so that they vary within a bin.
 ALONG = ("displacement_mm", "distance_mm", "time_s")
 # Derived channel if loads differ: load times |speed|, the power of friction over its coefficient.
@@ -208,8 +208,8 @@ class Rows:
         return self.groups.codes[level]
 
     def level_name(self, level: str) -> str:
-        """Return the name of a level in the results."""
-        return SET_UP if level == "run" and SET_UP in self.table else level
+        """Return the name of a level in the results: the groups of level "run" may be set-ups."""
+        return "set_up" if level == "run" and SET_UP in self.table else level
 
     @cached
     def sparse(self, most: int) -> Rows:
