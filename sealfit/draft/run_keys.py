@@ -360,9 +360,11 @@ def compressed(cells: Sequence[str], theirs: str, notes: Notes) -> bool:
 
 
 def _dates_doubt(table: RunsTable, clock: str | None, notes: Notes) -> str:
-    """Add a doubt about the first column of dates in a form that is not known, and return it; "" if none."""
+    """Add a doubt about a column of dates in a form that is not known, and return its name; "" if none.
+
+    Of several it is the one that differs most: many tests follow one day in the oven.
+    """
     dates = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{2,4}")
-    # Of several dates that of the test differs most: many tests follow one day in the oven.
     for name, cells in sorted(table.cells.items(), key=lambda column: -len(set(column[1]))):
         full = [cell for cell in cells if cell]
         if name not in table.ours and full and all(map(dates.search, full)):

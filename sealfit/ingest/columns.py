@@ -1,6 +1,6 @@
 """Columns of a trace file, columns of a campaign's listing, and the keys of conditions built from them."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Self
@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 import pandas as pd
 
-from sealfit.config import MEASURED, Config, TraceFormat
+from sealfit.config import MEASURED, Config, FileColumn, TraceFormat
 from sealfit.errors import KEPT, NOTED, BadFile, Fault, SealfitError, nearest, shortened
 from sealfit.ingest.cells import OVERLOAD, Trace, cell_faults, listed, numbers_of
 from sealfit.ingest.expression import parse
@@ -323,17 +323,26 @@ def header_units(layout: FileLayout, settings: TraceFormat, units: Units, clock:
         at = column.name - 1 if isinstance(column.name, int) else names.index(column.name)
         cell = row[at].strip(" []") if at < len(row) else ""
         said = cell if cell[:1].isalpha() else names[at].rpartition("[")[2].rpartition("]")[0].strip()
-        taken = column.unit or units.of(ours)
-        unit = other_unit(said, taken)
-        if unit is None:
-            continue
-        fix = f'set {ours} = {{name = {column.name!r}, unit = "{unit}"}} under [trace.columns].'
-        if not unit:
-            fix = f"name the column otherwise under [trace.columns], and compute {ours} from it."
-        reason = f"the header says '{said}', and the config takes the numbers in {taken}."
         place = {"line": layout.names_line, "column": names[at]}
-        faults.append(Fault("unit", reason, fix=f"If the header is right, {fix}", **place, **KEPT))
+        faults += unit_said(said, ours, column, column.unit or units.of(ours), "trace.columns", place)
     return faults
+
+
+def unit_said(
+    said: str, ours: str, column: FileColumn, taken: str, table: str, place: Mapping[str, str | int | None]
+) -> Iterator[Fault]:
+    """Yield a warning if a header says another unit than that in which the numbers of a column are taken.
+
+    `table` is the one of the config that names the column as `ours`.
+    """
+    unit = other_unit(said, taken)
+    if unit is None:
+        return
+    fix = f'set {ours} = {{name = {column.name!r}, unit = "{unit}"}} under [{table}].'
+    if not unit:
+        fix = f"name the column otherwise under [{table}], and compute {ours} from it."
+    reason = f"the header says '{said}', and the config takes the numbers in {taken}."
+    yield Fault("unit", reason, fix=f"If the header is right, {fix}", **place, **KEPT)
 
 
 def _missing(ours: str, layout: FileLayout, width: int, settings: TraceFormat) -> Fault:

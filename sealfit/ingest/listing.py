@@ -13,13 +13,13 @@ from pathlib import Path
 
 from sealfit.config import AGING_CONDITION, Config, Files
 from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, ConfigError, Fault, nearest, printable
-from sealfit.ingest.columns import NO_COLUMN, Columns, mapped, suggestion
+from sealfit.ingest.columns import NO_COLUMN, Columns, mapped, suggestion, unit_said
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import TEXT_COLUMNS, as_number, found_by, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
 from sealfit.store.manifest import found_by_glob, glob_names
 from sealfit.store.paths import runs_tables
-from sealfit.units import Conversion, other_unit
+from sealfit.units import Conversion
 
 NUMBERS = (*AGING_CONDITION, "load_N", "speed_mm_s")
 UNIT_IN_BRACKETS = re.compile(r"[\[(]([^\])]+)[\])]\s*$")
@@ -199,14 +199,11 @@ def _units_in_header(
 ) -> Iterator[Fault]:
     """Yield a warning for each column whose name has a unit in brackets other than the config's."""
     for ours, theirs in config.files.runs_columns.items():
-        said, taken = UNIT_IN_BRACKETS.search(str(theirs.name)), theirs.unit or config.units.of(ours)
-        if str(theirs.name) in header and said and taken and (unit := other_unit(said[1], taken)) is not None:
-            reason = f"the header says '{said[1]}', and the config takes the numbers in {taken}."
-            fix = f'set {ours} = {{name = "{theirs.name}", unit = "{unit}"}} under [files.runs_columns].'
-            if not unit:
-                fix = f"name the column otherwise under [files.runs_columns], and compute {ours} from it."
-            fix = f"If the header is right, {fix}"
-            yield Fault("unit", reason, column=str(theirs.name), fix=fix, **place, **KEPT)
+        name, taken = str(theirs.name), theirs.unit or config.units.of(ours)
+        said = UNIT_IN_BRACKETS.search(name)
+        if name in header and said and taken:
+            own = {**place, "column": name}
+            yield from unit_said(said[1], ours, theirs, taken, "files.runs_columns", own)
 
 
 def misspelt(

@@ -72,7 +72,7 @@ def test_a_unit_in_the_header_of_the_table_that_the_config_does_not_name_is_warn
     found = warnings_of_units(folder, f'"{name}"')
     assert [fault.column for fault in found] == [name] * warned
     if warned:
-        assert 'load_N = {name = "Gewicht [kg]", unit = "kgf"} under [files.runs_columns]' in found[0].fix
+        assert "load_N = {name = 'Gewicht [kg]', unit = \"kgf\"} under [files.runs_columns]" in found[0].fix
         assert warnings_of_units(folder, f'{{name = "{name}", unit = "kgf"}}') == []
 
 

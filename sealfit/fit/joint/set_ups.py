@@ -40,16 +40,16 @@ def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
         {"run": "first", "specimen": "first", "repeat": "first", "force": "mean"}
     )
     files["set_up"] = files["specimen"] + " repeat " + files["repeat"]
-    p_value, shown = _test(files)
+    p_value, shown = _p_value(files)
     if p_value >= SET_UP_P:
         return bins
     most = shown.nlargest(max(len(shown) // 4, 1)).index
-    if len(shown) > 2 and _test(files[~files["specimen"].isin(most)])[0] >= OF_THE_OTHERS_P:
+    if len(shown) > 2 and _p_value(files[~files["specimen"].isin(most)])[0] >= OF_THE_OTHERS_P:
         return bins
     return bins.assign(**{SET_UP: record.map(files["set_up"])})
 
 
-def _test(files: pd.DataFrame) -> tuple[float, pd.Series]:
+def _p_value(files: pd.DataFrame) -> tuple[float, pd.Series]:
     """Return the p-value of set-ups, 1 for a negligible scatter, and what they explain in each specimen."""
     known = [files["run"]]
     if files.groupby("run")["specimen"].nunique().max() == 1:
