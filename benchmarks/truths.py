@@ -36,7 +36,9 @@ NO_INTERVAL = {("step", "x_0")}
 
 
 def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
-    """Return the noise-free force of steady sliding at arbitrary points, in N, shape (n,).
+    """Return the noise-free force at arbitrary points, in N, shape (n,), after the rise of each stroke.
+
+    Bristles follow a slow change along a stroke one length of the rise behind; the sensor does not.
 
     Parameters
     ----------
@@ -72,7 +74,21 @@ def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
         if empty := int(points[name].isna().sum()):
             raise RequestError(f"the points have {empty} empty cells.", column=name, fix="Fill them.")
         channels[name] = points[name].to_numpy()
-    return np.broadcast_to(law.force_N(channels), (len(points),)).astype(float)
+    *_, factor, added = law.parts(channels)
+    limit, viscous, *_ = law.parts(_followed(channels, spec, law))
+    return np.broadcast_to((limit + viscous) * factor + added, (len(points),)).astype(float)
+
+
+def _followed(channels: Mapping[str, np.ndarray], spec: Spec, law: SteadyLaw) -> dict[str, np.ndarray]:
+    """Return the channels one length of the rise before."""
+    speed = channels["speed_mm_s"]
+    sigma_0, length = spec.physics.sigma_0, spec.design.stiffness_mm
+    rise = np.full(speed.shape, length) if sigma_0 is None else np.abs(law.parts(channels)[0]) / sigma_0
+    behind = {"displacement_mm": np.sign(speed) * rise, "distance_mm": rise, "time_s": rise / np.abs(speed)}
+    before = {name: channels[name] - behind[name] for name in behind if name in channels}
+    if "distance_mm" in before:
+        before["distance_mm"] = np.maximum(before["distance_mm"], length)  # as the simulation begins
+    return {**channels, **before}
 
 
 @dataclass(frozen=True)

@@ -204,14 +204,14 @@ def _forces(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a trace's friction and the force that effects add to it, without noise, in N, (n,) each."""
     parts = law.parts({**channels, **_begun(spec, motion, speed)})
-    limit, viscous, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
-    if not (np.isfinite(limit + viscous).all() and np.isfinite(added).all()):
+    limit, viscous, factor, added = (np.broadcast_to(part, motion.time_s.shape) for part in parts)
+    if not np.isfinite((limit + viscous) * factor + added).all():
         reason = f"the effects give no number in {channels['file'][0]}."
         raise ConfigError(reason, fix="Check their parameters and formulas.")
     if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
         rise = np.full(motion.time_s.size, spec.design.stiffness_mm)
-        return with_presliding(limit + viscous, motion, rise), added
-    return _dynamic(spec, law, motion, channels, speed) + viscous, added
+        return with_presliding(limit + viscous, motion, rise) * factor, added
+    return (_dynamic(spec, law, motion, channels, speed) + viscous) * factor, added
 
 
 def _dynamic(
@@ -225,7 +225,7 @@ def _dynamic(
     }
     start = motion.displacement_mm[0] - (0.0 if motion.direction[0] > 0 else spec.design.stroke_mm)
     fine = move_at(spec.design, speed, int(motion.direction[0]), start, time)
-    limit, _, _ = law.parts({**between, **_begun(spec, fine, speed)})
+    limit, *_ = law.parts({**between, **_begun(spec, fine, speed)})
     limit = np.broadcast_to(limit, time.shape)
     rise = np.abs(limit) / spec.physics.sigma_0
     force = with_presliding(limit, fine, rise, spec.physics.sigma_1 / spec.physics.sigma_0)

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
+from scipy.special import exprel
 
 from sealfit.effects.contract import QUANTITIES_OF
 from sealfit.physics import aging_law, stribeck_decay
@@ -107,26 +107,17 @@ def with_presliding(
 
     .. math:: dF/dx = (F_{limit} - F) / x_0
 
-    This is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the length of the rise, `rise_mm`. At
-    constant speed only the initial difference decays, so that the force of steady sliding has no lag.
-    `limit_N` is the force of the bristles in steady sliding at every row's speed; it and `rise_mm` have the
-    shape (n,). `damping_s` is sigma_1 / sigma_0.
+    This is Eq. 2 over the distance x for F = sigma_0 z, with x_0 = g, the length of the rise, `rise_mm`.
+    `limit_N` is the force of the bristles in steady sliding at every row's speed, a straight line between
+    rows of one direction; it and `rise_mm` have the shape (n,). `damping_s` is sigma_1 / sigma_0.
     """
-    steps = np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0]))
-    decay = np.exp(-steps / rise_mm).tolist()
-    result = limit_N.astype(float)
-    phase = 2 * motion.stroke + motion.cruising
-    edges = np.flatnonzero(np.diff(phase, prepend=-1, append=-1))
-    force = 0.0
-    for first, last in pairwise(edges.tolist()):
-        if motion.cruising[first]:
-            slid = np.abs(motion.displacement_mm[first:last] - motion.displacement_mm[first])
-            result[first:last] += (force - limit_N[first]) * decay[first] * np.exp(-slid / rise_mm[first])
-            force = float(result[last - 1])
-            continue
-        for row, target in enumerate(limit_N[first:last].tolist(), start=first):
-            force = target + (force - target) * decay[row]
-            result[row] = force
+    slid = np.abs(np.diff(motion.displacement_mm, prepend=motion.displacement_mm[0])) / rise_mm
+    turned = np.diff(motion.direction, prepend=0) != 0
+    change = np.where(turned, 0.0, np.diff(limit_N, prepend=limit_N[0]))
+    begin, end = limit_N - change, limit_N - change * exprel(-slid)
+    result, force = np.empty(limit_N.size), 0.0
+    for row, decay in enumerate(np.exp(-slid)):
+        result[row] = force = end[row] + (force - begin[row]) * decay
     return result + damping_s * np.abs(motion.speed_mm_s) / rise_mm * (limit_N - result)
 
 
@@ -151,11 +142,11 @@ class SteadyLaw:
         return replace(self, effects=self.effects[:number] + self.effects[number + 1 :])
 
     def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the steady bristle force, viscous part and added forces, in N, broadcast over the channels.
+        """Return the steady bristle force, the viscous part, the factor on both, and added forces.
 
-        `channels` has `speed_mm_s` (signed), the condition columns and `load_N` of the design, and all that
-        the effects read; shape (n,) or (1,) each. ParameterError if an effect makes v_s or b zero or
-        negative.
+        Forces are in N, all broadcast over the channels. `channels` has `speed_mm_s` (signed), the condition
+        columns and `load_N` of the design, and all that the effects read; shape (n,) or (1,) each.
+        ParameterError if an effect makes v_s or b zero or negative.
         """
         given = {name: np.atleast_1d(channels[name]) for name in CONDITIONS if name in channels}
         now = declared_parameters(self.physics, given)
@@ -170,14 +161,14 @@ class SteadyLaw:
         for operation in ("multiply", "add"):
             mu = self._changed("mu", mu, channels, operation)
         load = np.asarray(channels.get("load_N", 1.0), dtype=float)
-        limit = self._changed("force", load * mu * np.sign(speed), channels, "multiply")
-        viscous = self._changed("force", now["sigma_2"] * speed, channels, "multiply")
-        return limit, viscous, self._changed("force", np.zeros(1), channels, "add")
+        factor = self._changed("force", np.ones(1), channels, "multiply")
+        added = self._changed("force", np.zeros(1), channels, "add")
+        return load * mu * np.sign(speed), now["sigma_2"] * speed, factor, added
 
     def force_N(self, channels: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the force of steady sliding, in N, signed as in the file."""
-        limit, viscous, added = self.parts(channels)
-        return limit + viscous + added
+        limit, viscous, factor, added = self.parts(channels)
+        return (limit + viscous) * factor + added
 
     def _changed(
         self, target: str, value: np.ndarray, channels: Mapping[str, np.ndarray], operation: str | None = None

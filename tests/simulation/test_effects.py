@@ -89,7 +89,7 @@ def test_truth_agrees_with_the_written_traces_at_every_steady_sample(campaign):
             "specimens": 2,
             "loads_N": (20.0, 50.0),
             "start_scatter_mm": 1.0,
-            "stiffness_mm": 0.1,
+            "stiffness_mm": 1e-7,
         },
         channels=[
             {"kind": "numeric", "name": "humidity_pct", "level": "run", "mean": 50, "sd": 8},
@@ -157,7 +157,8 @@ def test_catalogue_effects_are_resolved_with_their_shapes(campaign, monkeypatch)
     entry = {"id": "halving", "channels": ["distance_mm", "load_N"], "parameters": {"A": 0.2, "h": 10.0}}
     entry["reference"] = {"load_N_ref": 25.0}
     physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0}
-    truth, _, _ = campaign(physics=physics, design={**ONE_CONDITION, "loads_N": (50.0,)}, effects=[entry])
+    design = {**ONE_CONDITION, "loads_N": (50.0,), "stiffness_mm": 1e-9}
+    truth, _, _ = campaign(physics=physics, design=design, effects=[entry])
     assert truth["effects"][0]["acts_on"] == "mu"
     points = pd.DataFrame(
         {"temperature_C": 23.0, "compression_ratio_pct": 100.0, "aging_days": 0.0, "speed_mm_s": -5.0},
@@ -191,6 +192,7 @@ def test_every_effect_of_the_catalogue_can_be_simulated(campaign, known):
     entry = {"id": known.id, "parameters": values, "channels": [FREELY.get(n, n) for n in known.reads]}
     channels = [{"kind": "constant", "name": n, "value": SETTING[n]} for n in known.reads if n in SETTING]
     design = {**ONE_CONDITION, "days": (16.0,), "speeds_mm_s": (2.0,), "directions": (1, -1)}
+    design["stiffness_mm"] = 1e-7  # the law is that of steady sliding, which bristles follow by their length
     truth, runs, traces = campaign(design=design, channels=channels, effects=[entry], noise=())
     runs = runs.assign(
         direction=[1 if "fwd" in run else -1 for run in runs["run_id"]], stroke=1, elapsed_h=0.0
