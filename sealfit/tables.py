@@ -154,6 +154,7 @@ BINS = table(
     LOAD,
     Column("force_N", "friction force: mean in the bin, without presliding_N"),
     PRESLIDING,
+    Column("rise_mm", "length over which the stroke's pre-sliding rise comes up by 63 %; 0 without one"),
     Column("force_sd_N", "standard deviation of the samples in the bin"),
     Column("n", "samples in the bin", INT),
     DISPLACEMENT,

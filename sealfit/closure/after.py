@@ -26,7 +26,7 @@ from sealfit.fit.dynamic import fit_dynamic
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.declared import series_of_curve
 from sealfit.fit.joint.model import Model, Term, evaluate
-from sealfit.fit.joint.rows import POWER, Rows
+from sealfit.fit.joint.rows import POWER, Lag, Rows
 from sealfit.fit.steady import FORCES, SteadyFit, fit_conditions, parameter_units, table_row
 from sealfit.fit.steady.uncertainty import SHIFT
 from sealfit.ingest.stored_parts import StoredTraces
@@ -123,7 +123,7 @@ def _at_start(model: Model, reference: Model, rows: Rows) -> np.ndarray:
     table, direction = rows.table, np.sign(rows.speed)
     origin = table["displacement_mm"] - direction * table["distance_mm"].to_numpy(float)
     start = table.assign(displacement_mm=origin, distance_mm=0.0, time_s=0.0)
-    begun = replace(rows, table=start)
+    begun = replace(rows, table=start, lag=Lag())
     return evaluate(model, begun, jacobian=False)[0] - evaluate(reference, begun, jacobian=False)[0]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -280,4 +281,4 @@ def between_speeds(rows: Rows) -> Rows:
     table["speed_mm_s"] = np.sign(rows.speed[there]) * halfway[there]
     if POWER in table:
         table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
-    return rows.points(table, rows.condition[there])
+    return replace(rows.points(table, rows.condition[there]), force=rows.force[there])

@@ -69,7 +69,7 @@ def close_loop(
     context = Context(config, effects, say, workers=workers)
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins
-    rows = make_rows(with_set_ups(counted), has_aging=config.aging)
+    rows = make_rows(with_set_ups(counted), has_aging=config.aging, speed_factor=config.units.speed_factor)
     if SET_UP in rows.table:
         say("files of a specimen with the same repeat scatter alike: they are one set-up")
     outliers = outlier_files(rows)

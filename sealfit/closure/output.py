@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -51,6 +52,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
         "conditions": rows.conditions.to_dict(orient="list"),
         "has_load": rows.has_load,
         "has_aging": rows.has_aging,
+        "compliance": rows.lag.compliance,
         "declared": {
             "parameters": [[p.quantity, p.owner] for p in declared.parameters],
             "index": {q: declared.index[q].tolist() for q in QUANTITIES},
@@ -357,9 +359,11 @@ def curve_table(before: Fitted, after: Fitted) -> pd.DataFrame:
     condition, backward = (points.index.get_level_values(level).to_numpy() for level in (0, 1))
     points = points.assign(direction=-backward, speed_mm_s=-backward * along, file="")
     at = rows.points(points, condition)
+    before_N, _ = evaluate(before.model, at, jacobian=False)
+    at = replace(at, force=before_N)
     mean, tangent = evaluate(after.model, at)
     reach = mean_half_width(tangent, after.covariance, degrees_of_freedom(after), sandwiches(after))
-    forces = {"force_before_N": evaluate(before.model, at, jacobian=False)[0], "force_after_N": mean}
+    forces = {"force_before_N": before_N, "force_after_N": mean}
     ends = {"force_after_lo95_N": mean - reach, "force_after_hi95_N": mean + reach}
     return at.table.assign(**forces, **ends)[CURVES.names()]
 

@@ -22,7 +22,7 @@ from sealfit.effects.contract import SECOND, Effect, deviation
 from sealfit.errors import RequestError
 from sealfit.fit.joint.declared import SPEEDS_BETWEEN
 from sealfit.fit.joint.model import Model, evaluate, loads_of
-from sealfit.fit.joint.rows import LEVELS, POWER, Rows, point_rows, sliding_power
+from sealfit.fit.joint.rows import LEVELS, POWER, Lag, Rows, point_rows, sliding_power
 from sealfit.fit.joint.whitening import GAIN, Component, Scatter
 from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.columns import add_keys, condition_columns
@@ -70,7 +70,10 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     extrapolated = _outside(table, conditions, code, model, notes, after)
     if good.any():
         own = {"has_load": model["has_load"], "has_aging": model["has_aging"]}
+        own["lag"] = Lag(model["compliance"], config.units.speed_factor)
         at = point_rows(table[good].reset_index(drop=True), code[good], conditions, **own)
+        before_N, _ = evaluate(before, at, jacobian=False)
+        at = replace(at, force=before_N)  # its lag
         mean, tangent = evaluate(after, at)
         reach = t_quantile(model["df"])
         others = []
@@ -81,7 +84,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, at, mean))
         one = _one_measurement(model["scatter"], loads_of(after, at))
         spread = reach * np.sqrt((half / reach) ** 2 + one)
-        forces = (evaluate(before, at, jacobian=False)[0], mean, mean - half, mean + half)
+        forces = (before_N, mean, mean - half, mean + half)
         answer[good] = np.column_stack([*forces, mean - spread, mean + spread])
     return points.reset_index(drop=True).assign(
         **dict(zip(FORCE_COLUMNS, answer.T, strict=True)),

@@ -73,7 +73,7 @@ def _merged(part: Rows, campaign: Rows, seed: int) -> Rows:
     merged = merged_bins(part.table.drop(columns=POWER, errors="ignore"), seed)
     if len(merged) == part.force.size:
         return part
-    made = make_rows(merged, has_aging=campaign.has_aging, conditions=campaign.conditions)
+    made = make_rows(merged, has_aging=campaign.has_aging, campaign=campaign)
     declare(made, as_in=campaign)
     return made
 

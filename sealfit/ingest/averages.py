@@ -324,7 +324,7 @@ def _stroke_rows(
         row = {**trace.channels, **_means(stroke, samples), "file": file}
         row |= {"stroke": int(samples["stroke"][stroke.start]), "direction": stroke.direction}
         row |= {"speed_mm_s": config.units.speed_factor * stroke.speed_mm_s}
-        row |= {"several": several, "several_speeds": stroke.several_speeds}
+        row |= {"rise_mm": stroke.rise_mm, "several": several, "several_speeds": stroke.several_speeds}
         found = stroke_faults(stroke, trace, config.quality)
         used = not any(fault.action == "stroke left out" for fault in found)
         if used:

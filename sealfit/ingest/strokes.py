@@ -41,9 +41,10 @@ class Stroke:
     strokes, its time); a steady speed or a turn has that of the first of its motion. `speed_mm_s` is in
     displacement units per time unit, signed. Arrays are of shape (stop - start,): `steady` marks the rows of
     the window, `sliding` those in which it moves; `presliding_N` is what is left of the pre-sliding rise in
-    the window, with the sign of the force, 0 elsewhere; `speed_along_mm_s` is the speed at every row. `short`
-    says why the window is too short to be used. `settles` is false where the speed has no plateau;
-    `several_speeds` is true for a steady speed of a motion with several.
+    the window, with the sign of the force, 0 elsewhere; `speed_along_mm_s` is the speed at every row.
+    `rise_mm` is the length of that rise, 0 without one. `short` says why the window is too short to be used.
+    `settles` is false where the speed has no plateau; `several_speeds` is true for a steady speed of a motion
+    with several.
     """
 
     start: int
@@ -55,6 +56,7 @@ class Stroke:
     sliding: np.ndarray
     presliding_N: np.ndarray
     speed_along_mm_s: np.ndarray
+    rise_mm: float = 0.0
     short: str | None = None
     settles: bool = True
     several_speeds: bool = False
@@ -132,7 +134,8 @@ def _stroke(
     along = speed_along(time_s, displacement_mm, steady, window.rise_mm, speed, noise)
     short = _too_short(way * displacement_mm, steady, settings, settles=window.settles)
     ends = (rows.start, rows.stop)
-    return Stroke(*ends, origin, way, speed, steady, sliding, left_N, along, short, window.settles)
+    of_rows = (steady, sliding, left_N, along)
+    return Stroke(*ends, origin, way, speed, *of_rows, window.rise_mm, short, window.settles)
 
 
 def _turns(

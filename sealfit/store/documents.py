@@ -179,6 +179,7 @@ MODEL = record(
     config=Config,
     conditions=CONDITIONS,
     **dict.fromkeys(("has_load", "has_aging"), StrictBool),
+    compliance=Annotated[Number, Field(ge=0)],
     declared=DECLARED,
     **dict.fromkeys(("before", "after"), FITTED),
     covariance=Matrix,

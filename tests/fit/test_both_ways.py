@@ -3,9 +3,8 @@
 import pytest
 
 from sealfit.config import Config
-from sealfit.fit.joint.rows import merge_directions
 from sealfit.fit.steady import fit_conditions
-from sealfit.fit.steady.uncertainty import run_means
+from sealfit.fit.steady.uncertainty import merge_directions, run_means
 
 
 def test_one_row_a_file_and_the_offset_between_the_ways_cancels(campaign):

@@ -3,18 +3,22 @@ from dataclasses import replace
 import bins_helpers
 import numpy as np
 import numpy.testing as npt
+import pandas as pd
 import pytest
 
 from sealfit.closure.left_out import between_speeds
+from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
 from sealfit.fit.joint import _searched, fit, fit_declared
 from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
-from sealfit.fit.joint.rows import make_rows, set_speeds, thin
+from sealfit.fit.joint.rows import Lag, make_rows, set_speeds, thin
 from sealfit.fit.joint.search import start_model
 from sealfit.fit.joint.variance_components import curve_components
+from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.strokes import speed_clusters
+from sealfit.simulation import Spec, simulate
 
 WAVE = Effect(
     id="wave",
@@ -487,3 +491,41 @@ def test_a_condition_whose_files_were_all_left_out_has_a_finite_start():
     last = rows.conditions["condition"].iloc[-1]
     rest = rows.subset((rows.table["condition"] != last).to_numpy())
     assert np.isfinite(start_model(rest).theta).all()
+
+
+def test_an_effect_along_strokes_is_found_as_large_as_it_is(tmp_path):
+    """Strokes of some 50 bristle lengths: friction follows the warming up to 0.45 mm behind."""
+    truth = {"A": 0.1, "s_0": 5.0}
+    spec = Spec(
+        physics={"sigma_0": 100.0},
+        design={"days": (2.0,), "repeats": 2, "stroke_mm": 25.0, "max_rows": 400},
+        effects=[
+            {"id": "warming_distance", "acts_on": "mu", "operation": "multiply", "parameters": truth},
+        ],
+        noise=[{"kind": "white", "sd_N": 0.05}],
+    )
+    simulate(spec, tmp_path / "campaign")
+    bins = ingest_campaign(tmp_path / "campaign", Config()).tables["bins"]
+    rows = make_rows(bins, has_aging=True)
+    declared = fit_declared(rows)
+    term = Term(EFFECTS["warming_distance"], ("distance_mm",), "mu", "multiply")
+    found = fit(declared.model.with_term(term, truth), rows, declared.scatter, turns=2)
+    assert found.model.values[0] == pytest.approx(truth, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("channel", "behind"), [("distance_mm", 0.5), ("displacement_mm", -0.5), ("time_s", 0.05)]
+)
+def test_lag_by_hand(channel, behind):
+    # 25 N / (50 N/mm) = 0.5 mm, in 0.05 s at 10 mm/s.
+    npt.assert_allclose(Lag(1 / 50).behind(channel, np.array([-25.0]), np.array([-10.0])), behind)
+
+
+def test_lag_is_that_of_half_of_the_strokes_or_none():
+    bins = bins_helpers.make_bins(1, bins=2)
+    stroke = pd.factorize(bins["file"])[0]
+    force = bins["force_N"].abs().groupby(stroke).transform("mean")
+    for share, compliance in ((1.0, 0.02), (0.6, 0.02), (0.4, 0.0)):
+        rise = np.where(stroke < share * (stroke.max() + 1), 0.02 * force, 0.0)
+        rows = make_rows(bins.assign(rise_mm=rise), has_aging=True)
+        assert rows.lag.compliance == pytest.approx(compliance)

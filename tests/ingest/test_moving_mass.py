@@ -8,8 +8,8 @@ from trace_helpers import config
 
 from sealfit.errors import CampaignError, ConfigError
 from sealfit.fit.dynamic.starts import strokes_along
-from sealfit.fit.joint.rows import merge_directions, nesting_run, records
-from sealfit.fit.steady.uncertainty import run_means
+from sealfit.fit.joint.rows import nesting_run, records
+from sealfit.fit.steady.uncertainty import merge_directions, run_means
 from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.strokes import displacement_noise_mm, resolution_mm
 from sealfit.ingest.window import acceleration

@@ -44,14 +44,24 @@ class Term:
     @cached_property
     def shape_key(self) -> tuple:
         """All that the shape depends on besides the rows and its parameters."""
-        return (self.effect.id, self.channels, _hashable(self.fixed))
+        return (self.effect.id, self.channels, self.follows, _hashable(self.fixed))
+
+    @property
+    def follows(self) -> bool:
+        """Whether it changes what the bristles follow, and not the measured force.
+
+        The phase of a ripple is its own, and a wave shorter than a bristle lags by less than one.
+        """
+        return self.acts_on != "force" and not self.effect.periodic
 
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return the inputs of the effect's shape: channels of the rows, shape (n,), and fixed values."""
-        given = {
-            name: rows.unsigned(channel) if name in (CHANNEL, SECOND) else rows.values(channel)
-            for name, channel in zip(self.effect.reads, self.channels, strict=True)
-        }
+        given = {}
+        for name, channel in zip(self.effect.reads, self.channels, strict=True):
+            if self.follows and channel in ALONG:
+                given[name] = rows.followed(channel)
+            else:
+                given[name] = rows.unsigned(channel) if name in (CHANNEL, SECOND) else rows.values(channel)
         shift = self.fixed.get("shift")
         if shift is not None:  # NaN where the origin of a pass is unknown
             first = self.effect.reads[0]

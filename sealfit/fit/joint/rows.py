@@ -11,7 +11,6 @@ import pandas as pd
 from scipy.sparse import csr_array
 
 from sealfit.ingest.quality import LEAST_KNOWN, NO_VALUE
-from sealfit.ingest.strokes import SPEEDS_APART
 from sealfit.tables import BINS
 
 
@@ -60,50 +59,9 @@ class Groups:
         )
 
 
-# ---------------------------------------------------------------- both directions
-# `direction` of a row that is the mean of both directions.
-BOTH_DIRECTIONS = 0
-
-KEYS = ["file", "run_id"]
+# ---------------------------------------------------------------- rows
 # How a run of a file with both directions, or with several steady speeds in a stroke, ends.
 SPEED_AND_SIGN = r"( at \d[\d.e+-]*?)?[+-]?$"
-
-
-def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
-    """Return used rows of table `steady` with one row per record for runs with both directions at one speed.
-
-    Both directions are one unit of evidence; an offset between them cancels in their mean. In a merged row
-    `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
-    """
-    record = records(steady)
-    rows = steady.assign(file=record)
-    run = rows["run_id"].where(nesting_run(rows, record) == rows["run_id"], rows["run_id"].str.rstrip("+-"))
-    pace = rows["speed_mm_s"].abs()
-    if "speed_set_mm_s" in rows.columns:
-        pace = rows["speed_set_mm_s"].abs().fillna(pace)
-    extent = pd.DataFrame({"file": record, "run": run, "direction": rows["direction"], "pace": pace})
-    grouped = extent.groupby(["file", "run"])
-    merged = grouped["direction"].transform("nunique").eq(2)
-    merged &= grouped["pace"].transform("max") <= SPEEDS_APART * grouped["pace"].transform("min")
-    merged = merged.groupby(run).transform("all")
-    # A file that lost its strokes of one direction would bring a zero offset into the fit.
-    base = rows["run_id"].str.rstrip("+-")
-    both, lone = (part.groupby(base).transform("sum") for part in (merged, ~merged))
-    kept = merged | (2 * lone >= both)
-    rows, run, merged = rows[kept], run[kept], merged[kept]
-    if not merged.any():
-        return rows
-    size = {"force_N": rows["force_N"] * rows["direction"], "speed_mm_s": rows["speed_mm_s"].abs()}
-    own = rows.assign(run_id=run, **size)[merged]
-    numbers = [c for c in own.columns if pd.api.types.is_float_dtype(own[c])]
-    directions = own.groupby([*KEYS, "direction"], sort=False)[numbers].mean()
-    means = own.drop(columns=numbers).groupby(KEYS, sort=False).first()
-    means[numbers] = directions.groupby(level=KEYS, sort=False).mean()
-    means = means.assign(direction=BOTH_DIRECTIONS)
-    return pd.concat([rows[~merged], means.reset_index()[list(rows.columns)]], ignore_index=True)
-
-
-# ---------------------------------------------------------------- rows
 # Grouping levels, finest first. A row of `bins` is a mean of samples of a stroke.
 LEVELS = ("stroke", "file", "run", "specimen")
 # Column of the set-up of each row, if repeats are set-ups. No channel of a campaign begins with `_`.
@@ -119,7 +77,7 @@ SAME_SPEED_OF_RUN = 0.05
 # Ratio of the largest to the smallest load up to which it is one setting.
 SAME_LOAD = 1.05
 NOT_CHANNELS = {
-    "file", "record", "run_id", "bin", "stroke_id", "n", "force_N", "force_sd_N", "presliding_N",
+    "file", "record", "run_id", "bin", "stroke_id", "n", "force_N", "force_sd_N", "presliding_N", "rise_mm",
     "speed_bin_mm_s", "specimen_id", "condition", "series", "rubber", "speed_set_mm_s", SET_UP,
 }  # fmt: skip
 
@@ -145,6 +103,26 @@ def cached(method: Callable) -> Callable:
 
 
 @dataclass(frozen=True)
+class Lag:
+    """How far behind its steady value friction follows a slow change along a stroke.
+
+    At constant speed a bristle follows dz/dx = 1 - z / z_ss (Eq. 2 divided by v). If z_ss changes slowly
+    along x, z is that of x - z_ss: the friction force times `compliance`, 1 / sigma_0. `speed_factor` turns
+    displacement per time into the unit of the speed.
+    """
+
+    compliance: float = 0.0
+    speed_factor: float = 1.0
+
+    def behind(self, channel: str, force: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return the lag in a channel of `ALONG` at forces and signed speeds, shape (n,)."""
+        z_ss = self.compliance * np.abs(force)
+        if channel == "displacement_mm":
+            return np.sign(speed) * z_ss
+        return z_ss if channel == "distance_mm" else z_ss * self.speed_factor / np.abs(speed)
+
+
+@dataclass(frozen=True)
 class Rows:
     """Sorted rows of `bins` as arrays; `order` gives each row's place in the original table.
 
@@ -164,6 +142,7 @@ class Rows:
     has_load: bool
     has_aging: bool
     weight: np.ndarray  # (n,) sums to 1; all files have equal weight
+    lag: Lag = Lag()
     filled: dict[str, np.ndarray] = field(default_factory=dict)  # channels that some files lack
     cache: Cache = field(default_factory=Cache, init=False, compare=False, repr=False)
 
@@ -181,6 +160,12 @@ class Rows:
         if pd.api.types.is_numeric_dtype(column):
             return column.to_numpy(dtype=float, na_value=np.nan)
         return column.astype(object).where(column.notna(), NO_VALUE).to_numpy().astype(str)
+
+    @cached
+    def followed(self, channel: str) -> np.ndarray:
+        """Return a channel of `ALONG` where the steady friction is that of each row, shape (n,)."""
+        force = self.groups.means(np.abs(self.force), "stroke")[self.codes("stroke")]
+        return self.values(channel) - self.lag.behind(channel, force, self.speed)
 
     def unsigned(self, channel: str) -> np.ndarray:
         """Return a channel as the forms of effects read it: the speed without its sign, shape (n,)."""
@@ -224,7 +209,8 @@ class Rows:
     def points(self, table: pd.DataFrame, condition: np.ndarray) -> Rows:
         """Return points at the conditions of these rows, for a prediction; arguments as `point_rows`."""
         table = table.reset_index(drop=True)
-        return point_rows(table, condition, self.conditions, has_load=self.has_load, has_aging=self.has_aging)
+        own = {name: getattr(self, name) for name in ("has_load", "has_aging", "lag")}
+        return point_rows(table, condition, self.conditions, **own)
 
     def subset(self, mask: np.ndarray) -> Rows:
         """Return the rows where `mask`, shape (n,), is true; conditions keep the numbers that models need."""
@@ -243,10 +229,13 @@ class Rows:
         return part
 
 
-def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame | None = None) -> Rows:
+def make_rows(
+    bins: pd.DataFrame, *, has_aging: bool, speed_factor: float = 1.0, campaign: Rows | None = None
+) -> Rows:
     """Return table `bins` as sorted arrays with nested groups.
 
-    `has_aging` is whether conditions have `aging_days`; `conditions` are those of the whole campaign.
+    `has_aging` is whether conditions have `aging_days`, `speed_factor` turns displacement per time into the
+    unit of the speed. Conditions and lag are those of the `campaign` if these rows are a part of it.
     """
     table = bins.reset_index(drop=True).assign(record=records(bins).to_numpy())
     run = nesting_run(table, table["record"])
@@ -264,11 +253,12 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
         table[POWER] = sliding_power(table["load_N"], table["speed_mm_s"])
     days = table["aging_days"].to_numpy(dtype=float) if has_aging else np.zeros(len(table))
     condition, names = pd.factorize(table["condition"], sort=True)
-    if conditions is None:
+    if campaign is None:
         first = table.drop_duplicates("condition").set_index("condition").loc[names]
         conditions = first[["series", "rubber"]].reset_index()
         conditions["aging_days"] = first["aging_days"].to_numpy(dtype=float) if has_aging else 0.0
     else:
+        conditions = campaign.conditions
         condition = pd.Index(conditions["condition"]).get_indexer(names)[condition]
     files = groups.codes["file"]
     per_file = np.bincount(files)[files]
@@ -290,8 +280,21 @@ def make_rows(bins: pd.DataFrame, *, has_aging: bool, conditions: pd.DataFrame |
         has_load=has_load,
         has_aging=has_aging,
         weight=1.0 / per_file / (files.max() + 1),
+        lag=Lag(compliance_of(table, groups), speed_factor) if campaign is None else campaign.lag,
         filled=fill_missing(table, groups),
     )
+
+
+def compliance_of(table: pd.DataFrame, groups: Groups) -> float:
+    """Return the median over strokes of the length of the rise over the friction force, 1 / sigma_0.
+
+    Single rises are too noisy. It is 0 if fewer than half of the strokes begin with a rise.
+    """
+    if "rise_mm" not in table:
+        return 0.0
+    force = groups.means(np.abs(table["force_N"].to_numpy(dtype=float)), "stroke")
+    rise = table["rise_mm"].to_numpy(dtype=float)[groups.starts["stroke"]]
+    return float(np.nan_to_num(np.median(rise / np.maximum(force, 1e-300))))
 
 
 def set_speeds(speed: np.ndarray, run: np.ndarray) -> np.ndarray:
@@ -396,11 +399,18 @@ def open_columns(table: pd.DataFrame) -> list[str]:
 
 
 def point_rows(
-    table: pd.DataFrame, condition: np.ndarray, conditions: pd.DataFrame, *, has_load: bool, has_aging: bool
+    table: pd.DataFrame,
+    condition: np.ndarray,
+    conditions: pd.DataFrame,
+    *,
+    has_load: bool,
+    has_aging: bool,
+    lag: Lag,
 ) -> Rows:
     """Return the points of a prediction as `Rows`, one group per point.
 
-    `table`, shape (n, ...), has `speed_mm_s` and all channels that the model reads.
+    `table`, shape (n, ...), has `speed_mm_s` and all channels that the model reads. The force is 0: friction
+    has no lag until `force` is replaced.
     """
     n = len(table)
     every = np.arange(n)
@@ -419,5 +429,6 @@ def point_rows(
         conditions=conditions,
         has_load=has_load,
         has_aging=has_aging,
+        lag=lag,
         weight=np.full(n, 1.0 / max(n, 1)),
     )

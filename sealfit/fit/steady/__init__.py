@@ -8,7 +8,6 @@ import pandas as pd
 
 from sealfit.config import Config
 from sealfit.effects.contract import fill_unit
-from sealfit.fit.joint.rows import merge_directions
 from sealfit.fit.least_squares import t_quantile
 from sealfit.fit.steady.condition import (
     FULL,
@@ -21,7 +20,14 @@ from sealfit.fit.steady.condition import (
     solve,
 )
 from sealfit.fit.steady.stribeck import NAMES, linearised
-from sealfit.fit.steady.uncertainty import SMALLEST_SHARE, more_likely, run_means, run_weights, unit_variance
+from sealfit.fit.steady.uncertainty import (
+    SMALLEST_SHARE,
+    merge_directions,
+    more_likely,
+    run_means,
+    run_weights,
+    unit_variance,
+)
 from sealfit.ingest.columns import condition_columns
 from sealfit.ingest.scatter import RepeatScatter, repeat_scatter
 from sealfit.tables import STEADY_COVARIANCE, STEADY_FIT, STEADY_SHIFT, Schema

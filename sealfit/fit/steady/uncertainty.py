@@ -13,10 +13,10 @@ import pandas as pd
 from scipy.special import fdtrc
 
 from sealfit.errors import FitError
-from sealfit.fit.joint.rows import BOTH_DIRECTIONS, merge_directions
+from sealfit.fit.joint.rows import nesting_run, records
 from sealfit.fit.least_squares import t_quantile
 from sealfit.ingest.scatter import RepeatScatter
-from sealfit.ingest.strokes import speed_clusters
+from sealfit.ingest.strokes import SPEEDS_APART, speed_clusters
 
 # Level of the preliminary test for set-up scatter (Bancroft 1944). A level of 5 % would miss it too often.
 POOLING_P = 0.25
@@ -28,10 +28,47 @@ SMALLEST_SD = 1e-9
 SMALLEST_SHARE = 0.05
 # Prefix of the columns of `steady_after` with the directions of the subtracted effects' uncertainty.
 SHIFT = "effects_u"
+# `direction` of a row that is the mean of both directions.
+BOTH_DIRECTIONS = 0
 
 NEEDED = (
     "condition", "series", "rubber", "run_id", "file", "direction", "speed_mm_s", "load_N", "force_N", "used",
 )  # fmt: skip
+
+
+def merge_directions(steady: pd.DataFrame) -> pd.DataFrame:
+    """Return used rows of table `steady` with one row per record for runs with both directions at one speed.
+
+    Both directions are one unit of evidence; an offset between them cancels in their mean. In a merged row
+    `direction` is 0, `force_N` and `speed_mm_s` are magnitudes, and `run_id` has no sign.
+    """
+    record = records(steady)
+    rows = steady.assign(file=record)
+    run = rows["run_id"].where(nesting_run(rows, record) == rows["run_id"], rows["run_id"].str.rstrip("+-"))
+    pace = rows["speed_mm_s"].abs()
+    if "speed_set_mm_s" in rows.columns:
+        pace = rows["speed_set_mm_s"].abs().fillna(pace)
+    extent = pd.DataFrame({"file": record, "run": run, "direction": rows["direction"], "pace": pace})
+    grouped = extent.groupby(["file", "run"])
+    merged = grouped["direction"].transform("nunique").eq(2)
+    merged &= grouped["pace"].transform("max") <= SPEEDS_APART * grouped["pace"].transform("min")
+    merged = merged.groupby(run).transform("all")
+    # A file that lost its strokes of one direction would bring a zero offset into the fit.
+    base = rows["run_id"].str.rstrip("+-")
+    both, lone = (part.groupby(base).transform("sum") for part in (merged, ~merged))
+    kept = merged | (2 * lone >= both)
+    rows, run, merged = rows[kept], run[kept], merged[kept]
+    if not merged.any():
+        return rows
+    size = {"force_N": rows["force_N"] * rows["direction"], "speed_mm_s": rows["speed_mm_s"].abs()}
+    own = rows.assign(run_id=run, **size)[merged]
+    numbers = [c for c in own.columns if pd.api.types.is_float_dtype(own[c])]
+    keys = ["file", "run_id"]
+    directions = own.groupby([*keys, "direction"], sort=False)[numbers].mean()
+    means = own.drop(columns=numbers).groupby(keys, sort=False).first()
+    means[numbers] = directions.groupby(level=keys, sort=False).mean()
+    means = means.assign(direction=BOTH_DIRECTIONS)
+    return pd.concat([rows[~merged], means.reset_index()[list(rows.columns)]], ignore_index=True)
 
 
 def run_means(steady: pd.DataFrame) -> pd.DataFrame:
