@@ -52,6 +52,8 @@ LONGER = 3.0
 # Rise lengths on the plateau after which the law is asked again where it did not hold, and the rows that
 # this takes at least: twice as many as the law has parameters.
 SKIPPED, LEAST_ROWS = (1.0, 2.0), 8
+# Factor on the first rise length found beyond which one found then is that of a slow change, such as warming.
+SLOWER = 5.0
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0
 # Means of rows from which the frequency of a wave is found, periods that they hold at least, and the factor
@@ -241,6 +243,8 @@ def _left_over(start: MotionStart, length_mm: float) -> tuple[float, float]:
         if len(later.force_N) < LEAST_ROWS:
             break
         left_N, found, better = _law_on(later, found)
+        if found > SLOWER * length_mm:
+            return 0.0, length_mm
         if better > UNLIKELY:
             return _before(left_N, begin_mm / found), found
     return 0.0, found

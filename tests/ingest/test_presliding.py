@@ -10,6 +10,7 @@ from sealfit.ingest.campaign import ingest_campaign
 from sealfit.ingest.presliding import MotionStart, _before, rise_of
 from sealfit.ingest.strokes import find_strokes
 from sealfit.ingest.window import transient_rows
+from sealfit.simulation import Spec, simulate
 
 LENGTH, LEVEL, SPEED, NOISE = 0.45, 45.0, 0.5, 0.1  # mm, N, mm/s, N
 
@@ -256,3 +257,16 @@ def test_noise_is_seldom_a_transient():
     white = [transient_rows(window(np.zeros_like, seed=seed)) for seed in range(3000)]
     assert not any(white)  # 0.02 are expected
     assert transient_rows(np.full(200, 30.0)) == transient_rows(np.full(12, 30.0)) == 0
+
+
+def test_warming_of_a_fast_stroke_is_no_rest_of_its_rise(tmp_path):
+    """Friction falls by 10 % over 5 mm of sliding; the rise of the bristles is 0.25 mm long."""
+    warming = {"id": "warming_distance", "acts_on": "mu", "operation": "multiply"}
+    design = {"days": (), "speeds_mm_s": (25.0,), "repeats": 1, "stroke_mm": 25.0, "max_rows": 400}
+    spec = Spec(
+        physics={"sigma_0": 100.0}, design=design, effects=[{**warming, "parameters": {"A": 0.1, "s_0": 5.0}}]
+    )
+    simulate(spec, tmp_path / "campaign")
+    bins = ingest_campaign(tmp_path / "campaign", Config()).tables["bins"]
+    assert bins["presliding_N"].abs().max() < 0.01
+    assert bins["rise_mm"].iloc[0] == pytest.approx(0.25, abs=0.05)
