@@ -6,7 +6,7 @@ of temperature, compression and days is matched, too.
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, Self
@@ -252,6 +252,8 @@ def _word(at: int, texts: tuple[str, ...]) -> NamePart | None:
         return NamePart(at, "direction", pattern, texts, "a word for the direction", signs=signs)
     if low <= RUBBERS:
         return NamePart(at, "rubber", pattern, texts, "the short name of a rubber")
+    if _same_unit(texts):
+        return NamePart(at, "", pattern, texts, "a unit in singular and plural")
     doubt = "what this word stands for is not known; it is kept as a label"
     return NamePart(at, f"label_{at}", pattern, texts, "a word that varies", doubt=doubt)
 
@@ -266,14 +268,14 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     else:
         ours = said_by(BEFORE, before) or ""
         why = f"'{before}' stands before the number" if before else "a bare number"
-        if ours in NO_COUNTS and _counts_up(texts):
+        if ours in NO_COUNTS and counts_up(texts):
             ours = ""
         if ours in NUMBERS and rows[0][at + 1 : at + 2] and rows[0][at + 1].text == after:
             doubt = f"'{after}' behind it is no unit that is known here; {Units().of(ours)} is assumed"
     return _as_height(NamePart(at, ours, pattern, texts, why, unit=unit, doubt=doubt), before)
 
 
-def _counts_up(texts: Sequence[str]) -> bool:
+def counts_up(texts: Sequence[str]) -> bool:
     """Whether numbers are 1, 2, 3 or 0, 1, 2."""
     if not all(text.isdecimal() for text in texts):
         return False
@@ -286,7 +288,8 @@ def _around(rows: Sequence[Sequence[Token]], at: int) -> tuple[str, str]:
     row = rows[0]
     after = before = ""
     step = 2 if at + 2 < len(row) and row[at + 1].text == " " else 1
-    if at + step < len(row) and row[at + step].kind == "word" and _same(rows, at + step):
+    following = {own[at + step] for own in rows if at + step < len(own)}
+    if {token.kind for token in following} == {"word"} and _same_unit(token.text for token in following):
         leads = at + step + 1 < len(row) and row[at + step + 1].kind == "number"
         after = "" if leads else row[at + step].text
     if at >= 1 and row[at - 1].kind == "word":
@@ -295,6 +298,12 @@ def _around(rows: Sequence[Sequence[Token]], at: int) -> tuple[str, str]:
         trails = at >= 3 and row[at - 3].kind == "number"
         before = row[at - 2].text if _same(rows, at - 2) and not trails else ""
     return after, before
+
+
+def _same_unit(texts: Iterable[str]) -> bool:
+    """Return whether words behind a number are one word, or say the same: week and weeks."""
+    texts = set(texts)
+    return len(texts) == 1 or len({said_by(AFTER, text) or text for text in texts}) == 1
 
 
 def _same(rows: Sequence[Sequence[Token]], at: int) -> bool:
@@ -331,6 +340,8 @@ def _with_bare_numbers(parts: Sequence[NamePart], rows: Sequence[Sequence[Token]
             made.append(part)
         elif len(part.texts) == 1:
             continue
+        elif rows[0][part.at].kind == "word":  # a unit
+            made.append(part)
         elif not has_repeat and _repeats(part, known, rows):
             has_repeat = True
             made.append(replace(part, ours="repeat", why=f"{part.why}, few values, each once per setting"))
@@ -345,7 +356,7 @@ def _with_bare_numbers(parts: Sequence[NamePart], rows: Sequence[Sequence[Token]
 def _repeats(part: NamePart, known: Sequence[NamePart], rows: Sequence[Sequence[Token]]) -> bool:
     """Whether a number counts from 0 or 1 and differs between files of the same settings."""
     all_differ = len(part.texts) == len(rows) > COUNTED
-    if len(part.texts) > FEW or all_differ or not _counts_up(part.texts):
+    if len(part.texts) > FEW or all_differ or not counts_up(part.texts):
         return False
     seen = Counter(tuple(row[other.at].text for other in (*known, part)) for row in rows)
     settings = {tuple(row[other.at].text for other in known) for row in rows}

@@ -13,7 +13,7 @@ from sealfit.config import AGING_CONDITION
 from sealfit.draft.columns import Roles
 from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import CLOCK, Dialect
-from sealfit.draft.file_names import FEW, HEIGHT_FROM, NamePart, Names
+from sealfit.draft.file_names import FEW, HEIGHT_FROM, NamePart, Names, counts_up
 from sealfit.draft.files_found import Found, RunsTable
 from sealfit.errors import ConfigError
 from sealfit.ingest.files import as_number
@@ -53,8 +53,23 @@ def improved(names: Names, speeds: Mapping[str, float], notes: Notes) -> Names:
     """
     if names.settings.name_pattern is None:
         return names
-    names = _with_direction(_with_speed(names, speeds, notes), speeds)
+    names = _with_repeat(_with_direction(_with_speed(names, speeds, notes), speeds))
     return _unaged_apart(_told_apart(names, notes))
+
+
+def _with_repeat(names: Names) -> Names:
+    """Return the names with an unknown number as the repeat, if it alone tells files of one setting apart."""
+    settings = {name for name in names.given - {"started_at"} if not name.startswith("part_")}
+    said = values_by_file(names, names.files)
+    counted = _keys(said, settings)
+    if "repeat" in settings or not counted or max(counted.values()) == 1:
+        return names
+    for part in names.parts:
+        counts = part.ours.startswith("part_") and len(part.texts) <= FEW and counts_up(part.texts)
+        if counts and max(_keys(said, {*settings, part.ours}).values()) == 1:
+            why = f"{part.why}, few values, each once per setting"
+            return names.changed(part, ours="repeat", why=why, doubt="")
+    return names
 
 
 def _with_direction(names: Names, speeds: Mapping[str, float]) -> Names:
