@@ -199,8 +199,6 @@ class TraceFormat(Strict):
 
     @model_validator(mode="after")
     def _can_be_read(self) -> TraceFormat:
-        if self.delimiter == self.decimal:
-            raise ValueError(f"delimiter: {self.delimiter!r} is the decimal mark too. Set one of them")
         for ours, theirs in self.their_columns.items() if self.names == "none" else ():
             if isinstance(theirs, str):
                 raise ValueError(

@@ -24,6 +24,7 @@ DIMENSION = {
     "load": ("force",),
     "speed": ("speed", "rotation"),
 }
+MOST = 0.75  # share of the files in which a column called time must rise
 COPY = 0.9999  # correlation of two columns that are the same signal in two units
 BY_BEHAVIOUR = 0.5  # how well a column must behave to be taken without a name or a unit
 
@@ -243,12 +244,14 @@ def _best(columns: Sequence[TraceColumn], role: str, behaves) -> TraceColumn | N
 def _as_time(column: TraceColumn) -> float:
     """Return the share of steps that are like the median one: 1 for a clock, little for a count of rows.
 
-    A column called time may stand for several rows: the clock of the logger is coarse.
+    A column called time may stand for several rows: the clock of the logger is coarse. In a few files it may
+    run back.
     """
-    if not all(map(rises, column.values)):
+    rising = [values for values in column.values if rises(values)]
+    if len(rising) < (MOST if column.role == "time" else 1.0) * len(column.values):
         stands = all((np.diff(values) >= 0).mean() > 0.99 and np.ptp(values) > 0 for values in column.values)
         return 0.3 if stands and column.role == "time" else 0.0
-    steps = map(np.diff, column.values)
+    steps = map(np.diff, rising)
     even = float(np.median([np.mean(np.abs(s - np.median(s)) <= 0.2 * np.median(s)) for s in steps]))
     return 0.3 * even if all(map(is_counter, column.values)) else max(even, 0.3)
 

@@ -39,6 +39,7 @@ _SAMPLED = r"(?:sampl|abtast|mess|scan|acqui|logg|data|daten|campion|echantillon
 _RATE = re.compile(rf"{_SAMPLED}.*(?:rate|freq)|(?:rate|freq).*{_SAMPLED}")  # not that of a motion
 _STEP = re.compile(rf"{_SAMPLED}.*(?:interval|period)|(?:interval|period).*{_SAMPLED}|\bdt\b|\bdelta [tx]\b")
 RATE = "_rate"  # header field that an expression for the rate reads; by its first letter it is no channel
+_QUOTED = re.compile(r'"[-+]?\d+,\d+"')
 _DATE = re.compile(r"(?<!\d)(?:20\d\d([-/])\d\d?\1\d\d?|\d\d?(?P<mark>[./])\d\d?(?P=mark)20\d\d)(?!\d)")
 _DATES = ("%d.%m.%Y", "%Y-%m-%d", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y")
 _ISO = [f"%Y-%m-%d{mark}%H:%M{seconds}" for mark in " T" for seconds in ("", ":%S")]
@@ -77,7 +78,9 @@ def sniff(text: str) -> Dialect | None:
         lines = lines[:ENDS] + lines[-ENDS:]
     sample = lines[:SAMPLE_LINES]
     # a point before a comma: where there are whole numbers only, the first is taken
-    blocks = [_block(sample, mark, decimal) for mark, decimal in product(DELIMITERS, ".,") if mark != decimal]
+    written = [(mark, decimal) for mark, decimal in product(DELIMITERS, ".,") if mark != decimal]
+    written += [(",", ",")] * any(_QUOTED.search(line) for line in sample)  # numbers in quotes
+    blocks = [_block(sample, *marks) for marks in written]
     tables = [block for block in blocks if block is not None and block.rows >= MIN_ROWS]
     best = max(tables, key=lambda block: (block.pure, block.rows * len(block.numbers)), default=None)
     return None if best is None else _dialect(lines, best)
@@ -146,6 +149,8 @@ def _dialect(lines: list[str], block: _Block) -> Dialect:
     rows = [_header_cells(line, delimiter, width) for line in header]
     units_at = _units_line(rows)
     names_at = _names_line(rows, units_at, max(core), len(core))
+    if names_at is None and units_at is not None and not _of_a_rig(rows[units_at]):  # t, s, F
+        names_at, units_at = units_at, None
     cells = [cell.strip() for line in data for cell in split_line(line, delimiter)]
     in_groups = (c for c in cells if _GROUPED.fullmatch(c) and as_number(c, block.decimal) is None)
     return Dialect(
@@ -193,6 +198,12 @@ def _units_line(rows: Sequence[Sequence[str]]) -> int | None:
         if units >= 2 and units > 0.5 * len(full) and not all(as_number(cell) is not None for cell in full):
             return i
     return None
+
+
+def _of_a_rig(units: Sequence[str]) -> bool:
+    """Return whether two or more cells are units of time, displacement or force."""
+    known = [unit.dimension for cell in units if (unit := unit_of(cell)) is not None]
+    return sum(dimension in ("time", "length", "angle", "force", "torque") for dimension in known) >= 2
 
 
 def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, count: int) -> int | None:

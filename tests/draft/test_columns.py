@@ -363,3 +363,43 @@ def test_a_table_of_results_above_the_data_is_header():
 @pytest.mark.parametrize("text", ["", "a\n", "only words\n" * 30, "1\n2\n3\n" * 20, "1,2\n3,4\n"])
 def test_no_table_of_numbers(text):
     assert sniff(text) is None
+
+
+# ---------------------------------------------------------------- odd files
+def test_letters_above_the_data_are_names_and_no_units(tmp_path):
+    made = campaign(
+        tmp_path, lambda one: [one.time_s, one.displacement_mm, one.force_N], "t,s,F\n", strokes=4
+    )
+    assert slots(made) == {"time_s": "t", "displacement_mm": "s", "force_N": "F"}
+
+
+def test_units_above_the_data_are_no_names(tmp_path):
+    made = campaign(
+        tmp_path, lambda one: [one.time_s, one.displacement_mm, one.force_N], "ms,mm,N\n", strokes=4
+    )
+    assert slots(made) == {"time_s": 1, "displacement_mm": 2, "force_N": 3}
+    assert parse_config(made.text, "rig.toml").trace.columns["time_s"].unit == "ms"
+
+
+def test_decimal_commas_in_quotes_are_read_between_commas(tmp_path):
+    (one,) = exports.records(days=(4,), speeds=(5.0,), repeats=(1,), strokes=2)
+    columns = (one.time_s, one.displacement_mm, one.force_N)
+    rows = [
+        ",".join(f'"{value:.4f}"'.replace(".", ",") for value in row) for row in zip(*columns, strict=True)
+    ]
+    exports.write(tmp_path, "d4_v5.csv", "\n".join(['"Zeit [s]","Weg [mm]","Kraft [N]"', *rows, ""]))
+    made = draft(tmp_path)
+    config = parse_config(made.text, "rig.toml")
+    assert (config.trace.delimiter, config.trace.decimal) == (",", ",")
+    read = read_trace(tmp_path, TraceRef("d4_v5.csv", {}), config)
+    np.testing.assert_allclose(read.columns["force_N"], one.force_N, atol=1e-4)
+
+
+def test_a_time_that_runs_back_in_one_file_is_the_time(tmp_path):
+    for one in exports.records(days=(4,), speeds=SPEEDS, repeats=(1, 2, 3), strokes=2):
+        time = one.time_s[::-1] if one.speed == 5.0 and one.repeat == 3 else one.time_s
+        body = exports.table([time, one.displacement_mm, one.force_N], ",", 5)
+        exports.write(
+            tmp_path, f"d{one.days}_v{one.speed:g}_{one.repeat}.csv", "time [s],x [mm],force [N]\n" + body
+        )
+    assert slots(draft(tmp_path))["time_s"] == "time [s]"

@@ -95,7 +95,6 @@ def test_conditions_may_stand_in_the_traces_as_constants(tmp_path):
     [
         ('trace.encoding = "klingon"', "'trace.encoding': 'klingon' is not an encoding"),
         ('trace.delimiter = "::"', "'trace.delimiter': '::' is not a delimiter"),
-        ('trace.decimal = ","', "',' is the decimal mark too"),
         ('condition = ["speed_mm_s"]', "'condition': 'speed_mm_s' cannot be a condition column"),
         ('trace.names = "none"', "columns.time_s: 'time_s' is a name, but the files have none"),
         ('files.columns.run_id = "{rig}"', "reads a part 'rig' that the name has not"),
