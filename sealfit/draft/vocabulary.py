@@ -99,7 +99,7 @@ _SETTING_WORDS = (
                    r"|\b(days?|tage?|dias|jours|giorni|dagen|weeks?|wochen?|semaines|months?|monate?|years?|jahre?)\b"),
     ("compression_ratio_pct", r"compres|verpress|verform|stauch|height|hoehe"),
     ("speed_mm_s", r"speed|velocit|velocid|vitesse|snelheid|geschwind|vorschub|feed"),
-    ("load_N", r"load\b|normal|auflast|\blast\b|anpress|carga"),
+    ("load_N", r"load\b|normal|auflast|\blast\b|anpress|carga|^(dead )?weights?$|^gewichte?$"),
     ("repeat", r"\brep|wiederhol|\bwdh|herhal"),
     ("specimen_id", r"specimen|probe\b|sample|pruefling|muster"),
     ("rubber", r"material|rubber|gummi|compound|werkstoff|mischung|elastomer"),

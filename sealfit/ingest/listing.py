@@ -127,14 +127,19 @@ def read_table(
 
 
 def _header(numbered: list[tuple[int, str]], delimiter: str, config: Config) -> tuple[int, str, list[str]]:
-    """Return number, delimiter and cells of the first line that names a known column, else of the first."""
+    """Return number, delimiter and cells of the first line that names a known column.
+
+    If none does it is the first of several cells: a title has one.
+    """
     theirs = (str(own.name) for own in config.files.runs_columns.values())
     known = {"file", *KNOWN, *config.condition, *theirs}
     found = []
     for number, line in numbered:
         own = delimiter or max(",;\t", key=line.count)
         found.append((number, own, split_line(line, own)))
-    return next((one for one in found if known & set(one[-1])), (found or [(1, ",", [])])[0])
+    named = [one for one in found if known & set(one[-1])]
+    several = [one for one in found if sum(map(bool, one[-1])) > 1]
+    return next(iter(named or several or found), (1, ",", []))
 
 
 def _rows(

@@ -403,3 +403,16 @@ def test_a_time_that_runs_back_in_one_file_is_the_time(tmp_path):
             tmp_path, f"d{one.days}_v{one.speed:g}_{one.repeat}.csv", "time [s],x [mm],force [N]\n" + body
         )
     assert slots(draft(tmp_path))["time_s"] == "time [s]"
+
+
+def test_a_table_of_runs_may_have_a_title_and_weights(tmp_path):
+    lines = ["Versuchsplan 2025;;;", ";;;", "Datei;Alterung [d];Vorschub [mm/s];Gewicht [kg]"]
+    for one in exports.records(days=(4, 8), speeds=SPEEDS, repeats=(1,), strokes=2):
+        columns = [one.time_s, one.displacement_mm, one.force_N]
+        exports.write(tmp_path, f"M{one.number}.csv", "t [s],x [mm],F [N]\n" + exports.table(columns, ",", 5))
+        lines.append(f"M{one.number};{one.days};{one.speed:g};5")
+    exports.write(tmp_path, "Plan.csv", "\n".join([*lines, ""]))
+    config = parse_config(draft(tmp_path).text, "rig.toml")
+    columns = {ours: (column.name, column.unit) for ours, column in config.files.runs_columns.items()}
+    assert columns["load_N"] == ("Gewicht [kg]", "kgf")
+    assert columns["aging_days"][0] == "Alterung [d]"

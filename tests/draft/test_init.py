@@ -402,7 +402,7 @@ def test_files_that_an_unknown_word_tells_apart_keep_their_repeats(tmp_path):
 
 
 def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_known_is_said(tmp_path):
-    rows = ["File,Ofen,Tage,Datum,Uhrzeit,Gewicht [kg],v [mm/min]"]
+    rows = ["File,Ofen,Tage,Datum,Uhrzeit,Probe [kg],v [mm/min]"]
     for number, one in enumerate(exports.records(days=(0, 4), speeds=(1.0, 5.0))):
         exports.write(tmp_path, f"M{number}.csv", plain(one))
         oven = one.temperature if one.days else "RT"
@@ -414,7 +414,7 @@ def test_a_log_with_units_words_for_unaged_and_a_clock_is_read_and_what_is_not_k
     doubts = " ".join(f"{doubt.reason} {doubt.fix}" for doubt in made.doubts)
     started = "files.started_at = { date = 'Datum', time = 'Uhrzeit' }"
     assert f"Set {started} and files.date_format = '%d.%m.%Y %H:%M'." in doubts
-    assert "what 'Gewicht [kg]' of log.csv holds is not known here" in doubts
+    assert "what 'Probe [kg]' of log.csv holds is not known here" in doubts
 
 
 def write_with_log(folder, columns, started, log="log.csv"):
