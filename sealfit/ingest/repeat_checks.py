@@ -193,7 +193,7 @@ MAGNITUDE = 0.05
 
 
 def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
-    """Return a fault if the friction of a whole campaign has the direction of the motion, or no sign at all.
+    """Return a fault if the friction of a whole campaign has the direction of the motion, or no one sign.
 
     With strokes in both directions, the mean over them is the friction: an offset of the sensor cancels out.
     """
@@ -207,6 +207,13 @@ def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
         fix = "Export the signed force. If a signed speed is recorded, give the force its sign: "
         fix += 'force_N = "force_N * sign(SPEED)" under [trace.compute].'
         return [Fault("turned_sign", reason, column="force_N", value=friction, fix=fix)]
+    if len(ways) == 1 and (used["force_sd_N"] > used["force_N"].abs()).mean() > 0.5:
+        reason = (
+            "the force changes its sign along the strokes, while the displacement goes on as one that counts "
+        )
+        reason += "the distance slid in both directions."
+        fix = "Export the position of the rig, which goes back."
+        return [Fault("turned_sign", reason, column="displacement_mm", value=friction, fix=fix)]
     if not friction < 0.0:
         return []
     count = int((against < 0.0).sum())

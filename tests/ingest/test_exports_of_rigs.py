@@ -267,3 +267,15 @@ def test_a_force_that_is_a_magnitude_is_no_friction_of_turned_sign(tmp_path):
     (fault,) = (fault for fault in caught.value.faults if fault.check == "turned_sign")
     assert "as a magnitude has" in fault.reason
     assert "sign(SPEED)" in fault.fix
+
+
+def test_a_displacement_that_counts_the_distance_in_both_directions_is_named(tmp_path):
+    """Two strokes to and fro of 40 mm at 5 mm/s, and 8 N against the motion."""
+    time = np.arange(0.0, 32.0, 0.02)
+    force = np.where(time % 16.0 < 8.0, 8.0, -8.0) + np.random.default_rng(1).normal(0.0, 0.05, time.size)
+    lines = [f"{t:.2f},{5 * t:.4f},{f:.4f}" for t, f in zip(time, force, strict=True)]
+    (tmp_path / "v5.csv").write_text("\n".join([HEADER, *lines]))
+    with pytest.raises(CampaignError) as caught:
+        ingest_campaign(tmp_path, config(f'{LOT}files.glob = "*.csv"\nruns.constants = {{lot = "A"}}\n'))
+    (fault,) = (fault for fault in caught.value.faults if fault.check == "turned_sign")
+    assert "the distance slid in both directions" in fault.reason
