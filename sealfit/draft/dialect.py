@@ -181,7 +181,7 @@ def _header_cells(line: str, delimiter: str, width: int) -> list[str]:
     if len(cells) == width + 1 and cells[0] in ("#", "%", "//", ";"):  # a mark of comment
         return cells[1:]
     if delimiter == "whitespace" and len(cells) != width:
-        apart = re.split(r"\s{2,}|\t", line.strip())
+        apart = re.split(r"\s{2,}|\t", line.strip("#%; \t"))
         return apart if len(apart) == width else []
     return cells
 
@@ -207,14 +207,16 @@ def _of_a_rig(units: Sequence[str]) -> bool:
 
 
 def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, count: int) -> int | None:
-    """Return the line of names: as wide as the data, no numbers, most words that are names of columns."""
+    """Return the line of names: as wide as the data, no numbers, most words that name columns, and units."""
     found = []
     for i in range(len(rows))[: -NAMES_ABOVE - 1 : -1]:
         full = [cell for cell in rows[i] if cell]
         texts = all(as_number(cell) is None and as_number(cell, ",") is None for cell in full)
         if i != units_at and len(rows[i]) > last and texts and len(full) >= max(2, count - 1):
             found.append(i)
-    return max(found, key=lambda i: sum(column_role(cell)[1] for cell in rows[i]), default=None)
+    named = {i: [name_and_unit(cell) for cell in rows[i]] for i in found}
+    points = {i: sum(column_role(name)[1] + 2 * bool(unit) for name, unit in own) for i, own in named.items()}
+    return max(found, key=points.__getitem__, default=None)
 
 
 # ---------------------------------------------------------------- header lines

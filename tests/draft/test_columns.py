@@ -416,3 +416,9 @@ def test_a_table_of_runs_may_have_a_title_and_weights(tmp_path):
     columns = {ours: (column.name, column.unit) for ours, column in config.files.runs_columns.items()}
     assert columns["load_N"] == ("Gewicht [kg]", "kgf")
     assert columns["aging_days"][0] == "Alterung [d]"
+
+
+def test_a_title_of_known_words_is_no_line_of_names(tmp_path):
+    header = "# friction rig v2\n# t [s]  x [mm]  F [N]\n"
+    made = campaign(tmp_path, lambda one: [one.time_s, one.displacement_mm, one.force_N], header, 2, " ")
+    assert slots(made) == {"time_s": 1, "displacement_mm": 2, "force_N": 3}
