@@ -60,7 +60,7 @@ class Units:
         """Return the true unit of a column by its name; "" if it has none that we know."""
         if column in self.channels:
             return self.channels[column]
-        if column.startswith(("displacement", "distance")) and column.endswith("_mm"):
+        if column.startswith(("displacement", "distance", "rise_mm")) and column.endswith("_mm"):
             return self.unit("displacement")
         if column.startswith("speed") and column.endswith("_mm_s"):
             return self.unit("speed")

@@ -93,7 +93,7 @@ def make_bins(
             own = slice(first, first + bins)
             force[own] = effect(table.iloc[own], force[own])
     force = force * np.repeat(gains, bins) + noise_N * np.concatenate(waves)
-    return table.assign(force_N=force, force_sd_N=2 * noise_N, n=20)
+    return table.assign(force_N=force, force_sd_N=2 * noise_N, rise_mm=0.0, n=20)
 
 
 def _wave(rng: np.random.Generator, bins: int, autocorrelation: float) -> np.ndarray:

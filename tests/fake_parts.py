@@ -82,6 +82,7 @@ MODEL = {
     "conditions": {"condition": ["a"], "series": ["a"], "rubber": ["rubber"], "aging_days": [0.0]},
     "has_load": True,
     "has_aging": True,
+    "compliance": 0.0,
     "declared": {
         "parameters": [],
         "index": {name: [-1] for name in ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")},

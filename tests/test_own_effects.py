@@ -87,6 +87,7 @@ def with_own_effect(out: Path) -> None:
             "fixed": {}, "values": {"A": -0.5, "x_0": 20.0}, "smoothness": None,
         }
     )  # fmt: skip
+    model["compliance"] = 0.0  # so that friction follows the patch without a lag
     for holder in (model, *model["sandwiches"]):
         holder["covariance"] = np.pad(np.array(holder["covariance"]), (0, 2)).tolist()
     keep(out, model=model)
