@@ -35,7 +35,7 @@ from sealfit.effects.user import load_user_effects
 from sealfit.engine.run_map import run_map
 from sealfit.fit.joint import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate, shape_of
-from sealfit.fit.joint.rows import LEVELS, SET_UP, Rows, make_rows
+from sealfit.fit.joint.rows import LEVELS, SET_UP, Rows, make_rows, records
 from sealfit.fit.joint.set_ups import with_set_ups
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import Silent, timed
@@ -70,13 +70,15 @@ def close_loop(
     columns, counted = list(bins.columns), numbered(bins.reset_index(drop=True))
     del bins
     rows = make_rows(with_set_ups(counted), has_aging=config.aging, speed_factor=config.units.speed_factor)
-    if SET_UP in rows.table:
-        say("files of a specimen with the same repeat scatter alike: they are one set-up")
     outliers = outlier_files(rows)
     left_out = [one.file for one in outliers if not one.instead]
     if left_out:
         say("left out, far off all others: " + ", ".join(left_out))
-        rows = rows.subset(~rows.table["record"].isin(left_out).to_numpy())
+        rest = counted[~records(counted).isin(left_out).to_numpy()]
+        # Set-ups are looked for again: one wrong file hides that they scatter.
+        rows = make_rows(with_set_ups(rest), has_aging=config.aging, campaign=rows)
+    if SET_UP in rows.table:
+        say("files of a specimen with the same repeat scatter alike: they are one set-up")
     del counted  # it takes much memory, and `rows` contains it
     start = None
     for part in subsamples(rows, config.loop.seed):

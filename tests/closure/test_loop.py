@@ -305,11 +305,13 @@ def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load():
     assert values["n"] == pytest.approx(2.0, abs=0.3)
 
 
-def test_an_effect_between_set_ups_is_found_and_its_level_is_theirs():
+def test_an_effect_between_set_ups_is_found_beside_a_wrong_file_and_its_level_is_theirs():
     bins = mounted_anew(3)
     oil = 2.0 * (bins["mount"].to_numpy() % 4)
-    bins = bins.assign(oil_ppm=oil, force_N=bins["force_N"] * (1 + 0.03 * oil))
+    wrong = np.where(bins["file"] == "f0008.csv", 0.5, 1.0)
+    bins = bins.assign(oil_ppm=oil, force_N=bins["force_N"] * (1 + 0.03 * oil) * wrong)
     made = close(bins)
+    assert [one["file"] for one in made.document["outlier_files"]] == ["f0008.csv"]
     (found,) = made.document["effects"]
     assert (found["channels"], found["level"]) == (["oil_ppm"], "set_up")
     assert made.document["heldout_unit"] == "set-up"
