@@ -195,6 +195,15 @@ def test_json_has_neither_nan_nor_infinity_nor_numpy():
 
 
 # ---------------------------------------------------------------- current and stale
+def test_a_folder_of_something_else_is_not_proposed_for_results(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(OutError, match=r"run CAMPAIGN --out \S*empty$"):
+        Store.open(tmp_path / "empty")
+    (tmp_path / "empty" / "trace.csv").touch()
+    with pytest.raises(OutError, match=r"Give the folder that this made: sealfit run CAMPAIGN --out OUT$"):
+        Store.open(tmp_path / "empty")
+
+
 def test_everything_is_current_after_it_was_done(out, campaign):
     do_all(out, campaign)
     assert stale(out) == []
