@@ -394,11 +394,11 @@ def _unaged(
     main: Sequence[Token], parts: Sequence[NamePart], others: Sequence[Sequence[Token]]
 ) -> tuple[tuple[int, int] | None, list[str]]:
     """Return the range of pieces that a word such as `unaged` replaces, and these words."""
-    days = [part.at for part in parts if part.ours == "aging_days"]
+    aging = [part.at for part in parts if part.ours in AGING_CONDITION]
     instead = [one for pieces in others for one in _words_instead(pieces, main) if means_unaged(one[2])]
     ranges = Counter((first, last) for first, last, _ in instead)
     first, last = ranges.most_common(1)[0][0] if ranges else (0, 0)
-    if not days or not first <= days[0] < last:
+    if not any(first <= at < last for at in aging):  # RT_0d beside 70C_7d has its days in the name
         return None, []
     return (first, last), sorted({word for _, _, word in instead})
 

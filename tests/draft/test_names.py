@@ -55,6 +55,7 @@ def test_a_way_of_naming_files_is_read(template, expected):
         ),
         (made("essai_{j}j_{N}kN.asc", j=(4, 8), N=(0.1, 0.2)), {"aging_days": 4.0, "load_N": 100.0}),
         (made("{w}weeks_v{v}.csv", w=(2, 4), v=(1, 2)), {"aging_days": 14.0, "speed_mm_s": 1.0}),
+        (["RT_0d_v1.csv", "70C_7d_v1.csv", "70C_14d_v1.csv"], {"aging_days": 0.0, "speed_mm_s": 1.0}),
         (["4 weeks 5mms.csv", "1 week 1mms.csv"], {"aging_days": 28.0, "speed_mm_s": 5.0}),
         (made("{v}mmmin_d{d}.csv", v=(300, 60), d=(1, 2)), {"speed_mm_s": 5.0, "aging_days": 1.0}),
         (made("{N}N_d{d}.csv", N=(50, 100), d=(1, 2)), {"load_N": 50.0, "aging_days": 1.0}),
