@@ -207,16 +207,23 @@ def _of_a_rig(units: Sequence[str]) -> bool:
 
 
 def _names_line(rows: Sequence[Sequence[str]], units_at: int | None, last: int, count: int) -> int | None:
-    """Return the line of names: as wide as the data, no numbers, most words that name columns, and units."""
+    """Return the line of names: as wide as the data, no numbers, most words that name columns.
+
+    Units beside the words count if no other line holds them.
+    """
     found = []
     for i in range(len(rows))[: -NAMES_ABOVE - 1 : -1]:
         full = [cell for cell in rows[i] if cell]
         texts = all(as_number(cell) is None and as_number(cell, ",") is None for cell in full)
         if i != units_at and len(rows[i]) > last and texts and len(full) >= max(2, count - 1):
             found.append(i)
-    named = {i: [name_and_unit(cell) for cell in rows[i]] for i in found}
-    points = {i: sum(column_role(name)[1] + 2 * bool(unit) for name, unit in own) for i, own in named.items()}
-    return max(found, key=points.__getitem__, default=None)
+
+    def points(i: int) -> int:
+        named = [name_and_unit(cell) for cell in rows[i]]
+        units = sum(unit is not None for _, unit in named) if units_at is None else 0
+        return sum(column_role(name)[1] for name, _ in named) + units
+
+    return max(found, key=points, default=None)
 
 
 # ---------------------------------------------------------------- header lines

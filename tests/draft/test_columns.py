@@ -422,3 +422,10 @@ def test_a_title_of_known_words_is_no_line_of_names(tmp_path):
     header = "# friction rig v2\n# t [s]  x [mm]  F [N]\n"
     made = campaign(tmp_path, lambda one: [one.time_s, one.displacement_mm, one.force_N], header, 2, " ")
     assert slots(made) == {"time_s": 1, "displacement_mm": 2, "force_N": 3}
+
+
+def test_a_table_of_results_above_the_names_is_no_line_of_names(tmp_path):
+    results = '"","Static COF","Max Load (lbf)"\n"1","0.512","3.22"\n'
+    header = results + '"Time","Extension","Load"\n"(s)","(mm)","(N)"\n'
+    made = campaign(tmp_path, lambda one: [one.time_s, one.displacement_mm, one.force_N], header, 2)
+    assert slots(made) == {"time_s": "Time", "displacement_mm": "Extension", "force_N": "Load"}
