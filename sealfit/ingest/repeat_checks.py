@@ -190,6 +190,9 @@ def _copied(row: pd.Series, what: str) -> Fault:
 
 # Largest mean friction over both directions, as a share of its size in one, at which a force is a magnitude.
 MAGNITUDE = 0.05
+# Smallest ratio of standard error to standard deviation of a force that swings a few times in a stroke. White
+# noise has 0.1 in a hundred samples.
+SWINGS = 0.25
 
 
 def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
@@ -207,10 +210,8 @@ def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
         fix = "Export the signed force. If a signed speed is recorded, give the force its sign: "
         fix += 'force_N = "force_N * sign(SPEED)" under [trace.compute].'
         return [Fault("turned_sign", reason, column="force_N", value=friction, fix=fix)]
-    if len(ways) == 1 and (used["force_sd_N"] > used["force_N"].abs()).mean() > 0.5:
-        reason = (
-            "the force changes its sign along the strokes, while the displacement goes on as one that counts "
-        )
+    if len(ways) == 1 and _changes_sign(used).mean() > 0.5:
+        reason = "the force changes its sign along the strokes, as if the displacement counted "
         reason += "the distance slid in both directions."
         fix = "Export the position of the rig, which goes back."
         return [Fault("turned_sign", reason, column="displacement_mm", value=friction, fix=fix)]
@@ -223,6 +224,12 @@ def turned_sign(strokes: pd.DataFrame, config: Config) -> list[Fault]:
     turned = "-force_N" if computed is None else f"-({computed})"
     fix = f'Change its sign in the config: force_N = "{turned}" under [trace.compute].'
     return [Fault("turned_sign", reason, column="force_N", value=friction, fix=fix)]
+
+
+def _changes_sign(strokes: pd.DataFrame) -> pd.Series:
+    """Return whether the force of each stroke scatters about 0 in a few long swings, unlike noise."""
+    mean, sd, se = strokes["force_N"].abs(), strokes["force_sd_N"], strokes["force_se_N"]
+    return (mean < np.minimum(sd, 2.0 * se)) & (se > SWINGS * sd)
 
 
 # Of a column that was set: most values, the largest share by which files of one value differ, and the share

@@ -279,3 +279,15 @@ def test_a_displacement_that_counts_the_distance_in_both_directions_is_named(tmp
         ingest_campaign(tmp_path, config(f'{LOT}files.glob = "*.csv"\nruns.constants = {{lot = "A"}}\n'))
     (fault,) = (fault for fault in caught.value.faults if fault.check == "turned_sign")
     assert "the distance slid in both directions" in fault.reason
+
+
+@pytest.mark.parametrize("swing", [0.0, 2.5])
+def test_noise_or_a_ripple_above_the_friction_is_no_reversal(swing, tmp_path):
+    """One stroke of 40 mm: 1 N of friction under 5 N of noise, or a ripple of 2.5 N and 4 mm."""
+    time = np.arange(0.0, 8.0, 0.02)
+    noise = np.random.default_rng(1).normal(0.0, 0.1 if swing else 5.0, time.size)
+    force = 1.0 + swing * np.sin(2 * np.pi * 5 * time / 4.0) + noise
+    lines = [f"{t:.2f},{5 * t:.4f},{f:.4f}" for t, f in zip(time, force, strict=True)]
+    (tmp_path / "v5.csv").write_text("\n".join([HEADER, *lines]))
+    found = ingest_campaign(tmp_path, config(f'{LOT}files.glob = "*.csv"\nruns.constants = {{lot = "A"}}\n'))
+    assert "turned_sign" not in set(found.tables["quality"]["check"])
