@@ -200,7 +200,9 @@ def test_a_folder_of_something_else_is_not_proposed_for_results(tmp_path):
     with pytest.raises(OutError, match=r"run CAMPAIGN --out \S*empty$"):
         Store.open(tmp_path / "empty")
     (tmp_path / "empty" / "trace.csv").touch()
-    with pytest.raises(OutError, match=r"Give the folder that this made: sealfit run CAMPAIGN --out OUT$"):
+    with pytest.raises(
+        OutError, match=r"Give the folder of the results, or make it: sealfit run CAMPAIGN --out OUT$"
+    ):
         Store.open(tmp_path / "empty")
 
 

@@ -79,7 +79,8 @@ def sniff(text: str) -> Dialect | None:
     sample = lines[:SAMPLE_LINES]
     # a point before a comma: where there are whole numbers only, the first is taken
     written = [(mark, decimal) for mark, decimal in product(DELIMITERS, ".,") if mark != decimal]
-    written += [(",", ",")] * any(_QUOTED.search(line) for line in sample)  # numbers in quotes
+    if any(map(_QUOTED.search, sample)):  # decimal commas between commas
+        written.append((",", ","))
     blocks = [_block(sample, *marks) for marks in written]
     tables = [block for block in blocks if block is not None and block.rows >= MIN_ROWS]
     best = max(tables, key=lambda block: (block.pure, block.rows * len(block.numbers)), default=None)

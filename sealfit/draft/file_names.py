@@ -34,6 +34,7 @@ HEIGHT_FROM = 50.0  # percent: a smaller compression is how much was taken away;
 ALIKE = 0.2  # share of names that another way of naming must have for a word to be optional; fewer are slips
 # What numbers that count up from 1 are not, whatever letter stands before them: T1 and T2 are tests.
 NO_COUNTS = ("temperature_C", "compression_ratio_pct", "load_N")
+ONCE = "few values, each once per setting"  # why a number is a repeat
 COUNTED = 6  # files from which on a number that is another in each of them counts files, not repeats
 
 
@@ -268,14 +269,14 @@ def _number(at: int, rows: Sequence[Sequence[Token]], texts: tuple[str, ...]) ->
     else:
         ours = said_by(BEFORE, before) or ""
         why = f"'{before}' stands before the number" if before else "a bare number"
-        if ours in NO_COUNTS and counts_up(texts):
+        if ours in NO_COUNTS and _counts_up(texts):
             ours = ""
         if ours in NUMBERS and rows[0][at + 1 : at + 2] and rows[0][at + 1].text == after:
             doubt = f"'{after}' behind it is no unit that is known here; {Units().of(ours)} is assumed"
     return _as_height(NamePart(at, ours, pattern, texts, why, unit=unit, doubt=doubt), before)
 
 
-def counts_up(texts: Sequence[str]) -> bool:
+def _counts_up(texts: Sequence[str]) -> bool:
     """Whether numbers are 1, 2, 3 or 0, 1, 2."""
     if not all(text.isdecimal() for text in texts):
         return False
@@ -344,7 +345,7 @@ def _with_bare_numbers(parts: Sequence[NamePart], rows: Sequence[Sequence[Token]
             made.append(part)
         elif not has_repeat and _repeats(part, known, rows):
             has_repeat = True
-            made.append(replace(part, ours="repeat", why=f"{part.why}, few values, each once per setting"))
+            made.append(replace(part, ours="repeat", why=f"{part.why}, {ONCE}"))
         elif len(part.texts) == len(rows) and np.ptp(list(map(as_float, part.texts))) < 2 * len(rows):
             made.append(replace(part, why=f"{part.why} that counts the files"))
         else:
@@ -354,13 +355,20 @@ def _with_bare_numbers(parts: Sequence[NamePart], rows: Sequence[Sequence[Token]
 
 
 def _repeats(part: NamePart, known: Sequence[NamePart], rows: Sequence[Sequence[Token]]) -> bool:
-    """Whether a number counts from 0 or 1 and differs between files of the same settings."""
-    all_differ = len(part.texts) == len(rows) > COUNTED
-    if len(part.texts) > FEW or all_differ or not counts_up(part.texts):
+    settings = [tuple(row[other.at].text for other in known) for row in rows]
+    return is_repeat(part, [row[part.at].text for row in rows], settings)
+
+
+def is_repeat(part: NamePart, numbers: Sequence[object], settings: Sequence[tuple]) -> bool:
+    """Return whether a part's numbers count from 0 or 1 and differ between files of the same settings.
+
+    `numbers` and `settings` are those of each file.
+    """
+    all_differ = len(part.texts) == len(numbers) > COUNTED
+    if len(part.texts) > FEW or all_differ or not _counts_up(part.texts):
         return False
-    seen = Counter(tuple(row[other.at].text for other in (*known, part)) for row in rows)
-    settings = {tuple(row[other.at].text for other in known) for row in rows}
-    return max(seen.values()) == 1 and len(settings) < len(rows)
+    seen = Counter(zip(settings, numbers, strict=True))
+    return max(seen.values(), default=0) == 1 and len(set(settings)) < len(numbers)
 
 
 def _without_doubles(parts: Sequence[NamePart], rows: Sequence[Sequence[Token]]) -> list[NamePart]:

@@ -13,7 +13,7 @@ from sealfit.config import AGING_CONDITION
 from sealfit.draft.columns import Roles
 from sealfit.draft.config_text import Notes, file_column
 from sealfit.draft.dialect import CLOCK, Dialect
-from sealfit.draft.file_names import FEW, HEIGHT_FROM, NamePart, Names, counts_up
+from sealfit.draft.file_names import FEW, HEIGHT_FROM, ONCE, NamePart, Names, is_repeat
 from sealfit.draft.files_found import Found, RunsTable
 from sealfit.errors import ConfigError
 from sealfit.ingest.files import as_number
@@ -58,17 +58,13 @@ def improved(names: Names, speeds: Mapping[str, float], notes: Notes) -> Names:
 
 
 def _with_repeat(names: Names) -> Names:
-    """Return the names with an unknown number as the repeat, if it alone tells files of one setting apart."""
-    settings = {name for name in names.given - {"started_at"} if not name.startswith("part_")}
-    said = values_by_file(names, names.files)
-    counted = _keys(said, settings)
-    if "repeat" in settings or not counted or max(counted.values()) == 1:
-        return names
-    for part in names.parts:
-        counts = part.ours.startswith("part_") and len(part.texts) <= FEW and counts_up(part.texts)
-        if counts and max(_keys(said, {*settings, part.ours}).values()) == 1:
-            why = f"{part.why}, few values, each once per setting"
-            return names.changed(part, ours="repeat", why=why, doubt="")
+    """Return the names with an unknown number as the repeat, now that the speed is known."""
+    known = sorted(name for name in names.given if not name.startswith(("part_", "started_at")))
+    said = [one for one in values_by_file(names, names.files).values() if one]
+    settings = [tuple(map(one.get, known)) for one in said]
+    for part in names.parts if "repeat" not in known else ():
+        if part.ours.startswith("part_") and is_repeat(part, [one.get(part.ours) for one in said], settings):
+            return names.changed(part, ours="repeat", why=f"{part.why}, {ONCE}", doubt="")
     return names
 
 

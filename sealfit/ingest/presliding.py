@@ -52,7 +52,8 @@ LONGER = 3.0
 # Rise lengths on the plateau after which the law is asked again where it did not hold, and the rows that
 # this takes at least: twice as many as the law has parameters.
 SKIPPED, LEAST_ROWS = (1.0, 2.0), 8
-# Factor on the first rise length found beyond which one found then is that of a slow change, such as warming.
+# Largest ratio of a rise length found after such rows to the first one. A longer one belongs to a slow change
+# such as warming.
 SLOWER = 5.0
 # Rise lengths after which nothing is left of a rise.
 FAR = 200.0

@@ -141,7 +141,7 @@ class SteadyLaw:
         """Return the law without its effect `number`."""
         return replace(self, effects=self.effects[:number] + self.effects[number + 1 :])
 
-    def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def parts(self, channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
         """Return the steady bristle force, the viscous part, the factor on both, and added forces.
 
         Forces are in N, all broadcast over the channels. `channels` has `speed_mm_s` (signed), the condition

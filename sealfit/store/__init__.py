@@ -66,10 +66,10 @@ class Store:
         if state is None:
             what = "holds no results of sealfit." if out.is_dir() else "there is no such folder."
             fix = did_you_mean(out, lambda folder: (folder / STATE).is_file())
-            full = out.is_dir() and any(out.iterdir())  # of something else, such as the campaign
-            made = "Give the folder that this made" if full else "Make it"
-            target = "OUT" if full else quoted(out)
-            raise OutError(what, file=out, fix=fix or f"{made}: sealfit run CAMPAIGN --out {target}")
+            make = f"Make it: sealfit run CAMPAIGN --out {quoted(out)}"
+            if out.is_dir() and any(out.iterdir()):  # something else, such as the campaign
+                make = "Give the folder of the results, or make it: sealfit run CAMPAIGN --out OUT"
+            raise OutError(what, file=out, fix=fix or make)
         effects = own_effects_folder(effects, None, out, state.campaign)
         config = state.config.now()
         hashes = effects_seen(effects, state, config)
