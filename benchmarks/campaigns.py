@@ -49,6 +49,8 @@ BOTH_WAYS: dict[Size, dict] = {
     },  # 210 files
     "large": {"temperatures_C": (60.0, 80.0), "days": (1.0, 2.0, 4.0, 8.0, 12.0, 16.0)},  # 624 files
 }
+# Stiffness of the bristles in N/mm: rises of 0.1 to 0.35 mm.
+SIGMA_0 = 130.0
 RIG = (
     {"kind": "white", "sd_N": 0.1},
     {"kind": "repeat_gain", "sd_rel": 0.005},
@@ -110,7 +112,7 @@ def campaign(
     return Spec(
         name=name,
         seed=seed,
-        physics={"growth": {}},
+        physics={"growth": {}, "sigma_0": SIGMA_0},
         design=design,
         effects=effects,
         channels=channels,

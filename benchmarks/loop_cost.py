@@ -51,7 +51,7 @@ def main() -> None:
     spec = with_idle_columns(
         campaign(given.kind, seed=given.seed, size="large", strength=given.strength, rows=1000),
     )
-    sealfit = [sys.executable, "-m", "sealfit.cli"]
+    sealfit = [sys.executable, "-m", "sealfit"]
     with tempfile.TemporaryDirectory() as folder:
         place, out = Path(folder) / "campaign", Path(folder) / "out"
         simulate(spec, place)

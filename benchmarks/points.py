@@ -9,7 +9,7 @@ import pandas as pd
 
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import evaluate
-from sealfit.fit.joint.rows import Rows, point_rows
+from sealfit.fit.joint.rows import Rows
 from sealfit.simulation import Spec
 from sealfit.simulation.noise import CategoryChannel, NumericChannel, SlowChannel
 
@@ -76,6 +76,7 @@ def force_at(fitted: Fitted, points: pd.DataFrame) -> np.ndarray:
     # Any condition of a series has its law, whatever the days; the unaged rubber is a series by itself.
     like = {series: k for k, series in enumerate(conditions["series"])}
     code = points["series"].map(like).to_numpy(dtype=int)
-    at = point_rows(points, code, conditions, has_load=rows.has_load, has_aging=rows.has_aging)
-    at = replace(at, days=points["aging_days"].to_numpy(dtype=float))
+    at = replace(rows.points(points, code), days=points["aging_days"].to_numpy(dtype=float))
+    plain = replace(fitted.model, terms=(), values=())
+    at = replace(at, force=evaluate(plain, at, jacobian=False)[0])  # its lag
     return evaluate(fitted.model, at, jacobian=False)[0]
