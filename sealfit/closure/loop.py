@@ -18,7 +18,7 @@ from sealfit.closure.confirm import (
     turns_negative,
     varies_within,
 )
-from sealfit.closure.criteria import DETERMINED, JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
+from sealfit.closure.criteria import CERTAIN_P, DETERMINED, JACKKNIFE_UNITS, PART_WITHIN, RIVAL_CORRELATION
 from sealfit.closure.errors_and_intervals import level_table, mean_se
 from sealfit.closure.forms import describe
 from sealfit.closure.left_out import covered, folds, heldout_level, outlier_files
@@ -100,7 +100,7 @@ def close_loop(
         if not part.whole and (more := missed_by_subsample(on_all_strokes, selection, config)):
             say(f"all {rows.groups.starts['stroke'].size} strokes show more than those searched: {more}")
             continue
-        repeated = ": the search repeated without each fold" if heldout.repeats else ""
+        repeated = ": the search repeated without each fold" if heldout.repeats(selection) else ""
         unit = rows.level_name(heldout.level).replace("_", "-")
         say(f"held out by {unit}{repeated}")
         with timed("held out", rows=len(heldout.masks), of="folds"):
@@ -170,14 +170,14 @@ class _HeldOut:
         loop = context.config.loop
         self.masks = list(folds(rows, self.level, loop.folds, loop.seed))
 
-    @property
-    def repeats(self) -> bool:
-        """Whether the search is repeated in each fold.
+    def repeats(self, selection: Selection) -> bool:
+        """Whether the search is repeated in each fold, or the effects of the full campaign are refitted.
 
-        With few runs a fold has too little power; the effects of the full campaign are then refitted in each
-        fold.
+        With few runs a fold has too little power. With p-values below `CERTAIN_P` every fold would find the
+        same effects again.
         """
-        return self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
+        enough = self.rows.groups.starts["run"].size >= JACKKNIFE_UNITS
+        return enough and any(a.proposal.p_value > CERTAIN_P for a in selection.added)
 
     def forces(
         self, selection: Selection, say: Callable[[str], None]
@@ -189,7 +189,7 @@ class _HeldOut:
         repeated. A repeated search has as many rounds as the full campaign needed for its last effect: with
         less power it would go on for many rounds with small effects that it refuses.
         """
-        if not (selection.added and self.repeats):
+        if not self.repeats(selection):
             before, determined = self.refitted(selection.before)
             after, also = self.refitted(selection.after) if selection.added else (before, determined)
             return before, after, determined & also, None

@@ -239,7 +239,8 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal
     joint += [_joint(fitted, p) for p in likeliest[LIKELIEST:]]
     joint += [_joint(fitted, p) for p in _further_forms(min(joint, key=lambda p: p.bic), found, more)]
     if first.fitted.deviance - alone.fitted.deviance > criteria.SCATTER_FALL:
-        joint = list(_refitted_under(fitted, joint, alone.fitted.scatter))
+        scatter = alone.fitted.scatter
+        joint = list(_refitted_under(fitted, _likeliest_under(joint, scatter), scatter))
     refitted = sorted(joint, key=lambda p: p.bic)
     if refitted[0] is not first:
         best = _reestimated(refitted[0])
@@ -281,6 +282,14 @@ def _starts(model: Model, proposal: Proposal) -> Iterator[Mapping[str, float]]:
 
 def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
     return replace(proposal, fitted=reestimated(proposal.fitted, noise=noise))
+
+
+def _likeliest_under(joint: Sequence[Proposal], scatter: Scatter) -> list[Proposal]:
+    """Return the proposals whose BIC in the tangent space is near the least, and a few of the others."""
+    bic = {p: deviance_under(p.fitted, scatter) + p.bic_penalty for p in joint}
+    most = min(bic.values()) + criteria.TANGENT_MARGIN
+    far = sorted((p for p in joint if bic[p] >= most), key=bic.get)
+    return [p for p in joint if p not in far[LIKELIEST:]]
 
 
 def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter) -> Iterator[Proposal]:
