@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from one_campaign import Task, run_campaign
 
 from sealfit.simulation import load_truth, simulate, truth_path
 from sealfit.simulation.spec import plan_files
@@ -31,6 +32,14 @@ def files_of(spec):
 @pytest.mark.parametrize(("size", "low", "high"), [("small", 190, 220), ("large", 590, 630)])
 def test_sizes_are_about_200_and_600_files(name, size, low, high):
     assert low <= len(files_of(campaigns.campaign(name, size=size))) <= high
+
+
+def test_a_campaign_of_the_loop_is_scored():
+    scored = run_campaign(Task("null_white", "-", 1, "small", rivals=False))
+    assert scored["verdict"] == "nothing_missing"
+    assert scored["extra"] == 0
+    assert scored["errors"]["after"] == scored["errors"]["plain"] < 0.02
+    assert scored["errors"]["true_form"] == pytest.approx(scored["errors"]["plain"], rel=0.5)
 
 
 def test_there_are_eight_nulls_and_they_have_no_effect():

@@ -8,7 +8,7 @@ from bins_helpers import make_bins
 from sealfit.closure.channels import find_channels
 from sealfit.closure.confirm import AcceptedEffect
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.loop import _found_in_folds, _only_gains, _only_halved, _same_shape
+from sealfit.closure.loop import _found_in_folds, _HeldOut, _only_gains, _only_halved, _same_shape
 from sealfit.closure.result import BeforeAfter
 from sealfit.closure.selection import Selection
 from sealfit.effects import EFFECTS
@@ -59,6 +59,18 @@ def test_evidence_that_is_not_weak_needs_no_fold_to_find_it_again(selection):
     first = selection.added[0]
     strong = replace(first, proposal=replace(first.proposal, p_value=1e-9))
     assert _found_in_folds(replace(selection, added=(strong, *selection.added[1:])), [selection.before.model])
+
+
+@pytest.mark.parametrize(
+    ("p_values", "repeats"), [((1e-21, 1e-30), False), ((1e-30, 1e-9), True), ((), False)]
+)
+def test_the_search_is_repeated_in_the_folds_unless_every_effect_is_certain(selection, p_values, repeats):
+    added = tuple(
+        replace(one, proposal=replace(one.proposal, p_value=p_value))
+        for one, p_value in zip(selection.added, p_values, strict=False)
+    )
+    heldout = SimpleNamespace(rows=selection.after.rows)  # of 72 runs
+    assert _HeldOut.repeats(heldout, replace(selection, added=added)) is repeats
 
 
 def test_what_no_fold_found_again_is_refused_and_leaves_the_declared_model(selection):

@@ -101,6 +101,13 @@ def test_a_proposal_costs_the_logarithm_of_the_units_for_each_number():
     )
 
 
+def test_after_a_fall_of_the_scatter_forms_far_behind_are_not_refitted_but_for_three(monkeypatch):
+    monkeypatch.setattr(naming, "deviance_under", lambda fitted, scatter: fitted.deviance)
+    found = [proposal("linear", behind=behind) for behind in (700.0, 0.0, 500.0, 290.0, 400.0, 600.0)]
+    kept = naming._likeliest_under(found, None)
+    assert [p.bic for p in kept] == pytest.approx([0.0, 500.0, 290.0, 400.0, 600.0])
+
+
 def test_of_none_none_is_named():
     assert named_among(None, []) == []
 
