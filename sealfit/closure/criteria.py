@@ -81,7 +81,8 @@ CONTENDER_SHARE = 0.6  # Forms are fitted for channels that explain this share o
 SCATTER_FALL = 20.0
 HALF_OF_CALENDAR = 0.5  # A channel that explains this share of what the calendar does is preferred to it.
 REFIT_MARGIN = 60.0  # The scatter is re-estimated for proposals whose BIC is this near. Others are no rivals.
-# The same before the proposals are refitted: the BIC in the tangent space is off by up to 185 (9 campaigns).
+# Proposals are refitted under a re-estimated scatter if their BIC in the tangent space is this near the
+# least. It was off by up to 185 in nine simulated campaigns.
 TANGENT_MARGIN = 300.0
 EQUAL_BIC = 3.0  # Of forms whose BIC differs by less the simpler or more physical one is reported.
 RIVAL_BIC = 10.0  # A form is a rival if its BIC is larger by less than this, a likelihood ratio of exp(5).
