@@ -176,7 +176,7 @@ def formula_effect(text: str, values: Mapping[str, float], target: tuple[str, st
         return evaluate(formula, {**{name: inputs[name] for name in reads}, **numbers})
 
     parameters = tuple(Parameter(n, "{y}", 0.0, AMPLITUDE, "size", linear=True) for n in values)
-    return Effect("expression", text, text, text, reads, (target,), parameters, shape, "SPEC", ({}, {}, 0.0))
+    return Effect("expression", text, text, reads, (target,), parameters, shape, "SPEC", ({}, {}, 0.0))
 
 
 @dataclass(frozen=True)

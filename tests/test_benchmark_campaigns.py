@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from one_campaign import Task, run_campaign
+from truths import formula_effect
 
 from sealfit.simulation import load_truth, simulate, truth_path
 from sealfit.simulation.spec import plan_files
@@ -40,6 +41,12 @@ def test_a_campaign_of_the_loop_is_scored():
     assert scored["extra"] == 0
     assert scored["errors"]["after"] == scored["errors"]["plain"] < 0.02
     assert scored["errors"]["true_form"] == pytest.approx(scored["errors"]["plain"], rel=0.5)
+
+
+def test_a_formula_of_the_truth_is_an_effect():
+    made = formula_effect("A * oil_ppm * time_s", {"A": 2.0}, ("force", "add"))
+    assert made.reads == ("oil_ppm", "time_s")
+    assert made.shape({"oil_ppm": np.array([3.0]), "time_s": np.array([5.0])}, A=2.0) == [30.0]
 
 
 def test_there_are_eight_nulls_and_they_have_no_effect():
