@@ -228,7 +228,7 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal
 
     Further named forms of the variables of the best are among them, from `more`. The scatter is re-estimated
     for those whose BIC under the scatter of the best is near. If most of the former scatter was the missing
-    effect, as the few likeliest proposals show, all are fitted under the re-estimated one.
+    effect, as the few likeliest proposals show, the likelier ones are refitted under the re-estimated one.
     """
     if not found:
         return []
@@ -247,7 +247,7 @@ def _refitted(fitted: Fitted, found: Sequence[Proposal], more: Sequence[Proposal
     most = min(best.bic, refitted[0].bic) + criteria.REFIT_MARGIN
     own, far = [], []
     for p in refitted[1:]:
-        near = deviance_under(p.fitted, best.fitted.scatter) + p.bic_penalty < most
+        near = _bic_under(p, best.fitted.scatter) < most
         (own if near else far).append(p)
     return [best, *map(_reestimated, own), *far[:LIKELIEST]]
 
@@ -286,7 +286,7 @@ def _reestimated(proposal: Proposal, *, noise: bool = False) -> Proposal:
 
 def _likeliest_under(joint: Sequence[Proposal], scatter: Scatter) -> list[Proposal]:
     """Return the proposals whose BIC in the tangent space is near the least, and a few of the others."""
-    bic = {p: deviance_under(p.fitted, scatter) + p.bic_penalty for p in joint}
+    bic = {p: _bic_under(p, scatter) for p in joint}
     most = min(bic.values()) + criteria.TANGENT_MARGIN
     far = sorted((p for p in joint if bic[p] >= most), key=bic.get)
     return [p for p in joint if p not in far[LIKELIEST:]]
@@ -311,6 +311,11 @@ def _refitted_under(fitted: Fitted, joint: Sequence[Proposal], scatter: Scatter)
         anew = min(fits, key=lambda f: f.deviance)
         begun.setdefault(target, anew.model.theta)
         yield replace(proposal, fitted=anew)
+
+
+def _bic_under(proposal: Proposal, scatter: Scatter) -> float:
+    """Return the BIC that a fitted proposal would have under another scatter; see `deviance_under`."""
+    return deviance_under(proposal.fitted, scatter) + proposal.bic_penalty
 
 
 def deviance_under(fitted: Fitted, scatter: Scatter) -> float:
