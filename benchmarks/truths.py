@@ -82,12 +82,11 @@ def true_force(truth: Mapping, points: pd.DataFrame) -> np.ndarray:
 def _followed(channels: Mapping[str, np.ndarray], spec: Spec, law: SteadyLaw) -> dict[str, np.ndarray]:
     """Return the channels one length of the rise before."""
     speed = channels["speed_mm_s"]
-    sigma_0, length = spec.physics.sigma_0, spec.design.stiffness_mm
-    rise = np.full(speed.shape, length) if sigma_0 is None else np.abs(law.parts(channels)[0]) / sigma_0
+    rise = np.abs(law.parts(channels)[0]) / spec.physics.sigma_0
     behind = {"displacement_mm": np.sign(speed) * rise, "distance_mm": rise, "time_s": rise / np.abs(speed)}
     before = {name: channels[name] - behind[name] for name in behind if name in channels}
     if "distance_mm" in before:
-        before["distance_mm"] = np.maximum(before["distance_mm"], length)  # as the simulation begins
+        before["distance_mm"] = np.maximum(before["distance_mm"], spec.rise_mm)  # as the simulation begins
     return {**channels, **before}
 
 

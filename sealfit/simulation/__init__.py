@@ -145,7 +145,6 @@ def _refuse_foreign(out: Path) -> None:
 
 def _write(spec: Spec, folder: Path) -> dict:
     law, seed = steady_law(spec), spec.seed
-    spec = spec.risen()
     files = noise.add_channels(plan_files(spec.design, noise.stream(seed, "order")), spec.channels, seed)
     scatter = noise.draw_scatter(spec.noise, files, seed)
     shifts = noise.stream(seed, "start").standard_normal(len(files))
@@ -154,7 +153,7 @@ def _write(spec: Spec, folder: Path) -> dict:
     squares, known = np.zeros(len(law.effects)), []
     for number, record in enumerate(files.to_dict("records")):
         speed = record["speed_mm_s"] * scatter.speed[number]
-        motion = move(spec.design, speed, record["direction"], starts[number])
+        motion = move(spec, speed, record["direction"], starts[number])
         along = {
             c.name: noise.trace_channel(c, motion.time_s, noise.stream(seed, "channel", c.name, number))
             for c in spec.channels
@@ -208,13 +207,11 @@ def _forces(
     if not np.isfinite((limit + viscous) * factor + added).all():
         reason = f"the effects give no number in {channels['file'][0]}."
         raise ConfigError(reason, fix="Check their parameters and formulas.")
-    if spec.physics.sigma_0 is None:  # all that friction is comes up over one length
-        rise = np.full(motion.time_s.size, spec.design.stiffness_mm)
-        return with_presliding(limit + viscous, motion, rise) * factor, added
-    return (_dynamic(spec, law, motion, channels, speed) + viscous) * factor, added
+    viscous = np.where(motion.speed_mm_s == 0, 0.0, viscous)
+    return (_bristle_force(spec, law, motion, channels, speed) + viscous) * factor, added
 
 
-def _dynamic(
+def _bristle_force(
     spec: Spec, law: SteadyLaw, motion: Motion, channels: dict[str, np.ndarray], speed: float
 ) -> np.ndarray:
     """Return the bristles' force in N, (n,), followed through the ramps in finer steps than the file's."""
@@ -224,7 +221,7 @@ def _dynamic(
         for name, values in channels.items()
     }
     start = motion.displacement_mm[0] - (0.0 if motion.direction[0] > 0 else spec.design.stroke_mm)
-    fine = move_at(spec.design, speed, int(motion.direction[0]), start, time)
+    fine = move_at(spec, speed, int(motion.direction[0]), start, time)
     limit, *_ = law.parts({**between, **_begun(spec, fine, speed)})
     limit = np.broadcast_to(limit, time.shape)
     rise = np.abs(limit) / spec.physics.sigma_0
@@ -241,7 +238,7 @@ def _begun(spec: Spec, motion: Motion, speed: float) -> dict[str, np.ndarray]:
     """
     return {
         "speed_mm_s": motion.direction * np.maximum(np.abs(motion.speed_mm_s), CRAWL * speed),
-        "distance_mm": np.maximum(motion.distance_mm, spec.design.stiffness_mm),
+        "distance_mm": np.maximum(motion.distance_mm, spec.rise_mm),
         "time_s": np.maximum(motion.stroke_time_s, motion.time_s[1]),
     }
 

@@ -58,8 +58,8 @@ class Physics(Strict):
     mu_c: Law = Law(mu_0=0.609, a=0.03307, b=0.1324)
     v_s: float = Field(5.0, gt=0, description="mm/s")
     sigma_2: float = Field(0.05, description="N s/mm")
-    sigma_0: float | None = Field(None, gt=0, description="N/mm; none: rises are design.stiffness_mm long")
-    sigma_1: float = Field(0.0, ge=0, description="N s/mm; only with sigma_0")
+    sigma_0: float = Field(150.0, gt=0, description="N/mm; the rise from rest is load * mu / sigma_0 long")
+    sigma_1: float = Field(0.0, ge=0, description="N s/mm")
     growth: Growth | None = Field(None, description="none: one law for all series")
     series: tuple[SeriesLaw, ...] = ()
 

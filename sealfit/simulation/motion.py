@@ -30,29 +30,30 @@ class Motion:
     steady: np.ndarray  # bool
 
 
-def move(design: Design, speed_mm_s: float, direction: int, start_mm: float) -> Motion:
+def move(spec: Spec, speed_mm_s: float, direction: int, start_mm: float) -> Motion:
     """Return the motion of one file.
 
     `speed_mm_s` is the magnitude of the platform's real speed. `direction`, +1 or -1, is that of the first
     stroke; the others alternate. `start_mm` is the lower end of the stroke in the rig's coordinate.
     """
+    design = spec.design
     _, rest, _, period = _phases(design, speed_mm_s)
     total = design.strokes_per_file * period + 0.5 * rest
     step = max(1.0 / design.sampling_Hz, total / (design.max_rows - 1))
     step = np.ceil(np.round(step / TICK_S, 6)) * TICK_S
     time = np.round(np.arange(int(total / step) + 1) * step, 5)
-    return move_at(design, speed_mm_s, direction, start_mm, time)
+    return move_at(spec, speed_mm_s, direction, start_mm, time)
 
 
-def move_at(design: Design, speed_mm_s: float, direction: int, start_mm: float, time: np.ndarray) -> Motion:
+def move_at(spec: Spec, speed_mm_s: float, direction: int, start_mm: float, time: np.ndarray) -> Motion:
     """Return the motion of one file at given times since its start, shape (n,); other arguments as `move`."""
-    length = design.stroke_mm
+    design, length = spec.design, spec.design.stroke_mm
     ramp, rest, cruise, period = _phases(design, speed_mm_s)
     number = np.minimum((time / period).astype(int), design.strokes_per_file - 1)
     since = time - number * period - rest  # since the start of motion of the stroke
     along, speed = _trapezoid(since, ramp, cruise, speed_mm_s, length)
     cruising = (since > ramp) & (since < ramp + cruise)
-    steady_from = 0.5 * speed_mm_s * ramp + STEADY_LENGTHS * design.stiffness_mm
+    steady_from = 0.5 * speed_mm_s * ramp + STEADY_LENGTHS * spec.rise_mm
     sign = direction * np.where(number % 2, -1, 1)
     return Motion(
         time_s=time,
@@ -115,9 +116,11 @@ def with_presliding(
     turned = np.diff(motion.direction, prepend=0) != 0
     change = np.where(turned, 0.0, np.diff(limit_N, prepend=limit_N[0]))
     begin, end = limit_N - change, limit_N - change * exprel(-slid)
-    result, force = np.empty(limit_N.size), 0.0
-    for row, decay in enumerate(np.exp(-slid)):
-        result[row] = force = end[row] + (force - begin[row]) * decay
+    result, force = [], 0.0
+    for first, last, decay in zip(begin.tolist(), end.tolist(), np.exp(-slid).tolist(), strict=True):
+        force = last + (force - first) * decay
+        result.append(force)
+    result = np.array(result)
     return result + damping_s * np.abs(motion.speed_mm_s) / rise_mm * (limit_N - result)
 
 

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from sealfit.config import Strict, explain, parse_toml, read_toml
+from sealfit.config import Strict, parse_toml, read_toml
 from sealfit.effects.free import LEVELS
 from sealfit.errors import ConfigError
 from sealfit.ingest.columns import RESERVED, SLOTS
@@ -43,7 +43,6 @@ class Design(Strict):
     start_scatter_mm: float = Field(0.0, ge=0, description="SD per file of where the stroke begins")
     sampling_Hz: float = Field(1000.0, gt=0, description="slower where a file would have more than max_rows")
     max_rows: int = Field(1000, ge=40)
-    stiffness_mm: float = Field(0.3, gt=0, description="length of the pre-sliding rise")
     # Ramps and rests last at most a tenth of the sliding time.
     ramp_s: float = Field(0.2, ge=0, description="speed ramp at start and stop")
     dwell_s: float = Field(0.5, ge=0, description="rest before every stroke")
@@ -82,9 +81,6 @@ class Design(Strict):
                 raise ValueError(f"{name} names a value twice")
         if self.both_ways and len(self.directions) < 2:
             raise ValueError("strokes_per_file above 1 needs directions = [1, -1]: strokes go both ways")
-        if self.stroke_mm < (least := 2.5 * STEADY_LENGTHS * self.stiffness_mm):
-            short = f"stroke_mm {self.stroke_mm:g} is too short for stiffness_mm {self.stiffness_mm:g}"
-            raise ValueError(f"{short}: make it at least {least:g}")
         if self.max_rows < 40 * self.strokes_per_file:
             raise ValueError(f"max_rows must be at least {40 * self.strokes_per_file}: 40 per stroke")
         fastest = self.stroke_mm / max(self.speeds_mm_s) * self.sampling_Hz
@@ -183,20 +179,19 @@ class Spec(Strict):
         own = [channel.name for channel in self.channels]
         return (*along, "repeat", "specimen_id", *self.design.columns, *dated, *own)
 
-    def risen(self) -> "Spec":
-        """Return the SPEC whose `design.stiffness_mm` is the longest rise that `physics.sigma_0` makes.
-
-        It is unchanged if `physics.sigma_0` is not given. ConfigError if the stroke is too short for it.
-        """
-        if self.physics.sigma_0 is None:
-            return self
+    @property
+    def rise_mm(self) -> float:
+        """Length of the longest rise from rest: load * mu / sigma_0 of the unaged rubber."""
         most = max(self.physics.mu_s.mu_0, self.physics.mu_c.mu_0) * max(self.design.loads_N, default=1.0)
-        design = {**self.design.model_dump(), "stiffness_mm": most / self.physics.sigma_0}
-        try:
-            return self.model_copy(update={"design": Design.model_validate(design)})
-        except ValidationError as error:
-            fix = "Raise physics.sigma_0: the rise is load * mu / sigma_0 long."
-            raise ConfigError(explain(error), fix=fix) from error
+        return most / self.physics.sigma_0
+
+    @model_validator(mode="after")
+    def _strokes_are_long_enough(self) -> "Spec":
+        if self.design.stroke_mm < (least := 2.5 * STEADY_LENGTHS * self.rise_mm):
+            short = f"stroke_mm {self.design.stroke_mm:g} is too short for a rise (load * mu / sigma_0)"
+            fix = f"make it {np.ceil(least):g}, or raise physics.sigma_0"
+            raise ValueError(f"{short} of {self.rise_mm:.3g} mm: {fix}")
+        return self
 
     @model_validator(mode="after")
     def _names_are_free(self) -> "Spec":

@@ -4,9 +4,7 @@ import pytest
 from bristle_helpers import integrated
 from simulation_helpers import ONE_CONDITION
 
-from sealfit.errors import ConfigError
 from sealfit.physics import LuGre
-from sealfit.simulation import Spec, simulate
 
 MODEL = {"mu_s": 0.8, "mu_c": 0.5, "v_s": 5.0, "sigma_0": 60.0, "sigma_1": 0.3, "sigma_2": 0.05}
 PHYSICS = {
@@ -34,8 +32,3 @@ def test_traces_follow_the_dynamic_model_through_the_ramps(campaign, speed, desi
 
     exact, _ = integrated(t, along, 49.03, LuGre(**MODEL))
     npt.assert_allclose(force, exact, atol=0.002 * exact.max())
-
-
-def test_a_stiffness_whose_rise_fills_the_stroke_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="sigma_0"):
-        simulate(Spec(physics={"sigma_0": 2.0}), tmp_path / "c")

@@ -13,6 +13,8 @@ from sealfit.effects.contract import Effect, Parameter
 from sealfit.errors import ConfigError, RequestError
 from sealfit.simulation import Spec, simulate
 
+STIFF = 1e9  # N/mm: bristles so short that the force is that of steady sliding
+
 
 @pytest.mark.parametrize(
     ("acts_on", "operation", "shape", "by_hand"),
@@ -30,7 +32,7 @@ from sealfit.simulation import Spec, simulate
     ],
 )
 def test_every_target_by_hand(campaign, acts_on, operation, shape, by_hand):
-    physics = {"mu_s": {"mu_0": 0.8}, "mu_c": {"mu_0": 0.6}, "v_s": 5.0, "sigma_2": 0.1}
+    physics = {"mu_s": {"mu_0": 0.8}, "mu_c": {"mu_0": 0.6}, "v_s": 5.0, "sigma_2": 0.1, "sigma_0": STIFF}
     design = {**ONE_CONDITION, "loads_N": (100.0,), "speeds_mm_s": (5.0,)}
     truth, runs, traces = campaign(
         physics=physics, design=design, effects=[effect(str(shape), acts_on, operation)]
@@ -69,7 +71,7 @@ def test_order_of_application_parameters_mu_force_added(campaign):
         effect("0.1", "force", "multiply"),
         effect("0.2", "mu", "multiply"),
     ]
-    physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.1}
+    physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.1, "sigma_0": STIFF}
     design = {**ONE_CONDITION, "loads_N": (100.0,), "speeds_mm_s": (10.0,)}
     _, runs, traces = campaign(
         physics=physics, design=design, effects=[*effects, effect("0.1", "mu_c", "add")]
@@ -89,8 +91,8 @@ def test_truth_agrees_with_the_written_traces_at_every_steady_sample(campaign):
             "specimens": 2,
             "loads_N": (20.0, 50.0),
             "start_scatter_mm": 1.0,
-            "stiffness_mm": 1e-7,
         },
+        physics={"sigma_0": STIFF},
         channels=[
             {"kind": "numeric", "name": "humidity_pct", "level": "run", "mean": 50, "sd": 8},
             {
@@ -156,8 +158,8 @@ def test_catalogue_effects_are_resolved_with_their_shapes(campaign, monkeypatch)
     monkeypatch.setitem(EFFECTS, "halving", halving)
     entry = {"id": "halving", "channels": ["distance_mm", "load_N"], "parameters": {"A": 0.2, "h": 10.0}}
     entry["reference"] = {"load_N_ref": 25.0}
-    physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0}
-    design = {**ONE_CONDITION, "loads_N": (50.0,), "stiffness_mm": 1e-9}
+    physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0, "sigma_0": STIFF}
+    design = {**ONE_CONDITION, "loads_N": (50.0,)}
     truth, _, _ = campaign(physics=physics, design=design, effects=[entry])
     assert truth["effects"][0]["acts_on"] == "mu"
     points = pd.DataFrame(
@@ -192,8 +194,10 @@ def test_every_effect_of_the_catalogue_can_be_simulated(campaign, known):
     entry = {"id": known.id, "parameters": values, "channels": [FREELY.get(n, n) for n in known.reads]}
     channels = [{"kind": "constant", "name": n, "value": SETTING[n]} for n in known.reads if n in SETTING]
     design = {**ONE_CONDITION, "days": (16.0,), "speeds_mm_s": (2.0,), "directions": (1, -1)}
-    design["stiffness_mm"] = 1e-7  # the law is that of steady sliding, which bristles follow by their length
-    truth, runs, traces = campaign(design=design, channels=channels, effects=[entry], noise=())
+    physics = {"sigma_0": STIFF}
+    truth, runs, traces = campaign(
+        design=design, physics=physics, channels=channels, effects=[entry], noise=()
+    )
     runs = runs.assign(
         direction=[1 if "fwd" in run else -1 for run in runs["run_id"]], stroke=1, elapsed_h=0.0
     )

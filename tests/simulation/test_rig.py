@@ -10,7 +10,7 @@ from truths import true_force
 
 def test_a_trace_rests_ramps_rises_slides_and_stops(campaign):
     _, runs, traces = campaign(
-        design={**ONE_CONDITION, "speeds_mm_s": (20.0,), "dwell_s": 0.1, "stiffness_mm": 0.05}
+        design={**ONE_CONDITION, "speeds_mm_s": (20.0,), "dwell_s": 0.1}, physics={"sigma_0": 900.0}
     )
     trace = traces[runs["file"][0]]
     t, x, force = (trace[name].to_numpy() for name in ("time_s", "displacement_mm", "force_N"))
@@ -33,10 +33,9 @@ def test_a_trace_rests_ramps_rises_slides_and_stops(campaign):
 
 
 def test_the_pre_sliding_rise_is_exponential_in_distance(campaign):
-    design = {**ONE_CONDITION, "speeds_mm_s": (1.0,), "ramp_s": 0.0, "stiffness_mm": 1.0}
-    _, runs, traces = campaign(
-        design=design, physics={"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0}
-    )
+    design = {**ONE_CONDITION, "speeds_mm_s": (1.0,), "ramp_s": 0.0}
+    physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0, "sigma_0": 0.5 * 49.03}
+    _, runs, traces = campaign(design=design, physics=physics)
     trace = traces[runs["file"][0]]
     moving = trace[(trace["displacement_mm"] > 0) & (trace["displacement_mm"] < 39)]
     by_hand = 0.5 * 49.03 * (1 - np.exp(-moving["displacement_mm"]))
@@ -73,8 +72,8 @@ def test_strokes_both_ways_in_one_file(campaign):
 
 def test_a_turn_without_ramp_and_rest_begins_with_the_force_before_it(campaign):
     design = {**ONE_CONDITION, "directions": (1, -1), "strokes_per_file": 2, "ramp_s": 0.0, "dwell_s": 0.0}
-    physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0}
-    _, runs, traces = campaign(design={**design, "stiffness_mm": 1.0, "max_rows": 2000}, physics=physics)
+    physics = {"mu_s": {"mu_0": 0.5}, "mu_c": {"mu_0": 0.5}, "sigma_2": 0.0, "sigma_0": 0.5 * 49.03}
+    _, runs, traces = campaign(design={**design, "max_rows": 2000}, physics=physics)
     trace = traces[runs["file"][0]]
     back = trace.iloc[trace["displacement_mm"].argmax() + 1 :]
     since = 40 - back["displacement_mm"]
@@ -84,8 +83,8 @@ def test_a_turn_without_ramp_and_rest_begins_with_the_force_before_it(campaign):
 
 
 def test_a_stop_rises_as_far_as_the_bristles_let_it(campaign):
-    design = {**ONE_CONDITION, "speeds_mm_s": (20.0,), "stiffness_mm": 0.5, "max_rows": 1000}
-    _, runs, traces = campaign(design=design, physics={"sigma_2": 0.0})
+    design = {**ONE_CONDITION, "speeds_mm_s": (20.0,), "max_rows": 1000}
+    _, runs, traces = campaign(design=design, physics={"sigma_2": 0.0, "sigma_0": 70.0})
     force = traces[runs["file"][0]]["force_N"]
     free, full = 0.609 * 49.03, 0.93513 * 49.03
     end = force.iloc[-1]
