@@ -25,8 +25,8 @@ from sealfit.engine import one_thread
 from sealfit.engine.run_map import cores
 from sealfit.pipeline import STEPS, run
 from sealfit.progress import to_stderr
+from sealfit.report.drawing import compose, look
 from sealfit.report.notation import count
-from sealfit.report.style import compose, look
 from sealfit.simulation import simulate
 from sealfit.simulation.model import Growth, Physics
 from sealfit.store import Store

@@ -12,10 +12,10 @@ from paper_numbers import MEASURED, SERIES, UNAGED, as_printed, condition, print
 
 from sealfit.config import Config
 from sealfit.physics import aging_law, stribeck_force
+from sealfit.report.drawing import BLACK, CYCLE, FLOOR, QUIET, Key, Panel, Plot, shades
 from sealfit.report.figures.aging import aging_points, draw_aging
 from sealfit.report.figures.speed import Line, draw_force_speed, run_points
 from sealfit.report.notation import symbol_math
-from sealfit.report.style import BLACK, CYCLE, FLOOR, QUIET, Key, Panel, Plot, shades
 
 TEMPERATURES, COMPRESSIONS, DAYS = (20, 40, 60, 80), (80, 90, 100), (1, 2, 4, 8, 12, 16)
 SENSITIVITY = {

@@ -7,7 +7,6 @@ import tomllib
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import partial
-from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, TypeVar, get_args
 
@@ -505,9 +504,9 @@ class Config(Strict):
 
 
 def read_config(path: Path | None) -> str:
-    """Return the text of the config at `path`, or of the default in the package; errors as `read_toml`."""
+    """Return the text of the config at `path`, an empty one without a path; errors as `read_toml`."""
     if path is None:
-        return files("sealfit").joinpath("configs/default.toml").read_text("utf-8")
+        return ""
     return read_toml(path, "Check --config.")
 
 

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from sealfit.report import drawing
-from sealfit.report.style import Panel, Plot, compose
+from sealfit.report.drawing import Panel, Plot, compose
 
 UNDRAWN = """
 import drawing_helpers

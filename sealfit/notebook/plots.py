@@ -7,10 +7,9 @@ from matplotlib.figure import Figure
 
 from sealfit.errors import RequestError
 from sealfit.pipeline import reported
-from sealfit.report.drawing import saved
+from sealfit.report.drawing import compose, saved
 from sealfit.report.figures import OF_LOOP, OF_TABLES, draw_all
 from sealfit.report.page import answered
-from sealfit.report.style import compose
 from sealfit.store import Store
 
 FIGURES = tuple(make.__name__ for make in (*OF_LOOP, *OF_TABLES))

@@ -1,6 +1,7 @@
 """The self-contained report.html: tables, sentences and embedded plots."""
 
 import json
+import math
 from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from hashlib import sha256
 from importlib.resources import files
 from pathlib import PurePath
 
+import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -16,17 +18,18 @@ from sealfit.config import Config
 from sealfit.errors import Fault, examples, grouped, how_many, one_reason
 from sealfit.progress import timed
 from sealfit.report import notation, parameter_tables, words
-from sealfit.report.drawing import draw, inline, run_traces
+from sealfit.report.drawing import Tables, draw, inline
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
-from sealfit.report.notation import ConditionNames, capital, channel_label, count, given, true_units
-from sealfit.report.style import Tables
+from sealfit.report.notation import ConditionNames, capital, channel_label, count, given, plain, true_units
 from sealfit.report.summary import of_properties
 from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
 from sealfit.tables import FITTED, SCHEMAS
 
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
 MOST_INPUTS = 2000  # listed with their hashes; inputs.parquet has all
+MOST_BINS = 30_000  # of all runs that a page has, about 1 MB; of more, every second, third ... is left
+LARGEST_STEP = 5  # traces of which fewer than every fifth bin would be left are not in the page
 RANK = {"error": 0, "warning": 1, "info": 2}  # of a severity, in the order of the page
 TEMPLATES = Environment(autoescape=True, undefined=StrictUndefined, loader=PackageLoader("sealfit", "report"))
 
@@ -238,3 +241,33 @@ TEMPLATES.globals |= {"most_channels": MOST_CHANNELS, "most_inputs": MOST_INPUTS
 script = _text("report.js")
 TEMPLATES.globals |= {"style": Markup(_text("style.css")), "script": Markup(script)}
 TEMPLATES.globals["script_hash"] = b64encode(sha256(script.encode()).digest()).decode()
+
+
+def run_traces(tables: Tables, config: Config) -> dict:
+    """Return the measured force and the model's along every run, which the page draws on a click.
+
+    Returned are labels `x` and `y`, and `runs`: by run_id its label and its strokes with file, x, force and
+    model at every `every`-th bin. There are no runs of properties, or where there are too many bins.
+    """
+    units = config.units
+    made = {"x": plain(units.label("displacement_mm")), "y": plain(units.label("force_N")), "runs": {}}
+    rows = next((t for s in ("after", "before") if len(t := tables[f"residuals_{s}"])), pd.DataFrame())
+    made["every"] = every = max(1, math.ceil(len(rows) / MOST_BINS))
+    if rows.empty or every > LARGEST_STEP:
+        return made
+    names = ConditionNames(config)
+    for run_id, run in rows[rows["bin"] % every == 0].groupby("run_id", sort=False):
+        first = run.iloc[0]
+        speed = f"{given(abs(run['speed_mm_s'].mean()), 3)} {units.unit('speed')}"
+        columns = {"x": "displacement_mm", "force": "force_N", "model": "model_N"}
+        strokes = [
+            {"file": file, **{name: _rounded(own[column]) for name, column in columns.items()}}
+            for (file, _), own in run.sort_values("bin").groupby(["file", "stroke"])
+        ]
+        label = f"{names(first['condition'])}, {speed}, run {run_id}"
+        made["runs"][str(run_id)] = {"label": label, "strokes": strokes}
+    return made
+
+
+def _rounded(values: pd.Series) -> list[float | None]:
+    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from sealfit.config import Config
+from sealfit.report.drawing import MOST_ROWS, spread
 from sealfit.report.notation import (
     NOTHING,
     ConditionNames,
@@ -17,7 +18,6 @@ from sealfit.report.notation import (
     symbol_html,
     true_units,
 )
-from sealfit.report.style import MOST_ROWS, spread
 from sealfit.report.words import with_symbols
 
 MOST_LAWS = 4  # listed per quantity

@@ -178,14 +178,14 @@ DEFAULT = "default"
 
 @dataclass(frozen=True, slots=True)
 class ConfigCopy:
-    """A config as text, with its path; `path` is None for the default in the package."""
+    """A config as text, with its path; `path` is None, and the text empty, for the default."""
 
     path: Path | None
     text: str
 
     @classmethod
     def at(cls, path: Path | None) -> ConfigCopy:
-        """Return the config file at `path`, or the default; ConfigError if it cannot be read."""
+        """Return the config file at `path`, or the empty one; ConfigError if it cannot be read."""
         text = read_config(path)  # first, as a link that leads to itself has no path to resolve
         return cls(path.resolve() if path else None, text)
 

@@ -13,7 +13,7 @@ from report.made_campaigns import Made, aging_campaign, torque_campaign
 from report.made_tables import DROP, empty, shape_points, shapes, table
 
 from sealfit.config import Config
-from sealfit.report.drawing import draw, inline
+from sealfit.report.drawing import AFTER, Key, Panel, Plot, compose, draw, inline, is_logarithmic, value_ticks
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.aging import (
     draw_aging,
@@ -34,7 +34,6 @@ from sealfit.report.figures.residual import (
     run_means,
 )
 from sealfit.report.figures.speed import curve_lines, force_speed, run_points
-from sealfit.report.style import AFTER, Key, Panel, Plot, compose, is_logarithmic, value_ticks
 from sealfit.units import Units
 
 NO_POINTS = pd.DataFrame()

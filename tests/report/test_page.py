@@ -9,9 +9,8 @@ from report.made_campaigns import NAMES, PROVENANCE, aging_campaign, paper_sized
 from report.made_tables import empty
 
 from sealfit.config import Config
-from sealfit.report.drawing import LARGEST_STEP, MOST_BINS, run_traces
 from sealfit.report.figures.residual import effect_shapes
-from sealfit.report.page import build_report
+from sealfit.report.page import LARGEST_STEP, MOST_BINS, build_report, run_traces
 
 VOID = {"meta", "img", "br", "link", "path", "rect", "circle"}
 

@@ -6,12 +6,11 @@ from report.made_tables import table
 
 from sealfit.config import Config
 from sealfit.report import page
-from sealfit.report.drawing import draw
+from sealfit.report.drawing import draw, panels_of
 from sealfit.report.figures.aging import aging
 from sealfit.report.figures.speed import force_speed
 from sealfit.report.page import build_report
 from sealfit.report.parameter_tables import break_aways, parameter_tables
-from sealfit.report.style import panels_of
 from sealfit.report.words import curve_of
 
 TEMPERATURES = (20, 30, 40, 50, 60, 70, 80)

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from sealfit.config import Config
+from sealfit.report.drawing import Plot, Tables
 from sealfit.report.figures import aging, residual, speed
-from sealfit.report.style import Plot, Tables
 
 # The figures of closure.json, and those of the tables alone, in the order of the report.
 OF_LOOP = (residual.finding, residual.before_after, residual.effect_shapes, residual.refused)

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from sealfit.config import Config
-from sealfit.report import style
-from sealfit.report.drawing import explain
+from sealfit.report import drawing
+from sealfit.report.drawing import Key, Panel, Plot, Tables, explain
 from sealfit.report.notation import (
     ConditionNames,
     capital,
@@ -25,14 +25,13 @@ from sealfit.report.notation import (
     symbol_math,
     symbol_plain,
 )
-from sealfit.report.style import Key, Panel, Plot, Tables
 from sealfit.units import Units
 
 TRACE_BUCKETS = 350  # of each, the lowest and the highest sample are drawn: what the eye can see of a trace
 MOST_TRACES = 6
 MOST_REPEATS = 6  # of a run that are drawn behind their mean, thinner than it
 REPEAT_BUCKETS = 120
-UNCORRECTED = Key("before, without the effects", style.FLOOR, "dotted")
+UNCORRECTED = Key("before, without the effects", drawing.FLOOR, "dotted")
 
 
 def draw_aging(
@@ -45,9 +44,9 @@ def draw_aging(
     rows of table `aging_curves`, and `before` of that without effects; `quantities` are those of all series.
     """
     for k, quantity in enumerate(quantities):
-        colour, marker = style.CYCLE[k % len(style.CYCLE)], "os^Dv"[k % 5]
+        colour, marker = drawing.CYCLE[k % len(drawing.CYCLE)], "os^Dv"[k % 5]
         curve = curves[curves["quantity"] == quantity].sort_values("aging_days")
-        style.draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, alpha=0.18)
+        drawing.draw_band(ax, curve["aging_days"], curve["lo95"], curve["hi95"], colour, alpha=0.18)
         ax.plot(curve["aging_days"], curve["value"], color=colour)
         earlier = before[before["quantity"] == quantity].sort_values("aging_days")
         ax.plot(earlier["aging_days"], earlier["value"], color=colour, linestyle=":", linewidth=1.1)
@@ -56,7 +55,7 @@ def draw_aging(
         spread, look = np.abs(np.nan_to_num(spread)), {"fmt": marker, "elinewidth": 0.8, "capsize": 1.5}
         markers, *_ = ax.errorbar(here["aging_days"], here["value"], spread, color=colour, **look)
         explain(markers, [_of_point(row) for row in here.to_dict("records")])
-    ax.xaxis.set_major_locator(style.round_ticks(integer=True))
+    ax.xaxis.set_major_locator(drawing.round_ticks(integer=True))
     ax.set_xlabel(plain(units.label("aging_days")))
     if "mu_s" in quantities or "mu_c" in quantities:
         ax.set_ylabel("friction coefficient")
@@ -83,7 +82,7 @@ def aging(tables: Tables, config: Config) -> Plot | None:
     points = property_means(values) if of_property else aging_points(tables["steady_fit"])
     points = points[points["quantity"].isin(quantities)]
     series = sorted(dict.fromkeys(curves["series"]), key=lambda s: natural(names(s)))
-    series, note = style.panels_of(series, "series")
+    series, note = drawing.panels_of(series, "series")
     if note:
         note += " steady_fit.parquet and aging_curves.parquet have all."
     rubber = points.drop_duplicates("series").set_index("series")["rubber"].to_dict()
@@ -108,9 +107,9 @@ def aging(tables: Tables, config: Config) -> Plot | None:
             alt += f"{symbols[0]} starts at {number(float(curve['value'].iloc[0]))}."
             panels.append(Panel(title, alt, draw, limits=limits))
     keys = [] if of_property and len(quantities) > 1 else quantities
-    legend = [Key(q, style.CYCLE[k % len(style.CYCLE)], symbol=True) for k, q in enumerate(keys)]
+    legend = [Key(q, drawing.CYCLE[k % len(drawing.CYCLE)], symbol=True) for k, q in enumerate(keys)]
     of_point = "mean of a condition, 95 %" if of_property else "fit per condition, 95 %"
-    legend += [Key(of_point, style.FLOOR, "point"), Key("aging law, 95 % band", style.FLOOR, "band")]
+    legend += [Key(of_point, drawing.FLOOR, "point"), Key("aging law, 95 % band", drawing.FLOOR, "band")]
     legend += [UNCORRECTED] if len(before) else []
     return Plot("aging", "Aging", tuple(panels), tuple(legend), note)
 
@@ -123,7 +122,7 @@ def _span(
     ends += [curves["value"], curves["lo95"], curves["hi95"], points["value"], before["value"]]
     shown = pd.concat(ends).dropna()
     out = 0.0 if of_property else 0.002  # share of a campaign's values that may lie outside
-    return style.padded(shown.quantile(out), shown.quantile(1 - out))
+    return drawing.padded(shown.quantile(out), shown.quantile(1 - out))
 
 
 def property_means(values: pd.DataFrame) -> pd.DataFrame:
@@ -155,16 +154,16 @@ def draw_trace(ax: Axes, trace: pd.DataFrame, repeats: pd.DataFrame, units: Unit
     """
     for _, stroke in repeats.groupby(["file", "stroke"]):
         one = envelope(along_motion(stroke), REPEAT_BUCKETS)
-        ax.plot(one["displacement_mm"], one["force_N"], color=style.QUIET, linewidth=0.5, zorder=1)
+        ax.plot(one["displacement_mm"], one["force_N"], color=drawing.QUIET, linewidth=0.5, zorder=1)
     thin = envelope(along_motion(trace))
     x, force, error = thin["displacement_mm"], thin["force_N"], thin["force_se_N"].fillna(0)
-    style.draw_band(ax, x, force - error, force + error, style.AFTER, alpha=0.25)
+    drawing.draw_band(ax, x, force - error, force + error, drawing.AFTER, alpha=0.25)
     whole = thin["n"] == thin["n"].max()  # where a repeat begins later, its own start pulls the mean
-    ax.plot(x, force, color=style.SKY, linewidth=0.8)
-    ax.plot(x, force.where(whole), color=style.AFTER, linewidth=0.9)
+    ax.plot(x, force, color=drawing.SKY, linewidth=0.8)
+    ax.plot(x, force.where(whole), color=drawing.AFTER, linewidth=0.9)
     trace = trace.sort_values("displacement_mm")
     window = {"where": trace["steady"].astype(bool), "transform": ax.get_xaxis_transform(), "zorder": 0}
-    ax.fill_between(trace["displacement_mm"], 0, 1, color=style.QUIET, alpha=0.12, linewidth=0, **window)
+    ax.fill_between(trace["displacement_mm"], 0, 1, color=drawing.QUIET, alpha=0.12, linewidth=0, **window)
     ax.set_xlabel(plain(units.label("displacement_mm")))
     ax.set_ylabel(plain(units.label("force_N")))
 
@@ -195,7 +194,7 @@ def traces_mean(tables: Tables, config: Config) -> Plot | None:
     traces = traces[traces["run_id"].isin(chosen["run_id"])]
     ends = along_motion(single)["force_N"].quantile([0.002, 0.998]) if len(single) else None  # but spikes
     shown = pd.concat([along_motion(traces)["force_N"], ends])
-    span = style.padded(shown.min(), shown.max())
+    span = drawing.padded(shown.min(), shown.max())
     panels = []
     for run in chosen.itertuples():
         trace = traces[traces["run_id"] == run.run_id]
@@ -207,11 +206,11 @@ def traces_mean(tables: Tables, config: Config) -> Plot | None:
         own = single[single["run_id"] == run.run_id] if len(single) else single
         draw = partial(draw_trace, trace=trace, units=units, repeats=own)
         panels.append(Panel(title, alt, draw, limits={"ylim": span}))
-    legend = [Key("mean of all repeats", style.AFTER)]
+    legend = [Key("mean of all repeats", drawing.AFTER)]
     if (traces["n"] < traces.groupby("run_id")["n"].transform("max")).any():
-        legend.append(Key("mean of fewer repeats", style.SKY))
-    legend += [Key(f"single repeats, up to {MOST_REPEATS}", style.QUIET)] if len(single) else []
-    legend += [Key("± standard error", style.AFTER, "band"), Key("steady window", style.QUIET, "band")]
+        legend.append(Key("mean of fewer repeats", drawing.SKY))
+    legend += [Key(f"single repeats, up to {MOST_REPEATS}", drawing.QUIET)] if len(single) else []
+    legend += [Key("± standard error", drawing.AFTER, "band"), Key("steady window", drawing.QUIET, "band")]
     return Plot("traces_mean", "Averaged traces", tuple(panels), tuple(legend))
 
 
@@ -229,10 +228,10 @@ def example_runs(traces: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
         return known
     groups = [g.sort_values("speed") for _, g in known.groupby("condition", sort=False)]
     picked = []
-    for k, group in enumerate(groups[place] for place in style.evenly(len(groups), MOST_TRACES)):
+    for k, group in enumerate(groups[place] for place in drawing.evenly(len(groups), MOST_TRACES)):
         left = group[~group["run_id"].isin([row["run_id"] for row in picked])]
         if len(left):
-            picked.append(left.iloc[style.evenly(len(left), MOST_TRACES)[k]])
+            picked.append(left.iloc[drawing.evenly(len(left), MOST_TRACES)[k]])
     return pd.DataFrame(picked)
 
 
@@ -255,17 +254,17 @@ def draw_master_curve(
     ax.set_xscale("symlog", linthresh=float(aged["scaled_days"].min()), linscale=0.7)
     ax.xaxis.get_major_locator().set_params(numticks=6)  # where factors of temperature differ by many decades
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    style.draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], style.FLOOR)
-    ax.plot(law["scaled_days"], law["value"], color=style.FLOOR)
+    drawing.draw_band(ax, law["scaled_days"], law["lo95"], law["hi95"], drawing.FLOOR)
+    ax.plot(law["scaled_days"], law["value"], color=drawing.FLOOR)
     before = before.sort_values("scaled_days")
-    ax.plot(before["scaled_days"], before["value"], color=style.FLOOR, linestyle=":")
+    ax.plot(before["scaled_days"], before["value"], color=drawing.FLOOR, linestyle=":")
     fresh = values[values["scaled_days"] == 0]
     if not fresh.empty:  # an unclipped line without points has its place at the corner of the figure
-        ax.plot(fresh["scaled_days"], fresh["value"], "o", color=style.BLACK, clip_on=False)
+        ax.plot(fresh["scaled_days"], fresh["value"], "o", color=drawing.BLACK, clip_on=False)
     percents = np.sort(aged["compression_ratio_pct"].dropna().unique())
     for (celsius, percent), own in aged.groupby(["temperature_C", "compression_ratio_pct"], dropna=False):
         rank = int(np.searchsorted(percents, percent)) if np.isfinite(percent) else 0
-        marker, colour = MARKERS[rank % len(MARKERS)], colours.get(celsius, style.BLACK)
+        marker, colour = MARKERS[rank % len(MARKERS)], colours.get(celsius, drawing.BLACK)
         (points,) = ax.plot(own["scaled_days"], own["value"], marker, markersize=4, color=colour)
         known = [(value, unit) for value, unit in ((celsius, "°C"), (percent, "%")) if np.isfinite(value)]
         place = ", ".join(f"{given(value)} {unit}" for value, unit in known)
@@ -281,26 +280,26 @@ def master_curve(tables: Tables, config: Config) -> Plot | None:
     if table.empty:
         return None
     celsius = np.sort(table["temperature_C"].dropna().unique())
-    colours = dict(zip(celsius.tolist(), style.shades(len(celsius)), strict=True))
+    colours = dict(zip(celsius.tolist(), drawing.shades(len(celsius)), strict=True))
     several = table["rubber"].nunique() > 1
     panels = []
-    groups, note = style.panels_of(list(table.groupby(["rubber", "quantity"], sort=False)), "curves")
+    groups, note = drawing.panels_of(list(table.groupby(["rubber", "quantity"], sort=False)), "curves")
     before = tables.get("master_curve_before", table.iloc[:0])
     for (rubber, quantity), rows in groups:
         earlier = before[(before["rubber"] == rubber) & (before["quantity"] == quantity)]
         earlier = earlier[earlier["kind"] == "law"]
         shown = pd.concat([rows["value"], rows["lo95"], rows["hi95"], earlier["value"]])
-        limits = {"ylim": style.padded(shown.min(), shown.max())}
+        limits = {"ylim": drawing.padded(shown.min(), shown.max())}
         draw = partial(draw_master_curve, rows=rows, before=earlier, colours=colours, units=config.units)
         words = QUANTITIES.get(quantity, symbol_plain(quantity))
         title = f"{rubber}, {words}" if several else words
         alt = f"Master curve of {title}: from {number(rows['value'].max())} to {number(rows['value'].min())}."
         panels.append(Panel(capital(title), alt, draw, limits=limits))
-    keys = style.spread(list(colours.items()), style.MOST_KEYS)
+    keys = drawing.spread(list(colours.items()), drawing.MOST_KEYS)
     legend = [Key(f"{given(t)} °C", colour, "point") for t, colour in keys]
     if ((table["kind"] == "value") & (table["scaled_days"] == 0)).any():
-        legend.append(Key("unaged", style.BLACK, "point"))
-    legend.append(Key("law, 95 % band", style.FLOOR, "band"))
+        legend.append(Key("unaged", drawing.BLACK, "point"))
+    legend.append(Key("law, 95 % band", drawing.FLOOR, "band"))
     legend += [UNCORRECTED] if len(before) else []
     note += " master_curve.parquet has all." if note else ""
     return Plot("master_curve", "Master curve", tuple(panels), tuple(legend), note)

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from scipy.special import stdtrit
 
 from sealfit.config import Config
-from sealfit.report import style
-from sealfit.report.drawing import explain
+from sealfit.report import drawing
+from sealfit.report.drawing import Key, Panel, Plot, Tables, explain
 from sealfit.report.figures.speed import LOG_SPAN as SPEED_SPAN
 from sealfit.report.notation import (
     capital,
@@ -28,7 +28,6 @@ from sealfit.report.notation import (
     symbol_plain,
     together,
 )
-from sealfit.report.style import Key, Panel, Plot, Tables
 from sealfit.report.summary import by_gain
 from sealfit.tables import CALENDAR
 from sealfit.units import Units
@@ -39,8 +38,8 @@ MOST_CHANNELS = 18
 MANY_CATEGORIES = 24
 LOG_SPAN = 50.0
 Z95 = 1.959964
-BARS = (Key("before", style.BEFORE, "bar"), Key("after", style.AFTER, "bar"))
-STAGES = (Key("before", style.BEFORE, "open"), Key("after", style.AFTER, "point"))
+BARS = (Key("before", drawing.BEFORE, "bar"), Key("after", drawing.AFTER, "bar"))
+STAGES = (Key("before", drawing.BEFORE, "open"), Key("after", drawing.AFTER, "point"))
 
 
 def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
@@ -55,14 +54,14 @@ def draw_errors(ax: Axes, closure: Mapping, units: Units) -> None:
         before, after = closure["before"][key], closure["after"][key]
         y = len(rows) - 1 - k
         if known(after) and after != before:
-            ax.plot([before, after], [y, y], color=style.QUIET, linewidth=1.2, zorder=1)
-            ax.plot(after, y, "o", color=style.AFTER, markersize=6.5, zorder=3)
-            ax.annotate(texts[2 * k + 1], (after, y), color=style.AFTER, bbox=box, **above)
-        ax.plot(before, y, "o", color=style.BEFORE, markersize=6.5, zorder=2)
-        ax.annotate(texts[2 * k], (before, y), color=style.BEFORE, bbox=box, **above)
+            ax.plot([before, after], [y, y], color=drawing.QUIET, linewidth=1.2, zorder=1)
+            ax.plot(after, y, "o", color=drawing.AFTER, markersize=6.5, zorder=3)
+            ax.annotate(texts[2 * k + 1], (after, y), color=drawing.AFTER, bbox=box, **above)
+        ax.plot(before, y, "o", color=drawing.BEFORE, markersize=6.5, zorder=2)
+        ax.annotate(texts[2 * k], (before, y), color=drawing.BEFORE, bbox=box, **above)
     floor = closure["noise_floor_N"]
     if known(floor):
-        ax.axvline(floor, color=style.FLOOR, linestyle="--", linewidth=1.0, zorder=0)
+        ax.axvline(floor, color=drawing.FLOOR, linestyle="--", linewidth=1.0, zorder=0)
         largest = max(largest, floor)
     ax.set_yticks(range(len(rows)), [label for _, label in reversed(rows)])
     ax.set_ylim(-0.6, len(rows) - 0.35)
@@ -76,11 +75,11 @@ def draw_histogram(ax: Axes, before: np.ndarray, after: np.ndarray, units: Units
     both = np.concatenate([before, after])
     edge = float(np.max(np.abs(both))) or 1.0
     edges = np.linspace(-edge, edge, 2 * int(np.clip(np.sqrt(len(before)), 4, 15)) + 2)
-    ax.hist(before, edges, histtype="stepfilled", color=style.BEFORE, alpha=0.25)
-    ax.hist(before, edges, histtype="step", color=style.BEFORE, linewidth=1.2)
+    ax.hist(before, edges, histtype="stepfilled", color=drawing.BEFORE, alpha=0.25)
+    ax.hist(before, edges, histtype="step", color=drawing.BEFORE, linewidth=1.2)
     if not np.array_equal(before, after):
-        ax.hist(after, edges, histtype="step", color=style.AFTER, linewidth=1.7)
-    ax.axvline(0.0, color=style.QUIET, linewidth=0.8, zorder=0)
+        ax.hist(after, edges, histtype="step", color=drawing.AFTER, linewidth=1.7)
+    ax.axvline(0.0, color=drawing.QUIET, linewidth=0.8, zorder=0)
     ax.yaxis.get_major_locator().set_params(integer=True)
     kind = "held-out error" if held_out else "error"
     ax.set_xlabel(f"{kind} of the run mean ({plain(units.unit('force'))})")
@@ -120,9 +119,9 @@ def before_after(tables: Tables, closure: Mapping, config: Config) -> Plot | Non
             draw = partial(draw_histogram, before=a, after=b, units=config.units, held_out=held)
             panels.append(Panel("Errors of run means", alt, draw))
     same = closure["before"] == closure["after"]
-    legend = [Key("declared model", style.BEFORE, "bar")] if same else list(BARS)
+    legend = [Key("declared model", drawing.BEFORE, "bar")] if same else list(BARS)
     if known(floor):
-        legend.append(Key("noise floor", style.FLOOR, "dashed"))
+        legend.append(Key("noise floor", drawing.FLOOR, "dashed"))
     return Plot("before_after", "Errors before and after", tuple(panels), tuple(legend))
 
 
@@ -193,7 +192,7 @@ def draw_levels(ax: Axes, levels: pd.DataFrame, units: Units) -> None:
     largest = max([value**2 for value in sd.values() if known(value)], default=1.0) or 1.0
     single = not any(stage == "after" for stage in whole["stage"])
     for k, name in enumerate(names):
-        for stage, colour, shift in (("before", style.BEFORE, 0.19), ("after", style.AFTER, -0.19)):
+        for stage, colour, shift in (("before", drawing.BEFORE, 0.19), ("after", drawing.AFTER, -0.19)):
             value = sd.get((stage, name))
             if not known(value):
                 continue
@@ -227,18 +226,18 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
     """Draw the mean residual along one channel, `rows` of table `channels`, with 95 % intervals."""
     numeric = rows["x"].notna().all() and channel != "direction"
     x = rows["x"].to_numpy(float) if numeric else np.arange(len(rows), dtype=float)
-    log = numeric and channel not in CALENDAR and style.is_logarithmic(x, LOG_SPAN)
+    log = numeric and channel not in CALENDAR and drawing.is_logarithmic(x, LOG_SPAN)
     if numeric and channel in ("speed_mm_s", "speed_set_mm_s"):  # as force against speed is drawn
         log = bool(x.min() > 0 and x.max() / x.min() > SPEED_SPAN)
     # The two stages are drawn side by side, so that neither hides the other.
     apart = 0.008 * (np.ptp(np.log(x)) if log else np.ptp(x)) if numeric else 0.09
-    ax.axhline(0.0, color=style.QUIET, linewidth=0.8, zorder=1)
+    ax.axhline(0.0, color=drawing.QUIET, linewidth=0.8, zorder=1)
     size = {"markersize": 3.6, "markeredgewidth": 0.9, "elinewidth": 0.9, "capsize": 1.8}
     if not numeric and len(rows) > MANY_CATEGORIES:  # drawn finer, or they are one blot
         size = {"markersize": 1.8, "markeredgewidth": 0.6, "elinewidth": 0.4, "capsize": 0.0}
     for stage, colour, marker, shift in (
-        ("before", style.BEFORE, "o", -apart),
-        ("after", style.AFTER, "s", apart),
+        ("before", drawing.BEFORE, "o", -apart),
+        ("after", drawing.AFTER, "s", apart),
     ):
         spread = rows[f"{stage}_half_N"].fillna(0.0).to_numpy(float)
         places, mean = x * np.exp(shift) if log else x + shift, rows[f"{stage}_N"]
@@ -253,10 +252,10 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
             zorder=above,
             linestyle="-" if numeric else "",
             linewidth=0.8,
-            rasterized=len(rows) > style.MOST_MARKS,
+            rasterized=len(rows) > drawing.MOST_MARKS,
             **size,
         )
-        if len(rows) <= style.MOST_MARKS:
+        if len(rows) <= drawing.MOST_MARKS:
             names = [number(value, 4) for value in x] if numeric else categories(rows, channel)
             texts = (f"{number(m, 3)} ± {number(s, 2)}" for m, s in zip(mean, spread, strict=True))
             place, unit = channel_label(channel, units), units.unit("force")
@@ -264,11 +263,11 @@ def draw_channel(ax: Axes, rows: pd.DataFrame, channel: str, units: Units) -> No
             most = "largest in run"  # a click on the point opens it
             explain(points, [f"{stage}: {v} {unit}\n{place}: {name}\n{most}\n{run}" for v, name, run in said])
     if log:
-        style.log_axis(ax)
+        drawing.log_axis(ax)
     elif numeric:
-        style.value_ticks(ax, x)
+        drawing.value_ticks(ax, x)
     else:
-        style.category_ticks(ax, categories(rows, channel))
+        drawing.category_ticks(ax, categories(rows, channel))
     ax.set_xlabel(plain(short(channel_label(channel, units), 44)))
     along = " along the motion" if rows["along_motion"].any() else ""
     ax.set_ylabel(f"residual{along} ({plain(units.unit('force'))})")
@@ -341,30 +340,30 @@ def draw_shape(ax: Axes, rows: pd.DataFrame, points: pd.DataFrame, effect: Mappi
     if channel == "direction" and rows["x"].notna().all():
         rows = rows[rows["x"].abs() == 1.0]  # there is nothing between forward and backward
     value, lo, hi, free = (scale * rows[name].to_numpy(float) for name in ("value", "lo95", "hi95", "free"))
-    ax.axhline(0.0, color=style.QUIET, linewidth=0.8, zorder=1)
+    ax.axhline(0.0, color=drawing.QUIET, linewidth=0.8, zorder=1)
     if numeric:
         x = rows["x"].to_numpy(float)
-        style.draw_band(ax, x, lo, hi, style.AFTER)
-        ax.plot(x, free, color=style.FLOOR, linestyle="--", linewidth=1.1)
-        ax.plot(x, value, color=style.AFTER)
+        drawing.draw_band(ax, x, lo, hi, drawing.AFTER)
+        ax.plot(x, free, color=drawing.FLOOR, linestyle="--", linewidth=1.1)
+        ax.plot(x, value, color=drawing.AFTER)
         ax.set_xlim(x.min(), x.max() if x.max() > x.min() else x.min() + 1)
-        if channel not in CALENDAR and style.is_logarithmic(x, LOG_SPAN):
-            style.log_axis(ax)
+        if channel not in CALENDAR and drawing.is_logarithmic(x, LOG_SPAN):
+            drawing.log_axis(ax)
         elif len(points):
-            style.value_ticks(ax, points["x"].to_numpy(float))
+            drawing.value_ticks(ax, points["x"].to_numpy(float))
     else:
         x = np.arange(len(rows))
         spread = np.nan_to_num(np.abs(np.stack([value - lo, hi - value])))
-        ax.errorbar(x, value, spread, color=style.AFTER, fmt="o", elinewidth=1.4, capsize=2.0)
-        ax.plot(x, free, color=style.FLOOR, marker="_", linestyle="", markersize=12)
-        style.category_ticks(ax, categories(rows, channel))
+        ax.errorbar(x, value, spread, color=drawing.AFTER, fmt="o", elinewidth=1.4, capsize=2.0)
+        ax.plot(x, free, color=drawing.FLOOR, marker="_", linestyle="", markersize=12)
+        drawing.category_ticks(ax, categories(rows, channel))
     if len(points):
         places = points["x"] if numeric else np.arange(len(points)) + 0.15
         ax.errorbar(
             places,
             scale * points["value"],
             Z95 * scale * points["se"],
-            color=style.FLOOR,
+            color=drawing.FLOOR,
             fmt="o",
             markersize=2.6,
             elinewidth=0.8,
@@ -414,9 +413,9 @@ def effect_shapes(tables: Tables, closure: Mapping, config: Config) -> Plot | No
         alt += f"from {number(values.min())} to {number(values.max())}."
         number_of = f"{place[int(index)] + 1}. " if len(effects) > 1 else ""
         panels.append(Panel(number_of + capital(words), alt, draw))
-    legend = [Key("effect, 95 % band", style.AFTER)]
+    legend = [Key("effect, 95 % band", drawing.AFTER)]
     if shapes["free"].notna().any():
-        legend.append(Key("free shape", style.FLOOR, "dashed"))
+        legend.append(Key("free shape", drawing.FLOOR, "dashed"))
     if len(points):
-        legend.append(Key("partial residual: effect plus mean residual, 95 %", style.FLOOR, "point"))
+        legend.append(Key("partial residual: effect plus mean residual, 95 %", drawing.FLOOR, "point"))
     return Plot("effect_shapes", "Shapes of the effects", tuple(panels), tuple(legend))

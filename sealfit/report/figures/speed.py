@@ -10,8 +10,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from sealfit.config import Config
-from sealfit.report import style
-from sealfit.report.drawing import explain
+from sealfit.report import drawing
+from sealfit.report.drawing import Key, Panel, Plot, Tables, explain
 from sealfit.report.notation import (
     ConditionNames,
     by_number,
@@ -25,7 +25,6 @@ from sealfit.report.notation import (
     plain,
     short,
 )
-from sealfit.report.style import Key, Panel, Plot, Tables
 from sealfit.units import Units
 
 MOST_CURVES = 24  # in one panel
@@ -47,11 +46,11 @@ class Line:
 
 def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool = False) -> None:
     """Draw force against speed of conditions: model with its band, declared model dotted, and run means."""
-    dense = sum(len(line.points) for line in lines) > style.MOST_MARKS
+    dense = sum(len(line.points) for line in lines) > drawing.MOST_MARKS
     for line in lines:
         for curve in line.curves:
             speed = curve["speed"]
-            style.draw_band(ax, speed, curve["lo"], curve["hi"], line.colour)
+            drawing.draw_band(ax, speed, curve["lo"], curve["hi"], line.colour)
             if not curve["before"].equals(curve["after"]):
                 ax.plot(speed, curve["before"], color=line.colour, linestyle=":", linewidth=0.9, alpha=0.8)
             backward = (curve["direction"] < 0).any()
@@ -74,7 +73,7 @@ def draw_force_speed(ax: Axes, lines: Sequence[Line], units: Units, *, log: bool
             if not dense:
                 explain(drawn, [_of_run(row, line.label, units) for row in points.to_dict("records")])
     if log:
-        style.log_axis(ax)
+        drawing.log_axis(ax)
     else:
         ax.set_xlim(left=0.0)
     ax.set_xlabel(plain(units.label("speed_mm_s")))
@@ -99,7 +98,7 @@ def force_speed(tables: Tables, config: Config) -> Plot | None:
     rubber = tables["steady"].drop_duplicates("condition").set_index("condition")["rubber"].to_dict()
     unaged = [c for c in conditions if is_unaged(c)]
     groups = _groups([c for c in conditions if not is_unaged(c)], names, last) or {"": unaged}
-    titles, note = style.panels_of(list(groups), "panels")
+    titles, note = drawing.panels_of(list(groups), "panels")
     groups = {title: groups[title] for title in titles}
     drawn = {*unaged, *chain.from_iterable(groups.values())}
     if len(drawn) < len(conditions):
@@ -108,7 +107,7 @@ def force_speed(tables: Tables, config: Config) -> Plot | None:
         note += "steady.parquet and curves.parquet have all."
     levels = sorted({names.parts(c).get(last, "") for c in drawn} - {""}, key=by_number)
     numeric = all(is_number(level) for level in levels)
-    colour = dict(zip(levels, style.shades(len(levels)) if numeric else cycle(style.CYCLE), strict=False))
+    colour = dict(zip(levels, drawing.shades(len(levels)) if numeric else cycle(drawing.CYCLE), strict=False))
     speeds = pd.concat([points["speed"], curves["speed"]])
     speeds = speeds[speeds > 0].astype(float)
     log = len(speeds) > 0 and speeds.max() / speeds.min() > LOG_SPAN
@@ -116,11 +115,11 @@ def force_speed(tables: Tables, config: Config) -> Plot | None:
     force, sd = points["force"], points["sd"].fillna(0)
     shown = pd.concat([force + sd, force - sd, curves["after"], curves["before"]]).dropna()
     x_span = (speeds.min() / 1.2 if log else 0.0, speeds.max() * (1.2 if log else 1.06))
-    limits = {"xlim": x_span, "ylim": style.padded(shown.min(), shown.max())}
+    limits = {"xlim": x_span, "ylim": drawing.padded(shown.min(), shown.max())}
     # curves of a condition: directions and loads
     most = max(2, MOST_CURVES // max(len(group) for group in groups.values()))
     own_curves = {
-        c: tuple(style.spread([part for _, part in own.groupby(["direction", "load"], dropna=False)], most))
+        c: tuple(drawing.spread([part for _, part in own.groupby(["direction", "load"], dropna=False)], most))
         for c, own in curves[curves["condition"].isin(drawn)].groupby("condition")
     }
     own_points = dict(list(points.groupby("condition", sort=False)))
@@ -130,25 +129,27 @@ def force_speed(tables: Tables, config: Config) -> Plot | None:
         lines = []
         for c in [*shared, *group]:
             own = own_curves.get(c, ()), own_points.get(c, points.iloc[:0])
-            lines.append(Line(names(c), style.BLACK if is_unaged(c) else colour[names.parts(c)[last]], *own))
+            lines.append(
+                Line(names(c), drawing.BLACK if is_unaged(c) else colour[names.parts(c)[last]], *own)
+            )
         draw = partial(draw_force_speed, lines=lines, units=config.units, log=log)
         panels.append(Panel(title, _force_alt(title, lines, config), draw, limits=limits))
-    legend = [Key(short(names(c)), style.BLACK) for c in style.spread(unaged, style.MOST_KEYS)]
-    keys = style.spread(levels, style.MOST_KEYS)
+    legend = [Key(short(names(c)), drawing.BLACK) for c in drawing.spread(unaged, drawing.MOST_KEYS)]
+    keys = drawing.spread(levels, drawing.MOST_KEYS)
     legend += [Key(short(names(f"{last}={level}")), colour[level]) for level in keys]
     kinds = (("run means", points, ("point", "left")), ("model", curves, ("line", "dashed")))
     for what, rows, marks in kinds:
         signs = rows["direction"].unique()
         for sign, way, mark in zip((1, -1), ("forward", "backward"), marks, strict=True):
             if sign in signs:
-                legend.append(Key(f"{what}, {way}" if len(signs) > 1 else what, style.FLOOR, mark))
+                legend.append(Key(f"{what}, {way}" if len(signs) > 1 else what, drawing.FLOOR, mark))
     if curves["lo"].notna().any():
-        legend.append(Key("95 % band", style.FLOOR, "band"))
+        legend.append(Key("95 % band", drawing.FLOOR, "band"))
     gap = (curves["after"] - curves["before"]).abs().max()
     if gap > 1e-9 * max(curves["after"].abs().max(), 1e-300):
-        legend.append(Key("declared model", style.FLOOR, "dotted"))
+        legend.append(Key("declared model", drawing.FLOOR, "dotted"))
     title = f"{capital(config.units.quantity('force'))} against {config.units.quantity('speed')}"
-    height = style.HEIGHT if len(groups) > 2 else TALL
+    height = drawing.HEIGHT if len(groups) > 2 else TALL
     return Plot("force_speed", title, tuple(panels), tuple(legend), note, height)
 
 
@@ -173,7 +174,7 @@ def run_points(steady: pd.DataFrame) -> pd.DataFrame:
         force=("force", "mean"),
         sd=("force", "std"),
         n=("force", "size"),
-        files=("file", lambda own: ", ".join(style.spread(list(own), MOST_FILES))),
+        files=("file", lambda own: ", ".join(drawing.spread(list(own), MOST_FILES))),
     )
     return found.reset_index()
 
@@ -201,9 +202,9 @@ def _groups(conditions: Sequence[str], names: ConditionNames, last: str) -> dict
     groups = {title: sorted(groups[title], key=lambda c: by_number(level[c])) for title in titles}
     if all(len(group) <= MOST_COLOURS for group in groups.values()):
         return groups
-    if len(conditions) > style.MOST_PANELS and all(map(is_number, level.values())):
+    if len(conditions) > drawing.MOST_PANELS and all(map(is_number, level.values())):
         # numbers have an order
-        return {title: style.spread(group, MOST_COLOURS) for title, group in groups.items()}
+        return {title: drawing.spread(group, MOST_COLOURS) for title, group in groups.items()}
     return {names(c): [c] for group in groups.values() for c in group}
 
 
@@ -217,10 +218,10 @@ def draw_starts(ax: Axes, curves: pd.DataFrame, colours: Mapping[float, str], un
     """Draw rows of table `dynamic_curves` of a condition, in the colours of the commanded speeds."""
     for (speed, direction), curve in curves.groupby(["speed_set_mm_s", "direction"], dropna=False, sort=True):
         curve = curve.sort_values("distance_mm")
-        colour = colours.get(speed, style.BLACK)
+        colour = colours.get(speed, drawing.BLACK)
         x, force, error = curve["distance_mm"], curve["force_N"], curve["force_se_N"].fillna(0.0)
         marker, face, line = ("o", colour, "-") if direction > 0 else ("<", "white", "--")
-        style.draw_band(ax, x, force - error, force + error, colour)
+        drawing.draw_band(ax, x, force - error, force + error, colour)
         look = {"color": colour, "markerfacecolor": face, "markersize": 2.6, "markeredgewidth": 0.7}
         ax.plot(x, force, marker, **look)
         ax.plot(x, curve["model_N"], color=colour, linestyle=line)
@@ -245,12 +246,12 @@ def starts(tables: Tables, config: Config) -> Plot | None:
     if curves.empty:
         return None
     names, units = ConditionNames(config), config.units
-    picked = style.spread(sorted(curves["condition"].unique(), key=names.place), MOST_START_PANELS)
-    speeds = style.spread(np.sort(curves["speed_set_mm_s"].dropna().unique()).tolist(), MOST_SPEEDS)
-    colours = dict(zip(speeds, style.shades(len(speeds)), strict=True))
+    picked = drawing.spread(sorted(curves["condition"].unique(), key=names.place), MOST_START_PANELS)
+    speeds = drawing.spread(np.sort(curves["speed_set_mm_s"].dropna().unique()).tolist(), MOST_SPEEDS)
+    colours = dict(zip(speeds, drawing.shades(len(speeds)), strict=True))
     shown = curves[curves["condition"].isin(picked)]
     shown = shown[shown["speed_set_mm_s"].isin(speeds) | shown["speed_set_mm_s"].isna()]
-    span = style.padded(min(0.0, shown["force_N"].min()), shown["force_N"].max())
+    span = drawing.padded(min(0.0, shown["force_N"].min()), shown["force_N"].max())
     panels = []
     for condition in picked:
         own = shown[shown["condition"] == condition]
@@ -262,9 +263,9 @@ def starts(tables: Tables, config: Config) -> Plot | None:
         draw = partial(draw_starts, curves=own, colours=colours, units=units)
         panels.append(Panel(names(condition), alt, draw, limits={"ylim": span}))
     legend = [Key(f"{given(speed)} {units.unit('speed')}", colour) for speed, colour in colours.items()]
-    legend.append(Key("mean of the strokes", style.FLOOR, "point"))
+    legend.append(Key("mean of the strokes", drawing.FLOOR, "point"))
     if (shown["direction"] < 0).any():
-        legend.append(Key("backward", style.FLOOR, "left"))
+        legend.append(Key("backward", drawing.FLOOR, "left"))
     if shown["model_N"].notna().any():
-        legend.append(Key("dynamic model", style.FLOOR, "line"))
+        legend.append(Key("dynamic model", drawing.FLOOR, "line"))
     return Plot("starts", "Pre-sliding", tuple(panels), tuple(legend))

@@ -7,8 +7,7 @@ import sys
 
 import matplotlib as mpl
 
-from sealfit.report.drawing import draw
-from sealfit.report.style import BLUE, Key, Panel, Plot, compose, look
+from sealfit.report.drawing import BLUE, Key, Panel, Plot, compose, draw, look
 
 HOSTILE = {
     "font.size": 21.0, "axes.labelsize": "xx-large", "xtick.labelsize": "small", "ytick.labelsize": "large",
@@ -48,9 +47,9 @@ def test_text_is_text_in_files_for_print():
 def test_a_matplotlibrc_changes_nothing(tmp_path):
     (tmp_path / "matplotlibrc").write_text("font.size: 21\nxtick.labelsize: xx-large\nlines.linewidth: 9\n")
     program = (
-        "import sys; sys.path[:0] = sys.argv[1:]; import matplotlib, test_style; "
+        "import sys; sys.path[:0] = sys.argv[1:]; import matplotlib, test_drawing; "
         "from sealfit.report.drawing import draw;"
-        "assert matplotlib.rcParams['font.size'] == 21; sys.stdout.write(draw(test_style.PLOT)['svg'])"
+        "assert matplotlib.rcParams['font.size'] == 21; sys.stdout.write(draw(test_drawing.PLOT)['svg'])"
     )
     environment = {**os.environ, "MATPLOTLIBRC": str(tmp_path)}
     here = os.path.dirname(__file__)
