@@ -183,5 +183,11 @@ class Renaming:
 
 
 def _lead(proposal: Proposal, other: Fitted) -> float:
-    """Return by how much the deviance of a proposal is below that of another fit under its scatter."""
-    return deviance_under(other, proposal.fitted.scatter) - proposal.fitted.deviance
+    """Return by how much the deviance of a proposal is below that of another fit.
+
+    Each has its own scatter or the other's, whichever is likelier. Under the scatter of one of them alone,
+    what this one does not explain would seem to be scatter.
+    """
+    own = proposal.fitted
+    other_deviance = min(other.deviance, deviance_under(other, own.scatter))
+    return other_deviance - min(own.deviance, deviance_under(own, other.scatter))

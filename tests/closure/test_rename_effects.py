@@ -216,6 +216,25 @@ def test_a_surface_takes_the_place_of_two_curves_unless_they_add_up(effect, foun
     assert {name for term in terms for name in term.channels} == set(TWO)
 
 
+def test_what_one_effect_leaves_unexplained_is_not_taken_for_scatter_of_files():
+    pressures = {"pressure_bar": lambda rng: rng.uniform(0, 10)}
+    bins = make_bins(7, temperatures=(), days=(), bins=8, gain=0.002, run_channels=pressures)
+    current = np.random.default_rng(1).normal(0, 1, len(bins))
+    force = bins["force_N"] + current + 0.3 * bins["pressure_bar"]
+    rows = make_rows(bins.assign(current_A=current, force_N=force), has_aging=False)
+    first, second = (
+        Term(EFFECTS["linear"], (name,), "force", "add", {"x_ref": 0.0})
+        for name in ("current_A", "pressure_bar")
+    )
+    model = fit_declared(rows).model.with_term(first, {"A": 1.0})
+    one, two = fit(model, rows, turns=3), fit(model.with_term(second, {"A": 0.3}), rows, turns=3)
+    source = (first.channels, "force", "add")
+    proposal = Proposal(first, {"A": 1.0}, "run", 8, 1e3, 1e-9, np.empty(0), source, fitted=one)
+    lead = rename_effects._lead(proposal, two)
+    assert lead == pytest.approx(two.deviance - one.deviance)
+    assert lead < 2 * (rename_effects.deviance_under(two, one.scatter) - one.deviance)
+
+
 def test_no_surface_changes_with_the_calendar():
     def changes(table, force):
         oil, hours = (table[name].to_numpy() for name in ("oil_ppm", "elapsed_h"))
