@@ -24,6 +24,9 @@ MOST_SET_VALUES = 50  # A channel with more groups of values than this is used a
 # Factor on the p-value of an F test against the scatter of runs or files, which need not scatter alike. With
 # two or three runs per parameter the jackknife needs t above 10 where F has p = 1e-15.
 UNEQUAL_RUNS = 1e4
+# Least effective number of runs or files that bear the evidence of an F test against their scatter. One wrong
+# file of a speed measured twice in a condition makes two.
+LEAST_BEARING = 3.0
 JACKKNIFE_UNITS = 30  # Number of units from which the jackknife over units is used.
 PROMISING = 1e-3  # The jackknife is computed if the unadjusted p-value of the columns is below this.
 TESTED_AGAINST_RUNS = 0.05  # Columns constant in runs or files are tested against their scatter below this.

@@ -199,19 +199,37 @@ class ScoreTests:
         fitted = self.fitted
         if not few_specimens(fitted):
             return True
-        explained = left @ (np.linalg.pinv(left.T @ left, hermitian=True) @ (left.T @ fitted.white_residual))
-        explained = explained[:, None]
+        explained = self._explained(left)[:, None]
         return not along_strokes(fitted, explained)[0] or bool(specimens_agree(fitted, explained)[0])
 
     def _test_of_constants(
         self, variants: Sequence[np.ndarray], target: tuple[str, str], coarsest: str
     ) -> SmallSampleTest | None:
-        """Return the weakest exact F test of columns constant in each run, file or specimen, or None."""
+        """Return the weakest exact F test of columns constant in each run, file or specimen, or None.
+
+        Of runs or files it is not significant if fewer than `LEAST_BEARING` bear the evidence: a wrong file
+        is no normal scatter.
+        """
         for level in ("specimen",) if coarsest == "specimen" else ("run", "file"):
             tests = [self.cluster_tests[level].test(left, target) for left in variants]
             if all(test is not None and test.share > criteria.CONSTANT_IN_RUNS for test in tests):
-                return max(tests, key=lambda test: test.log_p)
+                weakest = max(tests, key=lambda test: test.log_p)
+                few = level != "specimen" and self._bearing(variants[0], level) < criteria.LEAST_BEARING
+                return weakest._replace(log_p=0.0) if few else weakest
         return None
+
+    def _bearing(self, left: np.ndarray, level: str) -> float:
+        """Return the effective number of units that bear the evidence for projected columns, shape (n, k).
+
+        It is (sum s)^2 / sum s^2 of the sums of squares s that the columns explain in each unit.
+        """
+        fitted = self.fitted
+        scores = fitted.rows.groups.sums(self._explained(left) * fitted.white_residual, level)
+        return float(scores.sum() ** 2 / max((scores**2).sum(), 1e-300))
+
+    def _explained(self, left: np.ndarray) -> np.ndarray:
+        """Return what projected columns, shape (n, k), explain of the whitened residual, shape (n,)."""
+        return left @ (np.linalg.pinv(left.T @ left, hermitian=True) @ (left.T @ self.fitted.white_residual))
 
     def _score_test(self, left: np.ndarray, level: str, target: tuple[str, str]) -> ScoreTestResult | None:
         fitted = self.fitted

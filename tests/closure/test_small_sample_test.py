@@ -127,6 +127,24 @@ def test_an_asymmetry_of_viscous_friction_is_found_in_sixteen_runs_without_repea
     assert sum(found) >= 3
 
 
+@pytest.mark.parametrize("seed", [2, 5])
+def test_one_wrong_file_is_no_change_of_v_s_with_the_order_of_the_runs(seed):
+    """Both directions of its condition and speed are then off, and a curve of the run order meets them."""
+    bins = make_bins(
+        seed, days=(2.0, 8.0, 16.0), speeds=(1.0, 4.0, 15.0, 60.0), directions=(1, -1), repeats=1, bins=6,
+        gain=0.001, noise_N=0.05,
+    )  # fmt: skip
+    files = bins["file"].unique()
+    order = np.random.default_rng(seed).permutation(files.size) + 1.0
+    order = bins["file"].map(dict(zip(files, order, strict=True)))
+    wrong = (bins["aging_days"] == 8.0) & (bins["temperature_C"] == 60.0) & (bins["speed_mm_s"] == 15.0)
+    bins = bins.assign(run_order=order, elapsed_h=0.1 * order)
+    bins["force_N"] *= np.where(wrong, 0.85, 1.0)
+    rows = make_rows(bins, has_aging=True)
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    assert min(c.p_value for c in found) > 0.1
+
+
 def test_the_scatter_of_runs_is_its_own_where_each_run_is_a_file():
     units = ClusterTests(fit_declared(rows_of(setup=0.02)), "run")
     assert units.numbers(("mu", "multiply")).known < 1
