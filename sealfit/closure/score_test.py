@@ -144,27 +144,36 @@ class ScoreTests:
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
         """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
 
-        The first variant is projected. If the scatter of specimens is not known, the second is also projected
-        off the specimens' own columns: a channel that varies between runs would explain that scatter.
+        The first variant is projected. If the scatter of specimens is not known, another is also projected
+        off the specimens' own columns: a channel that varies between runs would explain that scatter. The
+        same holds for a few runs, or set-ups, and a channel that varies between files.
         """
         left = project(self.fitted, columns)
-        if self._specimens is None or FINER[unit] >= FINER["specimen"]:
-            return (left,)
-        own, basis = self._specimens
-        return left, _distinct(basis.project_out(own.project_out(left)), left)
+        levels = [name for name in self._of_unknown_scatter if FINER[unit] < FINER[name]]
+        found = [left]
+        for own, basis in map(self._own_columns, levels):
+            found.append(_distinct(basis.project_out(own.project_out(left)), left))
+        return tuple(found)
 
     @cached_property
-    def _specimens(self) -> tuple[OwnColumns, Tangent] | None:
-        """The specimens' own columns and the tangent space off them; None if their scatter is known."""
-        rows = self.fitted.rows
-        starts = rows.groups.starts
-        if self.fitted.scatter.estimates("specimen") or not 1 < starts["specimen"].size < starts["run"].size:
-            return None
-        white, basis = self.fitted.whitening(self.fitted.friction[:, None])[:, 0], self.fitted.basis
-        size = rows.groups.sums(white**2, "specimen")
-        taken = (basis.sums(rows.groups, "specimen", white).values ** 2).sum(axis=1)
+    def _of_unknown_scatter(self) -> list[str]:
+        """The levels whose groups scatter by an unknown amount."""
+        files, runs, specimens = (
+            self.fitted.rows.groups.starts[name].size for name in ("file", "run", "specimen")
+        )
+        few_runs = 1 < runs < min(files, criteria.LEAST_UNITS_OF_SLOPES)
+        unknown = not self.fitted.scatter.estimates("specimen") and 1 < specimens < runs
+        return [*(["run"] if few_runs else []), *(["specimen"] if unknown else [])]
+
+    @cached
+    def _own_columns(self, level: str) -> tuple[OwnColumns, Tangent]:
+        """Return the own columns of the groups of a level, and the tangent space off them."""
+        rows, basis = self.fitted.rows, self.fitted.basis
+        white = self.fitted.whitening(self.fitted.friction[:, None])[:, 0]
+        size = rows.groups.sums(white**2, level)
+        taken = (basis.sums(rows.groups, level, white).values ** 2).sum(axis=1)
         identifiable = size - taken >= criteria.IDENTIFIABLE * size
-        own = OwnColumns(rows.codes("specimen"), white * identifiable[rows.codes("specimen")])
+        own = OwnColumns(rows.codes(level), white * identifiable[rows.codes(level)])
         return own, basis.orthonormal(RANK, project_out=own.project_out)
 
     def __call__(

@@ -52,6 +52,29 @@ def test_with_another_specimen_for_every_repeat_a_change_in_common_is_their_scat
     assert with_set_ups(others)[SET_UP].nunique() == 3
 
 
+def test_repeats_of_one_specimen_may_be_set_ups_only_where_they_were_recorded_one_after_the_other():
+    bins = mounted_anew(1, days=(8.0,))
+    one = bins[bins["aging_days"] == 8.0]
+    found = with_set_ups(one)
+    assert found.groupby("repeat")[SET_UP].nunique().eq(1).all()
+    assert found[SET_UP].nunique() == 3
+    in_turn = one.sort_values(["run_id", "repeat"], kind="stable")
+    in_turn = in_turn.assign(run_order=pd.factorize(in_turn["file"])[0] + 1.0)
+    assert SET_UP not in with_set_ups(in_turn)
+
+
+def test_nothing_is_claimed_between_two_set_ups_of_one_specimen():
+    rng = np.random.default_rng(0)
+    for seed in range(4):
+        bins = mounted_anew(seed, sd=0.0, days=(8.0,), repeats=2, gain=0.001)
+        bins["force_N"] *= np.where(bins["repeat"] == 2, 1.03, 1.0)
+        bins = with_set_ups(bins[bins["aging_days"] == 8.0])
+        assert bins[SET_UP].nunique() == 2
+        rows = make_rows(bins, has_aging=False)
+        found = search(ScoreTests(fit_declared(rows)), find_channels(rows), rng)
+        assert not [c for c in found if c.p_value < 0.005 and c.claimable]
+
+
 @pytest.mark.parametrize("jitter", [0.0, 1e-6])
 def test_forces_that_are_the_same_to_the_last_digits_show_no_set_ups(jitter):
     bins = make_bins(1, noise_N=0.0, gain=0.0, **SMALL)

@@ -30,15 +30,16 @@ def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
 
     The logarithms of the files' mean forces are fitted by an effect of each run and one of each repeat. If
     set-ups, of a specimen and a repeat, explain more by F, they scatter. A change with the repeat that all
-    specimens have in common is none of set-ups, unless each repeat is another specimen. Nor is what a few
-    specimens show: an effect that begins or ends while they are measured.
+    specimens have in common is none of set-ups, unless each repeat is another specimen, or there is one
+    specimen whose repeats were recorded one after the other: it may have been mounted anew between them. Nor
+    is what a few specimens show: an effect that begins or ends while they are measured.
     """
     record = records(bins)
     strokes = pd.DataFrame({"run": nesting_run(bins, record), "specimen": bins["specimen_id"].astype(str)})
     strokes = strokes.assign(repeat=bins["repeat"].astype(str), force=bins["force_N"].abs())
-    files = strokes.groupby(record, sort=True).agg(
-        {"run": "first", "specimen": "first", "repeat": "first", "force": "mean"}
-    )
+    strokes = strokes.assign(order=bins["run_order"]) if "run_order" in bins else strokes.assign(order=0.0)
+    firsts = dict.fromkeys(("run", "specimen", "repeat", "order"), "first")
+    files = strokes.groupby(record, sort=True).agg({**firsts, "force": "mean"})
     files["set_up"] = files["specimen"] + " repeat " + files["repeat"]
     p_value, shown = _p_value(files)
     if p_value >= SET_UP_P:
@@ -52,7 +53,8 @@ def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
 def _p_value(files: pd.DataFrame) -> tuple[float, pd.Series]:
     """Return the p-value of set-ups, 1 for a negligible scatter, and what they explain in each specimen."""
     known = [files["run"]]
-    if files.groupby("run")["specimen"].nunique().max() == 1:
+    alike = files.groupby("run")["specimen"].nunique().max() == 1
+    if alike and not (files["specimen"].nunique() == 1 and _one_after_the_other(files)):
         known.append(files["repeat"])
     force = np.log(np.maximum(files["force"].to_numpy(), 1e-300))
     (before, few), (after, many) = _fitted(force, known), _fitted(force, [files["run"], files["set_up"]])
@@ -64,6 +66,12 @@ def _p_value(files: pd.DataFrame) -> tuple[float, pd.Series]:
     if explained <= LEAST_SET_UP**2:
         return 1.0, shown
     return float(fdtrc(added, many, explained / max(noise, 1e-300))), shown
+
+
+def _one_after_the_other(files: pd.DataFrame) -> bool:
+    """Return whether all files of a repeat were recorded before those of the next."""
+    in_order = files.sort_values("order")["repeat"]
+    return bool(files["order"].nunique() > 1 and (in_order != in_order.shift()).sum() == in_order.nunique())
 
 
 def _fitted(values: np.ndarray, factors: Sequence[pd.Series]) -> tuple[np.ndarray, int]:
