@@ -174,6 +174,7 @@ def targets(effects: list[dict], rows: Rows) -> list[Target]:
         levels = {e["level"], *([CLAIM_LEVEL[min(alone, key=order.index)]] if alone else [])}
         if not names:  # a plain change in one place: wherever that place is known
             levels |= {CLAIM_LEVEL[unit_of(_set(rows, n), units)] for n in e["place"]}
+            levels |= {"run"} if "elapsed_h" in e["place"] else set()  # though it may begin within a run
         added = (e["acts_on"], e["operation"]) == ("force", "add")
         if both_ways and (added or "direction" in e["variables"]):
             levels.add("stroke")  # it shows between the strokes of a file

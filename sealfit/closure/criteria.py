@@ -11,6 +11,7 @@ FINE_UNITS = 50  # Number of units from which the finer shape is tested.
 LEAST_BESIDE_STEP = 4  # Fewest units on either side of a step in time. With fewer, outliers would do.
 MOST_STEPS = 40  # Largest number of places at which a step is tested.
 MOST_ENDS = 20  # Largest number of places at which a change that lasts for a while may begin or end.
+MOST_BLOCKS = 400  # Largest number of blocks of time of which the best place, or pair of places, is found.
 # Share of strokes that end before the friction is steady from which effects along strokes are not searched.
 # In 68 worlds drawn at random with strokes of three to five bristle lengths no effect along the strokes was
 # found except ripples, and in eight one was invented or the verdict was `unexplained`.

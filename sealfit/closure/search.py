@@ -50,6 +50,8 @@ def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Genera
     found = adjust_all(tests, lasting, rng) if lasting else []
     for c in adjust_all(tests, temporary, rng) if temporary else []:
         found.append(replace(c, p_value=min(1.0, criteria.TEMPORARY_FACTOR * c.p_value)))
+    for channel in (c for c in channels if c.name == "elapsed_h"):
+        found += _at_best_places(tests, channel, rng)
     return sorted(found, key=lambda c: -c.evidence)
 
 
@@ -89,6 +91,61 @@ def _each_column(tests: ScoreTests, channel: Channel, shapes: np.ndarray) -> Ite
         parts = [slice(k, k + 1) for k in range(shapes.shape[1])]
         for candidate in _shape_candidates(tests, channel, shapes, MAIN_TARGETS, parts):
             yield replace(candidate, place=True)
+
+
+def _at_best_places(tests: ScoreTests, channel: Channel, rng: np.random.Generator) -> Iterator[Candidate]:
+    """Yield for each target the step and the change that lasts for a while that explain most, if certain.
+
+    They begin and end between any two files. `steps` and `intervals` are few, and lie between runs: what is
+    large beside the scatter of repeats, and begins within a run, is not seen by them. P-values are multiplied
+    by the number of places (Bonferroni). Those above `WEAK_P` are left to the few places.
+    """
+    rows = tests.fitted.rows
+    time = rows.values(channel.name)[rows.groups.starts["file"]]
+    times, block = np.unique(time, return_inverse=True)
+    block = block * min(times.size, criteria.MOST_BLOCKS) // times.size
+    files, block = np.bincount(block), block[rows.codes("file")]
+    channel = replace(channel, values=time[rows.codes("file")], unit="file")
+    for target in MAIN_TARGETS:
+        for ends, places in _best_places(tests.fitted, block, files, target):
+            shape = ((block >= ends[0]) & (block < ends[1])).astype(float)[:, None]
+            for candidate in _shape_candidates(tests, channel, shape - shape.mean(), [target]):
+                alone = adjust_all(tests, [candidate], rng)[0]
+                p_value = criteria.TEMPORARY_FACTOR * len(MAIN_TARGETS) * places * alone.p_value
+                if p_value <= criteria.WEAK_P:
+                    temporary = ends[1] < files.size
+                    yield replace(candidate, place=True, temporary=temporary, p_value=p_value)
+
+
+def _best_places(
+    fitted: Fitted, block: np.ndarray, files: np.ndarray, target: tuple[str, str]
+) -> Iterator[tuple[tuple[int, int], int]]:
+    """Yield the first and last place of the best step and change, and the number of places compared.
+
+    `block` is the block of time of each row, shape (n,), `files` the number of files in each block.
+    """
+    columns = np.zeros((block.size, files.size))
+    columns[np.arange(block.size), block] = fitted.slope(*target)
+    white = fitted.whitening(columns)
+    left = fitted.basis.project_out(white)
+    first, last = np.triu_indices(files.size + 1, 1)
+    inside = np.r_[0, files.cumsum()]
+    inside = inside[last] - inside[first]
+    whole, size = (_interval_sums(m.T @ m, first, last) for m in (white, left))
+    score = np.r_[0.0, np.cumsum(left.T @ fitted.white_residual)]
+    usable = np.minimum(inside, files.sum() - inside) >= criteria.LEAST_BESIDE_STEP
+    usable &= size > criteria.IDENTIFIABLE * whole
+    explained = np.where(usable, (score[last] - score[first]) ** 2 / np.where(usable, size, 1.0), 0.0)
+    for kind in ((first > 0) & (last == files.size), (first > 0) & (last < files.size)):
+        if (usable & kind).any():
+            k = np.argmax(np.where(kind, explained, -1.0))
+            yield (int(first[k]), int(last[k])), int((usable & kind).sum())
+
+
+def _interval_sums(squares: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Return the sums of the square blocks of a matrix from `first` to before `last`, shape of both."""
+    sums = np.pad(squares.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    return sums[last, last] - sums[first, last] - sums[last, first] + sums[first, first]
 
 
 def _shape_candidates(

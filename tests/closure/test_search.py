@@ -1,4 +1,5 @@
 import numpy as np
+import pandas as pd
 import pytest
 from bins_helpers import LOAD_N, TRUE, make_bins
 
@@ -359,6 +360,23 @@ def test_a_change_of_one_week_is_found_where_each_file_is_a_piece_of_its_own(mor
     assert values["A"] == pytest.approx(more, rel=0.25)
     assert hours[hours < 168].max() < values["t_1"] < hours[week].min()
     assert hours[week].max() < values["t_2"] < hours[hours > 336].min()
+
+
+def test_a_change_that_begins_within_a_run_is_found_at_its_file():
+    """Repeats agree to 0.1 %. At any place between runs the change leaves a scatter that hides it."""
+    bins = make_bins(2, temperatures=(60.0,), days=(2.0, 8.0), repeats=3, bins=6, gain=0.001, noise_N=0.05)
+    files = pd.factorize(bins["file"])[0]
+    changed = (files >= 37) & (files < 61)  # 37 is the second repeat of a run
+    bins["force_N"] *= np.where(changed, 1.07, 1.0)
+    rows = make_rows(bins, has_aging=True)
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    best = found[0]
+    assert best.channels == ("elapsed_h",)
+    assert best.temporary
+    assert best.p_value < 1e-9
+    hours, inside = rows.values("elapsed_h"), best.columns[:, 0] > 0
+    assert hours[inside].min() == pytest.approx(bins["elapsed_h"][changed].min())
+    assert hours[inside].max() == pytest.approx(bins["elapsed_h"][changed].max())
 
 
 def test_a_step_in_time_is_found_in_a_few_files_that_repeat_well():
