@@ -150,17 +150,14 @@ class ScoreTests:
         """
         left = project(self.fitted, columns)
         levels = [name for name in self._of_unknown_scatter if FINER[unit] < FINER[name]]
-        found = [left]
-        for own, basis in map(self._own_columns, levels):
-            found.append(_distinct(basis.project_out(own.project_out(left)), left))
-        return tuple(found)
+        own = map(self._own_columns, levels)
+        return left, *(_distinct(basis.project_out(c.project_out(left)), left) for c, basis in own)
 
     @cached_property
     def _of_unknown_scatter(self) -> list[str]:
         """The levels whose groups scatter by an unknown amount."""
-        files, runs, specimens = (
-            self.fitted.rows.groups.starts[name].size for name in ("file", "run", "specimen")
-        )
+        starts = self.fitted.rows.groups.starts
+        files, runs, specimens = (starts[name].size for name in ("file", "run", "specimen"))
         few_runs = 1 < runs < min(files, criteria.LEAST_UNITS_OF_SLOPES)
         unknown = not self.fitted.scatter.estimates("specimen") and 1 < specimens < runs
         return [*(["run"] if few_runs else []), *(["specimen"] if unknown else [])]

@@ -37,7 +37,7 @@ def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
     record = records(bins)
     strokes = pd.DataFrame({"run": nesting_run(bins, record), "specimen": bins["specimen_id"].astype(str)})
     strokes = strokes.assign(repeat=bins["repeat"].astype(str), force=bins["force_N"].abs())
-    strokes = strokes.assign(order=bins["run_order"]) if "run_order" in bins else strokes.assign(order=0.0)
+    strokes = strokes.assign(order=bins.get("run_order", 0.0))
     firsts = dict.fromkeys(("run", "specimen", "repeat", "order"), "first")
     files = strokes.groupby(record, sort=True).agg({**firsts, "force": "mean"})
     files["set_up"] = files["specimen"] + " repeat " + files["repeat"]
