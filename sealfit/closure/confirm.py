@@ -31,10 +31,11 @@ LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 
 TOO_FINE = "it is smaller than the resolution of the recorded force"
 TOO_SMALL = f"it is less than {criteria.LEAST_SIZE:.2%} of the force"
+OF_THE_RISE = f"it is less than {criteria.RISE_ERROR:.0%} of the pre-sliding rise subtracted along strokes"
 NO_GAIN = f"it lowers the error on held-out data by less than {criteria.LEAST_GAIN:.2%} of the force"
 NOT_HELD_OUT = "no rows can be held out to confirm it: repeat the runs"
 # Reasons of a refusal after which nothing is left to explain: the effect is too small to matter.
-NEGLIGIBLE = (TOO_FINE, TOO_SMALL, NO_GAIN)
+NEGLIGIBLE = (TOO_FINE, TOO_SMALL, OF_THE_RISE, NO_GAIN)
 NEGATIVE = "it multiplies a quantity by a negative number"
 WHOLE = ("mu", "force")  # Targets that are the whole friction.
 
@@ -260,12 +261,10 @@ def confirmed(
 
 def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame) -> str | None:
     """Return the reason why a proposal is refused; None if it is confirmed."""
-    force = float(np.sqrt(np.mean(fitted.rows.force**2)))
-    size = float(np.sqrt(np.mean(added_force(proposal) ** 2)))
-    if size <= rounding_error_N(samples):
-        return TOO_FINE
-    if size <= criteria.LEAST_SIZE * force:
-        return TOO_SMALL
+    rows, added = fitted.rows, added_force(proposal)
+    force, size = (float(np.sqrt(np.mean(own**2))) for own in (rows.force, added))
+    if reason := _reason_too_small(proposal, added, rows, samples):
+        return reason
     if not gain.known:
         return NOT_HELD_OUT
     if not gain.real:
@@ -273,12 +272,26 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
         return NO_GAIN if small else "it does not lower the error on held-out data"
     if gain.rmse_N < criteria.LEAST_GAIN * force and not proposal.term.effect.periodic:
         return NO_GAIN
-    if reason := _reason_of_weak_evidence(proposal, gain, fitted.rows):
+    if reason := _reason_of_weak_evidence(proposal, gain, rows):
         return reason
     if not all(g.real for g in gain_between_settings(fitted, proposal)):
         return "it does not predict held-out settings between those it was fitted to"
     if not proposal.term.effect.periodic and vague_between_speeds(fitted, proposal):
         return "with it the force between the tested speeds is less certain than the error that it removes"
+    return None
+
+
+def _reason_too_small(proposal: Proposal, added: np.ndarray, rows: Rows, samples: pd.DataFrame) -> str | None:
+    """Return the reason why the force that a proposal adds, shape (n,), is too small to matter, or None."""
+    size = np.sqrt(np.mean(added**2))
+    if size <= rounding_error_N(samples):
+        return TOO_FINE
+    if size <= criteria.LEAST_SIZE * np.sqrt(np.mean(rows.force**2)):
+        return TOO_SMALL
+    along_strokes = any(follows_strokes(name, rows) for name in proposal.term.channels)
+    least = error_of_rise_N(rows) if along_strokes and not proposal.term.effect.periodic else 0.0
+    if least and np.sqrt(np.mean(about_means(added, rows, "stroke") ** 2)) <= least:
+        return OF_THE_RISE
     return None
 
 
@@ -331,6 +344,14 @@ def added_force(proposal: Proposal) -> np.ndarray:
     fitted = proposal.fitted
     without = fitted.model.without_term(len(fitted.model.terms) - 1)
     return fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]
+
+
+def error_of_rise_N(rows: Rows) -> float:
+    """Return the RMS change along strokes that an error of the subtracted pre-sliding rise may make."""
+    if "presliding_N" not in rows.table:
+        return 0.0
+    subtracted = rows.table["presliding_N"].to_numpy(dtype=float)
+    return criteria.RISE_ERROR * float(np.sqrt(np.mean(about_means(subtracted, rows, "stroke") ** 2)))
 
 
 def rounding_error_N(samples: pd.DataFrame) -> float:

@@ -17,7 +17,7 @@ from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri, stdtrit
 
 from sealfit.closure import criteria
 from sealfit.closure.channels import FINER, Channel, scatter_level, too_short
-from sealfit.closure.confirm import about_means
+from sealfit.closure.confirm import about_means, error_of_rise_N
 from sealfit.closure.multiplicity import critical_many, critical_small_sample
 from sealfit.closure.score_test import Candidate, ScoreTests, project
 from sealfit.closure.selection import Selection
@@ -82,8 +82,9 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
                 times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
-                stated = float(max(TO_BE_ADDED * times, criteria.SIZE_MARGIN * criteria.LEAST_SIZE))
-                smallest = force * stated if stated < 1 else None
+                rise = error_of_rise_N(rows) / force if level == "sample" else 0.0
+                stated = max(TO_BE_ADDED * times, criteria.SIZE_MARGIN * max(criteria.LEAST_SIZE, rise))
+                smallest = float(force * stated) if stated < 1 else None
             if smallest is not None:
                 needed = int(np.ceil(files * (100 * smallest / force / WANTED_PCT) ** 2))
             elif name in in_model:

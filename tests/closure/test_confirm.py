@@ -8,10 +8,12 @@ from bins_helpers import make_bins
 
 from sealfit.closure.confirm import (
     NEGATIVE,
+    OF_THE_RISE,
     Context,
     Gain,
     about_means,
     confirmed,
+    error_of_rise_N,
     gain_between_settings,
     heldout_gain,
     rounding_error_N,
@@ -19,6 +21,7 @@ from sealfit.closure.confirm import (
     vague_between_speeds,
     varies_within,
 )
+from sealfit.closure.criteria import RISE_ERROR
 from sealfit.closure.left_out import between_speeds, blocks
 from sealfit.closure.linearised import Proposal
 from sealfit.config import Config, Loop
@@ -149,7 +152,15 @@ def decide(monkeypatch):
     """Decide on proposals with given gains: held out by groups and by settings, and the force they add."""
 
     def decided(
-        proposals, gains, settings=(), added=1.0, samples=SAMPLES, vague=False, negative=False, **more
+        proposals,
+        gains,
+        settings=(),
+        added=1.0,
+        samples=SAMPLES,
+        vague=False,
+        negative=False,
+        rise=0.0,
+        **more,
     ):
         held = dict(zip(map(id, proposals), gains, strict=True))
         monkeypatch.setattr("sealfit.closure.confirm.heldout_gain", lambda before, p, *args: held[id(p)])
@@ -157,6 +168,8 @@ def decide(monkeypatch):
         monkeypatch.setattr("sealfit.closure.confirm.vague_between_speeds", lambda *args: vague)
         monkeypatch.setattr("sealfit.closure.confirm.turns_negative", lambda fitted: negative)
         monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
+        monkeypatch.setattr("sealfit.closure.confirm.error_of_rise_N", lambda rows: rise)
+        monkeypatch.setattr("sealfit.closure.confirm.about_means", lambda values, rows, level: values)
         monkeypatch.setattr("sealfit.closure.confirm.follows_strokes", lambda name, rows: name == "time_s")
         monkeypatch.setattr(
             "sealfit.closure.confirm.rivals", lambda chosen, found: [p for p in found if p != chosen]
@@ -229,6 +242,23 @@ def test_what_is_not_significant_is_not_said_to_be_refused(decide):
     found, refused, _ = decide([proposal(p_value=0.006)], [Gain(-1.0, 2.0, -1.0)])
     assert found is None
     assert refused == []
+
+
+@pytest.mark.parametrize(
+    ("channel", "rise", "refused"), [("time_s", 1.1, True), ("time_s", 0.9, False), ("run_order", 1.1, False)]
+)
+def test_what_may_be_an_error_of_the_subtracted_rise_is_refused(decide, channel, rise, refused):
+    found, reasons, _ = decide([proposal(channels=(channel,))], [GOOD], rise=rise)
+    assert (found is None) == refused
+    assert [r.reason for r in reasons] == [OF_THE_RISE] * refused
+    assert all(r.negligible for r in reasons)
+
+
+def test_the_error_of_the_rise_is_a_share_of_what_was_subtracted_along_strokes():
+    bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=4)
+    assert error_of_rise_N(make_rows(bins, has_aging=True)) == 0.0
+    bins["presliding_N"] = np.tile([2.0, 1.0, 0.0, 1.0], len(bins) // 4)
+    assert error_of_rise_N(make_rows(bins, has_aging=True)) == pytest.approx(RISE_ERROR * np.sqrt(0.5))
 
 
 STEPS = pd.DataFrame({"force_N": np.repeat([10.0, 10.1, 10.2], 40), "stroke_id": np.repeat([0, 1, 2], 40)})
