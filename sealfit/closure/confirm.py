@@ -262,7 +262,7 @@ def confirmed(
 def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame) -> str | None:
     """Return the reason why a proposal is refused; None if it is confirmed."""
     rows, added = fitted.rows, added_force(proposal)
-    force, size = (float(np.sqrt(np.mean(own**2))) for own in (rows.force, added))
+    force, size = _rms(rows.force), _rms(added)
     if reason := _reason_too_small(proposal, added, rows, samples):
         return reason
     if not gain.known:
@@ -283,14 +283,13 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
 
 def _reason_too_small(proposal: Proposal, added: np.ndarray, rows: Rows, samples: pd.DataFrame) -> str | None:
     """Return the reason why the force that a proposal adds, shape (n,), is too small to matter, or None."""
-    size = np.sqrt(np.mean(added**2))
-    if size <= rounding_error_N(samples):
+    if _rms(added) <= rounding_error_N(samples):
         return TOO_FINE
-    if size <= criteria.LEAST_SIZE * np.sqrt(np.mean(rows.force**2)):
+    if _rms(added) <= criteria.LEAST_SIZE * _rms(rows.force):
         return TOO_SMALL
     along_strokes = any(follows_strokes(name, rows) for name in proposal.term.channels)
     least = error_of_rise_N(rows) if along_strokes and not proposal.term.effect.periodic else 0.0
-    if least and np.sqrt(np.mean(about_means(added, rows, "stroke") ** 2)) <= least:
+    if least and _rms(about_means(added, rows, "stroke")) <= least:
         return OF_THE_RISE
     return None
 
@@ -346,12 +345,16 @@ def added_force(proposal: Proposal) -> np.ndarray:
     return fitted.force - evaluate(without, fitted.rows, jacobian=False)[0]
 
 
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def error_of_rise_N(rows: Rows) -> float:
     """Return the RMS change along strokes that an error of the subtracted pre-sliding rise may make."""
     if "presliding_N" not in rows.table:
         return 0.0
     subtracted = rows.table["presliding_N"].to_numpy(dtype=float)
-    return criteria.RISE_ERROR * float(np.sqrt(np.mean(about_means(subtracted, rows, "stroke") ** 2)))
+    return criteria.RISE_ERROR * _rms(about_means(subtracted, rows, "stroke"))
 
 
 def rounding_error_N(samples: pd.DataFrame) -> float:

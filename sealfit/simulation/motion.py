@@ -116,11 +116,9 @@ def with_presliding(
     turned = np.diff(motion.direction, prepend=0) != 0
     change = np.where(turned, 0.0, np.diff(limit_N, prepend=limit_N[0]))
     begin, end = limit_N - change, limit_N - change * exprel(-slid)
-    result, force = [], 0.0
-    for first, last, decay in zip(begin.tolist(), end.tolist(), np.exp(-slid).tolist(), strict=True):
-        force = last + (force - first) * decay
-        result.append(force)
-    result = np.array(result)
+    result, force = np.empty(limit_N.size), 0.0
+    for row, decay in enumerate(np.exp(-slid)):
+        result[row] = force = end[row] + (force - begin[row]) * decay
     return result + damping_s * np.abs(motion.speed_mm_s) / rise_mm * (limit_N - result)
 
 
