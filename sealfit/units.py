@@ -68,6 +68,8 @@ class Units:
             return self.unit("time")
         if column.endswith("_N"):
             return self.unit("load" if column.startswith("load") else "force")
+        if column == "power":
+            return f"{self.unit('load')} {self.unit('speed')}"
         return next((unit for ending, unit in _ENDINGS.items() if column.endswith(ending)), "")
 
     def label(self, column: str) -> str:

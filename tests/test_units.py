@@ -20,6 +20,10 @@ def test_a_column_has_the_unit_that_the_config_declares_for_its_slot(slot, unit,
     assert f"({unit})" in Units({slot: (slot, unit)}).label(column)
 
 
+def test_the_sliding_power_has_the_unit_of_load_times_speed():
+    assert Units({"load": ("normal load", "kN"), "speed": ("speed", "m/s")}).of("power") == "kN m/s"
+
+
 def test_other_columns_keep_the_unit_of_their_name():
     declared = Units({"time": ("time", "ms")}, {"oil": "ppm"})
     assert [declared.of(name) for name in ("rest_s", "elapsed_h", "aging_days", "oil", "batch")] == [
