@@ -73,9 +73,10 @@ def contrast_test(fitted: Fitted, left: np.ndarray, level: str) -> ContrastTest 
     if not known.any():
         return None
     variance = np.maximum((deviations**2).sum(axis=0), LEAST_VARIANCE)
-    parts = (slope, variance, df, along_strokes(fitted, left))
-    agree = specimens_agree(fitted, left)[known]
-    return ContrastTest(level, *(p[known] for p in parts), deviations[:, known], agree)
+    along = along_strokes(fitted, left)
+    agree = specimens_agree(fitted, left) if along.any() else shapes_agree(fitted, left)
+    parts = (slope, variance, df, along)
+    return ContrastTest(level, *(p[known] for p in parts), deviations[:, known], agree[known])
 
 
 def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
@@ -98,19 +99,43 @@ def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     if not few_specimens(fitted):
         return found
     inside = along_strokes(fitted, left)
-    leverage, every = _slopes_of_specimens(fitted, left)
     for k in np.flatnonzero(found):
-        shown = leverage[:, k] > 0
-        own, slopes = leverage[shown, k], every[shown, k]
-        if slopes.size < 2:
-            continue
-        t = slopes.mean() / max(np.std(slopes) / np.sqrt(slopes.size - 1), 1e-300)
-        log_p = log_p_of_t(t, np.array(slopes.size - 1.0))
-        chi2 = own @ (slopes - np.average(slopes, weights=own)) ** 2
-        equal_slopes = chdtrc(slopes.size - 1, chi2) > criteria.DIFFERENT_P
-        most = criteria.CONSISTENT_P if equal_slopes or not inside[k] else criteria.CONSISTENT_P_IF_DIFFERENT
-        found[k] = log_p < np.log(most)
+        found[k] = _coefficients_agree(fitted, left[:, [k]], strict=inside[k])
     return found | (inside & (least_share(fitted, left) > criteria.LARGE_SHARE))
+
+
+def shapes_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
+    """Return the same for the columns of one shape that is not along strokes: all are true, or none."""
+    agree = not few_specimens(fitted) or _coefficients_agree(fitted, orthonormal(left, 1e-3), strict=False)
+    return np.full(left.shape[1], agree)
+
+
+def _coefficients_agree(fitted: Fitted, left: np.ndarray, *, strict: bool) -> bool:
+    r"""Return whether two to four specimens agree in their coefficients of orthonormal columns, shape (n, k).
+
+    The mean of the coefficients :math:`b_s` of S specimens is tested against their scatter,
+
+    .. math:: F = \frac{S |\bar b|^2 / k}{\sum_s |b_s - \bar b|^2 / (k (S - 1))} ,
+
+    for one column the square of Student's t. If `strict`, the level is `CONSISTENT_P_IF_DIFFERENT` where the
+    coefficients differ by more than noise. Specimens below `LEAST_LEVERAGE` are left out.
+    """
+    groups = fitted.rows.groups
+    share = np.stack([own.T @ own for own in np.split(left, groups.starts["specimen"][1:])])
+    score = groups.sums(left * fitted.white_residual[:, None], "specimen")
+    leverage = share.trace(axis1=1, axis2=2)
+    shown = leverage > criteria.LEAST_LEVERAGE * leverage.sum()
+    share, score, k = share[shown], score[shown], left.shape[1]
+    if len(share) < 2:
+        return True
+    own = np.einsum("sij,sj->si", np.linalg.pinv(share, hermitian=True), score)
+    df = k * (len(own) - 1)
+    between = float(((own - own.mean(axis=0)) ** 2).sum()) / df
+    f = len(own) * float((own.mean(axis=0) ** 2).sum()) / k / max(between, 1e-300)
+    off = own - np.linalg.solve(share.sum(axis=0), score.sum(axis=0))
+    equal = chdtrc(df, np.einsum("si,sij,sj->", off, share, off)) > criteria.DIFFERENT_P
+    most = criteria.CONSISTENT_P_IF_DIFFERENT if strict and not equal else criteria.CONSISTENT_P
+    return bool(log_p_of_f(f, k, df) < np.log(most))
 
 
 def _slopes_of_specimens(fitted: Fitted, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -189,6 +189,21 @@ def test_two_specimens_with_the_same_slope_are_too_few_to_claim_it():
     assert not any(c.claimable for c in along)
 
 
+@pytest.mark.parametrize(("of_aged", "claimed"), [(1.0, True), (0.6, True), (-1.0, False)])
+def test_a_curve_of_the_speed_is_claimed_if_two_specimens_have_the_same(of_aged, claimed):
+    def curve(table, force):
+        share = np.where(table["aging_days"] > 0, of_aged, 1.0)
+        return force * (1 + 0.06 * share * np.sin(2.5 * np.log(np.abs(table["speed_mm_s"]))))
+
+    speeds = tuple(np.geomspace(0.5, 200, 14))
+    bins = make_bins(3, days=(1.0,), temperatures=(60.0,), speeds=speeds, repeats=2, bins=4, effect=curve)
+    rows = make_rows(bins, has_aging=True)
+    assert rows.groups.starts["specimen"].size == 2
+    found = search(ScoreTests(fit_declared(rows)), find_channels(rows), np.random.default_rng(0))
+    shapes = [c for c in found if c.channels == ("speed_mm_s",) and c.columns.shape[1] > 1]
+    assert any(c.p_value < 0.005 and c.claimable for c in shapes) == claimed
+
+
 def test_what_two_specimens_show_is_a_candidate_and_the_verdict_cannot_tell():
     def slope(table, force):
         return force * (1 + 0.03 * (table["displacement_mm"].to_numpy() - 20) / 40)
