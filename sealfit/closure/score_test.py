@@ -24,6 +24,7 @@ from sealfit.closure.small_sample_test import (
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import LEVELS, Cache, cached
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
+from sealfit.fit.joint.variance_components import orthonormal
 
 # A candidate is a free shape of one channel acting on one quantity: columns c of the force. After whitening
 # and after projection on the tangent space of the current model, the score of unit u is
@@ -141,14 +142,19 @@ class ScoreTests:
         self.cluster_tests = {level: ClusterTests(fitted, level) for level in LEVELS}
         self.cache = Cache()
 
-    def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
+    def variants(
+        self, columns: np.ndarray, unit: str, beside: np.ndarray | None = None
+    ) -> tuple[np.ndarray, ...]:
         """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
 
-        The first variant is projected. If the scatter of specimens is not known, another is also projected
+        The first variant is projected, also off the columns `beside`, shape (n, m). If the scatter of specimens is not known, another is also projected
         off the specimens' own columns: a channel that varies between runs would explain that scatter. The
         same holds for a few runs, or set-ups, and a channel that varies between files.
         """
         left = project(self.fitted, columns)
+        if beside is not None:
+            other = orthonormal(project(self.fitted, beside), OWN)
+            left = _distinct(left - other @ (other.T @ left), left)
         levels = [name for name in self._of_unknown_scatter if FINER[unit] < FINER[name]]
         own = map(self._own_columns, levels)
         return left, *(_distinct(basis.project_out(c.project_out(left)), left) for c, basis in own)

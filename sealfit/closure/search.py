@@ -180,10 +180,16 @@ def _shape_candidates(
 
 
 def _tested(
-    tests: ScoreTests, whole: Candidate, parts: Sequence[slice], unit: str, between: str
+    tests: ScoreTests,
+    whole: Candidate,
+    parts: Sequence[slice],
+    unit: str,
+    between: str,
+    beside: np.ndarray | None = None,
 ) -> Iterator[Candidate]:
-    """Yield a candidate for each part of the columns of `whole` that can be tested."""
-    variants = tests.variants(whole.columns * tests.fitted.slope(*whole.target)[:, None], unit)
+    """Yield a candidate for each part of the columns of `whole` that can be tested beside other columns."""
+    slope = tests.fitted.slope(*whole.target)[:, None]
+    variants = tests.variants(whole.columns * slope, unit, None if beside is None else beside * slope)
     for part in parts:
         test_result = tests([v[:, part] for v in variants], between, whole.unit, whole.target)
         if test_result is not None:
@@ -208,7 +214,8 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool, lo
 
 # ---------------------------------------------------------------- pairs
 # Pairs of channels, for effects that are interactions, where no single channel explains the residual. The
-# columns of a pair are interaction terms only: the main effects of both channels have been tested before.
+# columns of a pair are tested beside the main effects of both channels: these have been tested before, or may
+# be the Stribeck curve that a few speeds do not determine.
 
 # The variable whose influence each coefficient describes.
 VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
@@ -271,15 +278,23 @@ def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Ca
         return []
     rows, finer = tests.fitted.rows, min(one.unit, other.unit, key=FINER.get)
     between, level = scatter_level((one, other), rows), flip_level(finer, rows)
-    shapes = np.column_stack(blocks)
+    shapes, alone = np.column_stack(blocks), np.column_stack([main_columns(one), main_columns(other)])
     ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
     parts = [slice(*place) for place in itertools.pairwise(ends)]
     found = []
     for target in MAIN_TARGETS:
         if "load_N" not in (one.name, other.name) or target[0] != "force":
             whole = Candidate((one.name, other.name), *target, level, shapes, NOT_TESTED, pair=True)
-            found += _tested(tests, whole, parts, finer, between)
+            found += _tested(tests, whole, parts, finer, between, alone)
     return found
+
+
+def main_columns(channel: Channel) -> np.ndarray:
+    """Return columns of what depends on one channel alone, shape (n, k): any of few levels, or a parabola."""
+    levels = np.unique(channel.values)
+    if levels.size <= criteria.MOST_CATEGORIES:
+        return (channel.values[:, None] == levels[1:]).astype(float)
+    return evenly(channel.values)[:, None] ** (1, 2)
 
 
 def candidate_of(term: Term, pair: Sequence[Channel], rows: Rows, p_value: float) -> Candidate:

@@ -328,7 +328,7 @@ def _margin(length: np.ndarray, quiet: np.ndarray, differs: np.ndarray, k: int, 
 def _under(fitted: Fitted, effect: np.ndarray) -> Fitted:
     """Return a fit under the scatter that is estimated with an effect added to its residual."""
     rows, loads, residual = fitted.rows, fitted.loads, fitted.residual + effect
-    scatter = estimate_scatter(rows, residual, loads, fitted.jacobian, fitted.scatter)
+    scatter = estimate_scatter(rows, residual, loads, fitted.free_jacobian, fitted.scatter)
     whitening = Whitening(scatter, loads, rows.groups)
     return replace(fitted, scatter=scatter, whitening=whitening, white_jacobian=whitening.of(fitted.jacobian))
 

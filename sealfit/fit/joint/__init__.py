@@ -83,11 +83,12 @@ class Fitted:
 
         The fit cannot follow the residual along it, so that it is no direction of the model.
         """
-        found = np.zeros(self.model.size, dtype=bool)
-        quantities = [parameter.quantity for parameter in self.model.declared.parameters]
-        zero = np.flatnonzero((np.array(quantities) == "sigma_2") & (self.model.theta == 0.0))
-        found[zero] = self.white_jacobian.against(self.white_residual)[zero] < 0
-        return found
+        return at_zero(self.model) & (self.white_jacobian.against(self.white_residual) < 0)
+
+    @property
+    def free_jacobian(self) -> Tangent:
+        """The derivatives without those of a sigma_2 that is 0: along them the fit cannot follow the scatter."""
+        return self.jacobian.columns(~at_zero(self.model))
 
     def refitted(self, model: Model) -> Fitted:
         """Return another model fitted to the same rows, to be compared: scatter and friction are the same."""
@@ -126,6 +127,14 @@ class Fitted:
         return prior.covariance_of(self.white_jacobian.gram(), prior.precision_of(self.model))
 
 
+def at_zero(model: Model) -> np.ndarray:
+    """Return whether each fitted number is a sigma_2 of 0, its lower bound, shape (p,)."""
+    quantities = [parameter.quantity for parameter in model.declared.parameters]
+    found = np.zeros(model.size, dtype=bool)
+    found[: len(quantities)] = (np.array(quantities) == "sigma_2") & (model.theta == 0.0)
+    return found
+
+
 def fit_declared(rows: Rows) -> Fitted:
     """Return the declared model fitted to `rows` ("before"); with several v_s, the better of two starts."""
     fitted = fit(start_model(rows), rows)
@@ -159,7 +168,7 @@ def fit(
     if model.terms:
         model = _searched(model, rows, scatter)
     found = _alternately(model, rows, None, centre, turns)
-    if scatter := with_curves(rows, found.residual, found.loads, found.jacobian, found.scatter):
+    if scatter := with_curves(rows, found.residual, found.loads, found.free_jacobian, found.scatter):
         other = _alternately(found.model, rows, scatter, centre, 1)
         found = min(found, other, key=lambda f: f.deviance)
     if _misses_levels(found):
@@ -173,7 +182,8 @@ def _alternately(model: Model, rows: Rows, scatter: Scatter | None, centre: np.n
     """Return the model fitted in turns with the scatter, which has the components that it starts with."""
     for _ in range(turns):
         force, jacobian = evaluate(model, rows)
-        scatter = estimate_scatter(rows, rows.force - force, loads_of(model, rows), jacobian, scatter)
+        free = jacobian.columns(~at_zero(model))
+        scatter = estimate_scatter(rows, rows.force - force, loads_of(model, rows), free, scatter)
         model = descend(with_reml_smoothness(model, rows, scatter), rows, scatter, centre)
     return fitted_at(model, rows, scatter)
 
@@ -213,7 +223,7 @@ def reestimated(fitted: Fitted, *, noise: bool = False) -> Fitted:
     to be compared share the friction, which is kept, and the row noise of the best fit.
     """
     rows, estimate = fitted.rows, estimate_scatter if noise else estimate_components
-    scatter = estimate(rows, fitted.residual, fitted.loads, fitted.jacobian, fitted.scatter)
+    scatter = estimate(rows, fitted.residual, fitted.loads, fitted.free_jacobian, fitted.scatter)
     model = with_reml_smoothness(fitted.model, rows, scatter, fitted.loads)
     model = descend(model, rows, scatter, prior.centre_of(model), fitted.loads, tolerance=COMPARED)
     return fitted_at(model, rows, scatter, fitted.loads)
