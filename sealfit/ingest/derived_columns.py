@@ -274,7 +274,7 @@ def add_runs(
     stroke = columns.get("stroke", none)
     for words, members in groups.items():
         speeds = np.array([measured[i] for i in members])
-        settings = [[members[k] for k in own] for own in of_one_speed(speeds, SAME_TESTED_SPEED)]
+        settings = [[members[k] for k in own] for own in of_one_setting(speeds, SAME_TESTED_SPEED)]
         if _there_and_back([[stroke[i] for i in own] for own in settings]):
             settings = [[i for own in settings for i in own]]
         for own in settings:
@@ -289,10 +289,10 @@ def add_runs(
     return added, [Fault("run_id_derived", reason, fix="Give run_id or speed_mm_s.", **NOTED)]
 
 
-def of_one_speed(speeds: np.ndarray, tolerance: float) -> list[np.ndarray]:
-    """Return the places of speeds, slowest first: those within a share of the next one together."""
-    order = np.argsort(speeds, kind="stable")
-    ordered = speeds[order]
+def of_one_setting(values: np.ndarray, tolerance: float) -> list[np.ndarray]:
+    """Return the places of positive values, smallest first: those within a share of the next one together."""
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
     return np.split(order, np.flatnonzero(~(ordered[1:] <= ordered[:-1] * (1.0 + tolerance))) + 1)
 
 

@@ -15,7 +15,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.averages import ALONG, FileStrokes, bin_table, mean_traces, read_strokes
 from sealfit.ingest.columns import Listing, columns_of, condition_columns, keys_of
-from sealfit.ingest.derived_columns import of_one_speed
+from sealfit.ingest.derived_columns import of_one_setting
 from sealfit.ingest.files import as_number
 from sealfit.ingest.strokes import several_speeds
 from sealfit.store import parquet
@@ -28,6 +28,9 @@ INNER = (
     "several", "several_speeds", "left", "equal", "extreme", "begins", "begins_half", "run", "sliding", "row",
     "by_itself",
 )  # fmt: skip
+# Share by which a measured load may exceed the next smaller one of its run. Settings differ by more, and
+# drift, friction of the loading device and the noise of a sensor by less.
+SAME_TESTED_LOAD = 0.1
 IN_PANDAS = {FLOAT: float, INT: np.int64, TEXT: "str", BOOL: bool}
 
 
@@ -167,7 +170,8 @@ def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, li
     """Return everything that is known of every stroke, the keys included.
 
     A run with strokes both ways is two: `<run_id>+` and `<run_id>-`. One with several steady speeds in a
-    stroke, or in a file for which none is commanded, is one for each of them: `<run_id> at 42.1`.
+    stroke, or in a file for which none is commanded, is one for each of them: `<run_id> at 42.1`. One at
+    several measured loads is one for each of these, with repeats of its own: `<run_id>, load 45`.
     """
     rows = [row for made in files for row in made.strokes]
     columns = columns_of(rows)
@@ -177,6 +181,7 @@ def stroke_columns(files: Sequence[FileStrokes], config: Config) -> dict[str, li
         return {"used": []}
     columns |= keys_of(columns, len(rows), config) | {"run": [str(name) for name in columns["run_id"]]}
     columns |= _at_speeds(columns, config.strokes.speed_tolerance)
+    columns |= _at_loads(columns)
     return columns | {"run_id": _two_runs(columns)}
 
 
@@ -195,11 +200,25 @@ def _at_speeds(strokes: Mapping[str, list], tolerance: float) -> dict[str, list]
     speed = np.abs(np.array(strokes["speed_mm_s"], float))
     for run in dict.fromkeys(names[several]):
         own = np.flatnonzero((names == run) & known)
-        for part in (own[places] for places in of_one_speed(speed[own], tolerance)):
+        for part in (own[places] for places in of_one_setting(speed[own], tolerance)):
             for i in part:
                 commanded[i] = float(f"{np.median(speed[part]):.3g}")
                 names[i] = f"{run} at {commanded[i]:g}"
     return {"run_id": names.tolist(), "speed_set_mm_s": commanded}
+
+
+def _at_loads(strokes: Mapping[str, list]) -> dict[str, list]:
+    """Return `run_id` with the load where a run was measured at several, and `repeat` counted within each."""
+    names, repeats = np.array(strokes["run_id"], object), np.array(strokes["repeat"], object)
+    loads = np.array(strokes.get("load_N", [math.nan] * len(names)), float)
+    known = np.array(strokes["used"], bool) & np.isfinite(loads)
+    for run in dict.fromkeys(names[known]):
+        own = np.flatnonzero((names == run) & known)
+        parts = [own[places] for places in of_one_setting(loads[own], SAME_TESTED_LOAD)]
+        for part in parts if len(parts) > 1 else ():
+            names[part] = f"{run}, load {np.median(loads[part]):.3g}"
+            repeats[part] = 1 + np.unique(repeats[part].astype(int), return_inverse=True)[1]
+    return {"run_id": names.tolist(), "repeat": repeats.tolist()}
 
 
 def _two_runs(strokes: Mapping[str, list]) -> list[str]:

@@ -7,13 +7,14 @@ import pandas as pd
 import pytest
 
 from sealfit.closure.left_out import between_speeds
+from sealfit.closure.ripple_selection import numbered
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import CHANNEL, TARGETS, Effect, Parameter
 from sealfit.fit.joint import _searched, fit, fit_declared
 from sealfit.fit.joint.declared import declare
 from sealfit.fit.joint.model import Model, Term, evaluate, shape_of, term_derivatives
-from sealfit.fit.joint.rows import LEVELS, Groups, Lag, make_rows, set_speeds, thin, without_noise
+from sealfit.fit.joint.rows import Lag, make_rows, set_speeds, thin, without_load_noise
 from sealfit.fit.joint.search import start_model
 from sealfit.fit.joint.variance_components import curve_components
 from sealfit.ingest.campaign import ingest_campaign
@@ -289,19 +290,19 @@ def test_noise_of_the_measured_load_does_not_turn_dry_friction_into_viscous():
     exact = bins_helpers.make_bins(4, speeds=(1.0, 4.0, 16.0, 64.0), days=(), bins=20)
     noise = 1 + 0.01 * np.random.default_rng(4).normal(size=len(exact))
     noisy = exact.assign(load_N=exact["load_N"] * noise)
-    expected, found = (fit_declared(make_rows(table, has_aging=True)) for table in (exact, noisy))
+    tables = (exact, without_load_noise(numbered(noisy)))
+    expected, found = (fit_declared(make_rows(table, has_aging=True)) for table in tables)
     se = np.sqrt(np.diag(expected.covariance))
     npt.assert_array_less(np.abs(found.model.theta - expected.model.theta), 2 * se)
 
 
 def test_a_load_that_changes_along_strokes_is_kept_and_white_noise_is_not():
-    code = np.repeat(np.arange(50), 20)
-    groups = Groups.of(dict.fromkeys(LEVELS, code))
     line = np.tile(np.linspace(-1.0, 1.0, 20), 50)
     white = np.random.default_rng(0).normal(size=1000)
-    npt.assert_allclose(without_noise(50 + line, groups), 50 + line, atol=0.03)
-    assert np.std(without_noise(50 + 0.1 * white, groups) - 50) < 0.3 * 0.1
-    npt.assert_array_equal(without_noise(np.full(1000, 50.0), groups), 50.0)
+    bins = pd.DataFrame({"stroke_id": np.repeat(np.arange(50), 20)})
+    found = [without_load_noise(bins.assign(load_N=load))["load_N"] for load in (50 + line, 50 + 0.1 * white)]
+    npt.assert_allclose(found[0], 50 + line, atol=0.03)
+    assert np.std(found[1] - 50) < 0.3 * 0.1
 
 
 def test_subset_keeps_conditions_and_fits_the_same_numbers():

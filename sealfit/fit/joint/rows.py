@@ -265,7 +265,7 @@ def make_rows(
     measured = table["speed_mm_s"].to_numpy(dtype=float)
     speed = set_speeds(measured, pd.factorize(run.iloc[order])[0])
     pace = table["speed_bin_mm_s"].to_numpy(dtype=float) if "speed_bin_mm_s" in table else measured
-    load = without_noise(table["load_N"].to_numpy(float), groups) if has_load else np.ones(len(table))
+    load = table["load_N"].to_numpy(dtype=float) if has_load else np.ones(len(table))
     return Rows(
         table=table,
         order=order,
@@ -316,20 +316,6 @@ def set_speeds(speed: np.ndarray, run: np.ndarray) -> np.ndarray:
     return np.sign(speed) * np.where(same, own.transform("mean"), size)
 
 
-def without_noise(load: np.ndarray, groups: Groups) -> np.ndarray:
-    """Return loads of rows, shape (n,), without the noise of their sensor along strokes.
-
-    Deviations from a stroke's mean are multiplied by their reliability, the share of their variance that is
-    not noise (regression calibration: Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapter
-    4). The noise is estimated from the differences of neighbours. The force does not follow it.
-    """
-    deviation = load - groups.means(load, "stroke")[groups.codes["stroke"]]
-    same = np.diff(groups.codes["stroke"]) == 0
-    spare, squares = np.count_nonzero(same), float(deviation @ deviation)
-    noise = float((np.diff(load)[same] ** 2).sum()) / 2  # as many as degrees of freedom within strokes
-    return load - deviation * min(noise / squares, 1.0) if spare and squares > 0 else load
-
-
 def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
     """Return the campaign's own numeric channels that a few files lack, with missing values filled in.
 
@@ -351,6 +337,22 @@ def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
             values = values.fillna(low.where(low == high, known.transform("mean")))
         found[name] = values.fillna(per_file.mean()).to_numpy()
     return found
+
+
+def without_load_noise(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return `bins`, numbered and in order of their strokes, with loads without the noise of their sensor.
+
+    Deviations from a stroke's mean are multiplied by their reliability, the share of their variance that is
+    not noise (regression calibration: Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapter
+    4). The noise is estimated from the differences of neighbours. The force does not follow it.
+    """
+    if "load_N" not in bins or bins["load_N"].isna().any():
+        return bins
+    load, stroke = bins["load_N"].to_numpy(dtype=float), bins["stroke_id"].to_numpy()
+    deviation = load - bins.groupby("stroke_id")["load_N"].transform("mean").to_numpy()
+    squares = float(deviation @ deviation)  # with as many degrees of freedom as there are neighbours
+    noise = float((np.diff(load)[np.diff(stroke) == 0] ** 2).sum()) / 2
+    return bins.assign(load_N=load - deviation * min(noise / squares, 1.0)) if squares > 0 else bins
 
 
 def one_load(load_N: np.ndarray | pd.Series) -> bool:
