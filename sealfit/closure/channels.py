@@ -344,3 +344,55 @@ def scaled(values: np.ndarray, *, even: bool = False) -> np.ndarray:
     if low > 0 and high / low >= WIDE and not even:
         values, low, high = np.log(values), np.log(low), np.log(high)
     return np.clip(2 * (values - low) / (high - low) - 1, -1.0, 1.0)
+
+
+# ---------------------------------------------------------------- columns of a pair
+
+# Powers of the two mapped channels in the nonlinear terms of a pair.
+BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))
+
+
+def main_columns(channel: Channel) -> np.ndarray:
+    """Return columns of what depends on one channel alone, shape (n, k): any of few levels, or a parabola."""
+    levels = np.unique(channel.values)
+    if levels.size <= criteria.MOST_CATEGORIES:
+        return (channel.values[:, None] == levels[1:]).astype(float)
+    return evenly(channel.values)[:, None] ** (1, 2)
+
+
+def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
+    """Return the interaction terms of two channels, blocks of shape (n, k) that are tested one by one.
+
+    The first are products, also of logarithms for channels with a wide range; the last is a block of
+    nonlinear terms. Two categories have none.
+    """
+    if not (one.numeric or other.numeric):
+        return []
+    if one.numeric and other.numeric:
+        products = [(u * w)[:, None] for u in _scales(one) for w in _scales(other)]
+        u, w = (_centred(evenly(channel.values)) for channel in (one, other))
+        blocks = [*products, np.column_stack([u**j * w**k for j, k in BENDS])]
+    else:
+        number, category = (one, other) if one.numeric else (other, one)
+        u = _centred(evenly(number.values))
+        levels = np.unique(category.values)
+        blocks = [(category.values[:, None] == levels[None, 1:]) * u[:, None]]
+    found = []
+    for columns in blocks:
+        size = np.sqrt((columns**2).mean(axis=0))
+        if (size > 1e-9).any():
+            found.append(columns[:, size > 1e-9] / size[size > 1e-9])
+    return found
+
+
+def _scales(channel: Channel) -> list[np.ndarray]:
+    """Return a channel, centred, and its logarithm if the range is wide (values from 0 are shifted first)."""
+    x = channel.values
+    scales = [x]
+    if x.min() >= 0 and x.max() > criteria.LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
+        scales.append(np.log(shifted_from_zero(x)))
+    return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
+
+
+def _centred(values: np.ndarray) -> np.ndarray:
+    return values - values.mean()

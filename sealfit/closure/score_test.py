@@ -147,9 +147,10 @@ class ScoreTests:
     ) -> tuple[np.ndarray, ...]:
         """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
 
-        The first variant is projected, also off the columns `beside`, shape (n, m). If the scatter of specimens is not known, another is also projected
-        off the specimens' own columns: a channel that varies between runs would explain that scatter. The
-        same holds for a few runs, or set-ups, and a channel that varies between files.
+        The first variant is projected, also off the columns `beside`, shape (n, m). If the scatter of
+        specimens is not known, another is also projected off the specimens' own columns: a channel that
+        varies between runs would explain that scatter. The same holds for a few runs, or set-ups, and a
+        channel that varies between files.
         """
         left = project(self.fitted, columns)
         if beside is not None:

@@ -13,14 +13,14 @@ from sealfit.closure import criteria
 from sealfit.closure.channels import (
     FINER,
     Channel,
-    evenly,
     flip_level,
     free_columns,
     intervals,
     kinks,
+    main_columns,
+    mixed_columns,
     run_means,
     scatter_level,
-    shifted_from_zero,
     steps,
     unit_of,
     without_trends,
@@ -221,8 +221,6 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool, lo
 VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
 # Direction has tests of its own, and the calendar interacts with nothing.
 NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
-# Powers of the two mapped channels in the nonlinear terms of a pair.
-BENDS = ((1, 1), (2, 1), (1, 2), (2, 2))
 
 
 def search_pairs(
@@ -289,57 +287,11 @@ def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Ca
     return found
 
 
-def main_columns(channel: Channel) -> np.ndarray:
-    """Return columns of what depends on one channel alone, shape (n, k): any of few levels, or a parabola."""
-    levels = np.unique(channel.values)
-    if levels.size <= criteria.MOST_CATEGORIES:
-        return (channel.values[:, None] == levels[1:]).astype(float)
-    return evenly(channel.values)[:, None] ** (1, 2)
-
-
 def candidate_of(term: Term, pair: Sequence[Channel], rows: Rows, p_value: float) -> Candidate:
     """Return a candidate of a pair of channels for a term that no test suggested, with a given p-value."""
     level = flip_level(min((c.unit for c in pair), key=FINER.get), rows)
     test = NOT_TESTED._replace(df=len(term.effect.parameters), units=rows.groups.starts[level].size)
     return Candidate(term.channels, *term.target, level, np.empty((0, 0)), test, p_value, pair=True)
-
-
-def mixed_columns(one: Channel, other: Channel) -> list[np.ndarray]:
-    """Return the interaction terms of two channels, blocks of shape (n, k) that are tested one by one.
-
-    The first are products, also of logarithms for channels with a wide range; the last is a block of
-    nonlinear terms. Two categories have none.
-    """
-    if not (one.numeric or other.numeric):
-        return []
-    if one.numeric and other.numeric:
-        products = [(u * w)[:, None] for u in _scales(one) for w in _scales(other)]
-        u, w = (_centred(evenly(channel.values)) for channel in (one, other))
-        blocks = [*products, np.column_stack([u**j * w**k for j, k in BENDS])]
-    else:
-        number, category = (one, other) if one.numeric else (other, one)
-        u = _centred(evenly(number.values))
-        levels = np.unique(category.values)
-        blocks = [(category.values[:, None] == levels[None, 1:]) * u[:, None]]
-    found = []
-    for columns in blocks:
-        size = np.sqrt((columns**2).mean(axis=0))
-        if (size > 1e-9).any():
-            found.append(columns[:, size > 1e-9] / size[size > 1e-9])
-    return found
-
-
-def _scales(channel: Channel) -> list[np.ndarray]:
-    """Return a channel, centred, and its logarithm if the range is wide (values from 0 are shifted first)."""
-    x = channel.values
-    scales = [x]
-    if x.min() >= 0 and x.max() > criteria.LOGARITHMIC_SPAN * x[x > 0].min(initial=np.inf):
-        scales.append(np.log(shifted_from_zero(x)))
-    return [_centred(x) / max(float(np.ptp(x)), 1e-300) for x in scales]
-
-
-def _centred(values: np.ndarray) -> np.ndarray:
-    return values - values.mean()
 
 
 # ---------------------------------------------------------------- masked pairs

@@ -1,13 +1,14 @@
 import numpy as np
+import pandas as pd
 import pytest
 from bins_helpers import THREE_FOLDS, make_bins, make_traces
 
-from sealfit.closure.channels import Channel, find_channels
+from sealfit.closure.channels import Channel, find_channels, mixed_columns
 from sealfit.closure.forms import terms_of
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
-from sealfit.closure.search import mixed_columns, search, search_pairs
+from sealfit.closure.search import search, search_pairs
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit_declared
@@ -111,3 +112,23 @@ def test_waves_are_forms_of_ripples_alone():
         forms = [term.effect for term, _ in terms_of(candidate, channels, fitted, EFFECTS)]
         assert forms
         assert not any(effect.periodic for effect in forms)
+
+
+def test_a_speed_that_two_settings_do_not_explain_is_no_interaction_with_the_repeat():
+    """Friction that falls between two speeds is no effect of both: the model has no curve of the speed."""
+
+    def falls(table, force):
+        return force * np.where(np.abs(table["speed_mm_s"]) > 5, 0.75, 1.0)
+
+    for seed in range(3):
+        pieces = []
+        for piece in "ABCDEF":
+            own = {"days": (), "speeds": (2.0, 10.0), "repeats": 2, "bins": 4, "specimen": 0.03}
+            one = make_bins(100 * seed + ord(piece), effect=falls, **own).assign(specimen_id=piece)
+            pieces.append(one.assign(file=piece + one["file"], run_id=piece + one["run_id"]))
+        bins = pd.concat(pieces, ignore_index=True)
+        tests = ScoreTests(fit_declared(make_rows(bins, has_aging=True)))
+        channels = find_channels(tests.fitted.rows)
+        singles = search(tests, channels, np.random.default_rng(0))
+        pairs = search_pairs(tests, channels, singles, np.random.default_rng(0))
+        assert min(c.p_value for c in (*singles, *pairs)) > 0.005

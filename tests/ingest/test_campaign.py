@@ -232,6 +232,19 @@ def test_a_load_measured_while_sliding_is_used_and_compared_with_the_declared_on
     assert "oil_C" in made.tables["traces"].columns
 
 
+def test_a_run_measured_at_several_loads_is_a_run_for_each_with_repeats_of_its_own(tmp_path):
+    rng = np.random.default_rng(0)
+    rows = []
+    for repeat, load in enumerate((20.0, 45.0, 20.5, 44.0), 1):
+        write_trace(tmp_path / f"{repeat}.csv", load_N=load + rng.normal(0, 0.1, 500))
+        rows.append(row(f"{repeat}.csv", "r", repeat))
+        del rows[-1]["load_N"]
+    write_campaign(tmp_path, rows)
+    runs = ingest_campaign(tmp_path, Config()).tables["runs"].sort_values("file")
+    assert runs["run_id"].tolist() == ["r, load 20.3", "r, load 44.5"] * 2
+    assert runs["repeat"].tolist() == [1, 1, 2, 2]
+
+
 def test_without_a_load_anywhere_it_is_null_in_every_table(tmp_path):
     write_trace(tmp_path / "1.csv")
     cells = row("1.csv", "r", 1)

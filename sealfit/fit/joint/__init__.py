@@ -87,7 +87,7 @@ class Fitted:
 
     @property
     def free_jacobian(self) -> Tangent:
-        """The derivatives without those of a sigma_2 that is 0: along them the fit cannot follow the scatter."""
+        """The derivatives without those of a sigma_2 of 0, along which the fit does not follow the data."""
         return self.jacobian.columns(~at_zero(self.model))
 
     def refitted(self, model: Model) -> Fitted:

@@ -13,8 +13,6 @@ from sealfit.fit.joint.rows import Rows
 from sealfit.ingest.strokes import speed_clusters
 
 QUANTITIES = ("mu_0s", "a_s", "b_s", "mu_0c", "a_c", "b_c", "v_s", "sigma_2")
-# Number of tested speeds that determine a Stribeck curve at these speeds, as sigma_2 >= 0.
-SPEEDS_FOR_STRIBECK = 3
 # Number of tested speeds that determine the curve, four numbers, between them as well.
 SPEEDS_BETWEEN = 4
 # Forms of the speed dependence with mu_s and v_s.
@@ -26,9 +24,9 @@ DAYS_FOR_LAW = 3
 # Standard deviation of the prior of the Stribeck drop mu_s - mu_c, as a share of friction. Without a prior
 # mu_c = 0 may fit four speeds as well as any other value, and the force between the speeds is far off.
 DROP_SHARE = 0.5
-# P-value below which a line through three speeds is rejected. Few files give the test little power. In 59
-# campaigns drawn at random with at most 27 files, 0.5 in place of 0.15 lowered the error against the truth in
-# three, 2 to 35 times, and raised it in one, by 8 %.
+# P-value below which a line through two or three speeds is rejected. Few files give the test little power. In
+# 59 campaigns drawn at random with at most 27 files and three speeds, 0.5 in place of 0.15 lowered the error
+# against the truth in three, 2 to 35 times, and raised it in one, by 8 %.
 REJECTED = 0.5
 # A residual sum of squares below this share of the total is rounding.
 ROUNDING = 1e-24
@@ -61,11 +59,11 @@ class Declared:
 def declare(rows: Rows, *, as_in: Rows | None = None) -> Declared:
     """Return the declared model that these conditions and speeds determine.
 
-    A series needs four speeds in one direction for Eq. 14, or three at which friction is not a straight line
-    ("interpolated"), and two for the viscous term. Two will do if another series of its rubber has a curve.
-    Eq. 15 needs three days, the unaged day included. Parameters that are not determined are left out. Speeds
-    are counted within one direction: an offset between directions could be taken for a Stribeck curve. The
-    result is cached. A part of a campaign with the same conditions takes the model of the campaign, `as_in`.
+    A series needs four speeds in one direction for Eq. 14, or two or three at which friction is no line that
+    rises ("interpolated"), and two for the viscous term. Few will do if another series of its rubber has a
+    curve. Eq. 15 needs three days, the unaged day included. Parameters that are not determined are left out.
+    Speeds are counted within one direction: an offset between directions could be taken for a Stribeck curve.
+    The result is cached. A part of a campaign with the same conditions takes its model, `as_in`.
     """
     return rows.cache.once(("declared",), lambda: _declare(rows) if as_in is None else declare(as_in))
 
@@ -147,10 +145,10 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
         most = max(tested_speeds(rows, chosen[way]).size for way in (forward, ~forward))
         if most >= SPEEDS_BETWEEN:
             forms[name] = "full"
-        elif most >= SPEEDS_FOR_STRIBECK and _p_of_lines(rows, chosen) < REJECTED:
-            forms[name] = "interpolated"
+        elif most < SPEEDS_FOR_VISCOUS:
+            forms[name] = "constant"
         else:
-            forms[name] = "viscous" if most >= SPEEDS_FOR_VISCOUS else "constant"
+            forms[name] = "interpolated" if _p_of_lines(rows, chosen) < REJECTED else "viscous"
     owners = list(zip(series_of, rows.conditions["rubber"], strict=True))
     curved = {rubber for name, rubber in owners if forms[name] in CURVED}
     return forms | {
@@ -159,9 +157,9 @@ def _speed_forms(rows: Rows, series_of: np.ndarray) -> dict[str, str]:
 
 
 def _p_of_lines(rows: Rows, chosen: np.ndarray) -> float:
-    """Return the p-value of F tests on file means that friction at three speeds is a line that rises.
+    """Return the p-value of F tests on file means that friction at two or three speeds is a line that rises.
 
-    A curve through three speeds leaves few degrees of freedom for other effects, so a line is kept if it is
+    A curve through so few speeds leaves few degrees of freedom for other effects, so a line is kept if it is
     not rejected. As in the declared model its slope is not negative and shared by all conditions, each of
     which has its own level. The curve adds curvature that all share, and may add a slope of each condition
     (mu_s less mu_c). Repeats may differ, each by the same in all runs: seals run in. So may the directions.
