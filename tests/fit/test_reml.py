@@ -12,6 +12,7 @@ from sealfit.fit.joint.variance_components import (
     estimate_components,
     orthonormal,
     reml,
+    usable_components,
 )
 from sealfit.fit.joint.whitening import KINDS
 
@@ -196,3 +197,9 @@ def test_a_ripple_explains_no_difference_between_files():
     )
     npt.assert_allclose(*([c.variance for c in s.components] for s in (with_waves, without)))
     assert sum(c.variance for c in without.components) > 0
+
+
+def test_runs_that_the_model_goes_through_show_no_scatter():
+    for speeds, shown in (((2.0, 6.0, 18.0, 50.0), False), ((2.0, 6.0, 12.0, 18.0, 50.0), True)):
+        rows = make_rows(make_bins(speeds=speeds, days=(), repeats=3, bins=4), has_aging=True)
+        assert ("run" in {level for level, _ in usable_components(rows)}) == shown

@@ -265,8 +265,10 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     """Return (level, kind) of the random effects that these groups distinguish, finest level first."""
     counts = {level: rows.groups.starts[level].size for level in LEVELS}
     used = ["stroke"] if counts["stroke"] > counts["file"] else []
+    # The model goes through every run if it has as many numbers: runs show no scatter then.
+    known = counts["run"] > len(declare(rows).parameters)
     for level in LEVELS[1:]:
-        if not used or 2 < counts[level] < counts[used[-1]]:
+        if not used or (2 < counts[level] < counts[used[-1]] and (known or level != "run")):
             used.append(level)
     # Specimen scatter needs replicates of a condition, or a law across conditions.
     if used[-1] == "specimen" and counts["specimen"] - declare(rows).mu_parameter_count < 2:
