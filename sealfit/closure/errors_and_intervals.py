@@ -300,7 +300,8 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
 
     The larger of two standard errors is used, by the variance components and by the sandwich of the units of
     the effect's level, as the effect may scatter between units. The place of a jump is only known to lie
-    between two neighbouring values of the channel.
+    between two neighbouring values of the channel. No interval of a nonlinear parameter but a phase leaves
+    its bounds: a time is not below 0.
     """
     term = fitted.model.terms[number]
     held = dict(term.fixed.get("held", {}))
@@ -318,6 +319,8 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
     result = {}
     for p, r in zip(term.effect.parameters, reach, strict=True):
         low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))
+        if not p.linear and p.name not in PHASES:
+            low, high = np.clip((low, high), *p.bounds)
         result[p.name] = (values[p.name], float(low), float(high))
     return normalised_waves(result)
 

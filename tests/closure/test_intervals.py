@@ -6,6 +6,7 @@ from sealfit.closure.criteria import FEW_UNITS
 from sealfit.closure.errors_and_intervals import (
     Sandwich,
     degrees_of_freedom,
+    effect_intervals,
     mean_half_width,
     normalised_waves,
     sandwiches,
@@ -113,3 +114,17 @@ def test_a_wave_of_positive_amplitude_is_the_same_wave(effect, inputs, values):
     np.testing.assert_allclose(after, before, atol=1e-12)
     assert made["A"][0] > 0
     assert all(low < value < high for value, low, high in made.values())
+
+
+def test_the_interval_of_a_time_that_rests_do_not_determine_ends_at_its_bounds():
+    def stronger(table, force):
+        return force * (1 + 0.01 * np.log1p(table["rest_s"].to_numpy() / 0.01))
+
+    rests = {"rest_s": lambda rng: float(rng.choice([1.0, 10.0, 100.0]))}
+    rows = make_rows(make_bins(2, days=(), bins=4, run_channels=rests, effect=stronger), has_aging=True)
+    effect = EFFECTS["rest_strengthening"]
+    before = fit_declared(rows)
+    term = Term(effect, ("rest_s",), "mu", "multiply")
+    fitted = fit(before.model.with_term(term, {"A": 0.01, "t_0": 0.1}), rows)
+    value, low, high = effect_intervals(fitted, 0, "run")["t_0"]
+    assert effect.parameters[1].bounds[0] <= low < value < high
