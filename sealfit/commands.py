@@ -147,7 +147,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     if goal.value is not None and goal.value <= 0 and store.state.properties is None:
         reason = f"--threshold {goal.value:g} is never reached: friction is above 0."
         raise RequestError(reason, fix="Give a positive number.")
-    laws, taken_out = _laws_of(store, asked, asked.model)
+    laws, taken_out, notes = _laws_of(store, asked, asked.model)
     place = {"temperature_C": asked.temperature_C, "compression_ratio_pct": asked.compression_ratio_pct}
     chosen, rivals = answer(laws[0], goal, years, resample=True, **place), []
     if asked.law is None:
@@ -156,6 +156,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
             chosen["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
     model = asked.model if store.state.properties is None else None  # a property has one model only
     said = {"out": str(store.out), "quantity": asked.quantity, "model": model, "effects": taken_out}
+    said["notes"] = notes
     before = None
     if taken_out:
         with suppress(RequestError):  # the declared model may have no answer where this one has
@@ -163,17 +164,22 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     return {**said, **chosen, "rivals": rivals, "before": before}
 
 
-def _laws_of(store: Store, asked: LifetimeRequest, model: str) -> "tuple[list[JointLaw], list[dict]]":
-    """Return the laws of a quantity in order of BIC, and the effects taken out of its values."""
+def _laws_of(
+    store: Store, asked: LifetimeRequest, model: str
+) -> "tuple[list[JointLaw], list[dict], list[str]]":
+    """Return the laws of a quantity by BIC, the effects taken out of its values, and remarks on these."""
     if store.state.properties is not None:
         from sealfit.fit.aging.property import laws_of_property
 
         store.require("fit-aging")
-        return laws_of_property(store.read("property_values"), asked.quantity, asked.law), []
+        return laws_of_property(store.read("property_values"), asked.quantity, asked.law), [], []
     from sealfit.fit.aging.all_series import law_of
 
-    tables, taken_out = _fits_of(store, model)
-    return law_of(*tables, asked.quantity, asked.law), taken_out
+    (steady, fits), taken_out = _fits_of(store, model)
+    own = fits["steady_fit"]
+    own = own[(own["parameter"] == asked.quantity) & own["identified"].astype(bool)]
+    notes = [text for text in own["reason"].fillna("").unique().tolist() if text]
+    return law_of(steady, fits, asked.quantity, asked.law), taken_out, notes
 
 
 def _fits_of(store: Store, model: str) -> "tuple[tuple[pd.DataFrame, SteadyFit], list[dict]]":

@@ -56,7 +56,7 @@ def desk(tmp_path_factory):
 @pytest.fixture(scope="module")
 def printed(desk):
     """What the commands of the README for one's own data print; `results` are those they make."""
-    text = (ROOT / "README.md").read_text("utf-8").split("## Your own data")[1].split("\n## ")[0]
+    text = (ROOT / "README.md").read_text("utf-8").split("## Your own data")[1].split("Two measured")[0]
     commands = re.findall(r"^    \.venv/bin/(sealfit .*)$", text, re.MULTILINE)
     (desk / "results").symlink_to(desk / "my_results")
     return {command.split()[1]: run(command, desk) for command in commands}

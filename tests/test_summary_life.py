@@ -18,8 +18,8 @@ def laws():
     return fit_laws(Aged(DAYS, value * (1 + 0.01 * np.random.default_rng(1).standard_normal(19)), CELSIUS))
 
 
-def said(laws, goal, years=None, **place):
-    part = {"quantity": "mu_s", "model": "after", "effects": []}
+def said(laws, goal, years=None, notes=(), **place):
+    part = {"quantity": "mu_s", "model": "after", "effects": [], "notes": notes}
     part |= answer(laws[0], goal, years, resample=True, **place)
     part["rivals"] = [answer(rival, goal, years, **place) for rival in rivals_of(laws)]
     if years is None:
@@ -59,3 +59,8 @@ def test_the_temperature_for_years_has_an_interval_and_is_marked_beyond_the_test
     assert "it lasts 10 years at " in text
     assert " degC, 95 % " in text
     assert "extrapolated" in text
+
+
+def test_a_remark_on_the_values_stands_above_the_life(laws):
+    text = said(laws, Goal(0.75), notes=["the mean coefficient over these speeds."], temperature_C=50.0)
+    assert "\nnote        mu_s is the mean coefficient over these speeds.\nlife " in text

@@ -60,7 +60,10 @@ def _refuse_width(row: list[str], names: list[str], **place: object) -> None:
 
 
 def _refuse_names(names: list[str], **place: object) -> None:
-    """Raise RequestError for columns that are there twice or are those of the answer."""
+    """Raise RequestError for numbers in place of names, columns there twice, or those of the answer."""
+    if names and all(_is_number(name) for name in names):
+        fix = "Put a line of column names above it."
+        raise RequestError("the first line has numbers in place of column names.", fix=fix, **place)
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled:
         raise RequestError("appears twice.", column=doubled[0], fix="Keep one of the two.", **place)
@@ -105,11 +108,16 @@ def _no_formula(cell: str) -> str:
     >>> _no_formula("=cmd()"), _no_formula("-2.5"), _no_formula("-A1"), _no_formula("oil")
     ("'=cmd()", '-2.5', "'-A1", 'oil')
     """
+    return f"'{cell}" if not _is_number(cell) and cell.lstrip().startswith(FORMULA) else cell
+
+
+def _is_number(cell: str) -> bool:
+    """Whether a cell holds a number."""
     try:
         float(cell)
     except ValueError:
-        return f"'{cell}" if cell.lstrip().startswith(FORMULA) else cell
-    return cell
+        return False
+    return True
 
 
 def write_answers(points: pd.DataFrame, answers: pd.DataFrame, output: Path, *, given: Path) -> dict:

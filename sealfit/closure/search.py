@@ -31,7 +31,7 @@ from sealfit.closure.small_sample_test import log_p_of_numbers
 from sealfit.effects.sensors import DAY_H, day_and_night
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import Term
-from sealfit.fit.joint.rows import POWER, Rows, open_columns
+from sealfit.fit.joint.rows import LEVELS, POWER, Rows, open_columns
 from sealfit.fit.joint.variance_components import orthonormal
 
 TARGETS = (
@@ -306,7 +306,8 @@ def candidate_of(term: Term, pair: Sequence[Channel], rows: Rows, p_value: float
 # tests both against the residual scatter of the units, exactly if that is normal with one variance. P-values
 # are adjusted for the number of pairs (Bonferroni). Each of the two must be significant given the other.
 
-OF_DIRECTION = (("force", "add"), ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
+OFFSET = ("force", "add")
+OF_DIRECTION = (OFFSET, ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
 LEAST_SINGULAR = 1e-3  # Two unit columns with a smaller singular value are collinear.
 
 
@@ -352,10 +353,13 @@ def _pairs(
     lines = list({c.key: c for c in reversed(lines)}.values())
     products = [c for c in straight if c.pair]
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
-        shared, units = level[id(one)] == level[id(other)], rows.groups.starts[level[id(one)]].size
+        own, others = level[id(one)], level[id(other)]
+        if one.channels[0] == other.channels[0] == "direction" and one.target == other.target == OFFSET:
+            own = others = min(own, others, key=LEVELS.index)  # specimens do not differ in a sensor's zero
+        units = rows.groups.starts[own].size
         few_units = criteria.LEAST_UNITS_OF_SLOPES <= units < criteria.JACKKNIFE_UNITS
-        if shared and few_units and _is_simple_pair(one, other, channels):
-            yield (one, other), level[id(one)]
+        if own == others and few_units and _is_simple_pair(one, other, channels):
+            yield (one, other), own
 
 
 def _is_simple_pair(line: Candidate, other: Candidate, channels: Mapping[str, Channel]) -> bool:

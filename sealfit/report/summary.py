@@ -80,7 +80,10 @@ def _rows_left_out(faults: pd.DataFrame) -> int:
 
 
 def of_fit(fit: pd.DataFrame, of: str) -> dict:
-    """Return the range of each parameter over the conditions or series of `fit` in which it is identified."""
+    """Return the range of each parameter over the conditions or series of `fit` in which it is identified.
+
+    `reason` is the most frequent one of those in which it is not, `remark` that of the others.
+    """
     rows, ranges = fit[fit["quantity"] != STATISTICS], []
     keys = ["quantity", "parameter", "unit"]
     for (quantity, parameter, unit), group in rows.groupby(keys, sort=False, dropna=False):
@@ -90,9 +93,11 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
         why = "".join(lacking["reason"].mode()[:1])  # the most frequent reason
         if lacking["reason"].nunique() > 1:
             why = f"For example, {lacking.loc[lacking['reason'] == why, of].iloc[0]}: {why}"
+        remark = "".join(group.loc[identified & (group["reason"].fillna("") != ""), "reason"].mode()[:1])
         low, high = (float(known.min()), float(known.max())) if len(known) else (None, None)
         row = {"quantity": quantity, "parameter": parameter, "unit": unit or "", "min": low, "max": high}
-        ranges.append({**row, "identified": len(known), "of": len(group), "reason": why})
+        row |= {"identified": len(known), "of": len(group), "reason": why, "remark": remark}
+        ranges.append(row)
     return {of: int(fit[of].nunique()), "parameters": ranges}
 
 

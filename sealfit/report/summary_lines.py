@@ -76,6 +76,7 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
             reasons += filter(None, [entry["reason"]])
     if texts:
         found.append(line("", " ".join([f"not identified: {', '.join(texts)}.", *reasons[:1]])))
+    found += [line("", f"{entry['parameter']}: {entry['remark']}") for entry in ranges if entry["remark"]]
     return found
 
 
@@ -284,6 +285,7 @@ def lifetime_lines(part: Mapping) -> list[str]:
     clause = lack_of_fit_clause(part["lack_of_fit_p"])
     law = f"{part['quantity']} = {part['form']}, {_change(part)}"
     found.append(line("law", f"{law}; it {clause}" if clause else law))
+    found += [line("note", f"{part['quantity']} is {note}") for note in part["notes"]]
     found.append(line("life" if "days" in part else "use", _life(part)))
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))

@@ -64,8 +64,8 @@ def verdict(closure: Mapping, config: Config) -> Markup:
         return _sentences(*said, error)
     times = Counter(effect_label(effect, config.units) for effect in added)
     labels = [label if n == 1 else f"{label} ({n} of them)" for label, n in times.items()]
-    them = "them" if len(added) > 1 else "it"
-    return _sentences(f"the declared model lacks {joined(labels)}", f"with {them}, {error}", *said)
+    what, them = ("an effect", "it") if len(added) == 1 else (f"{len(added)} effects", "them")
+    return _sentences(f"the declared model lacks {what}: {joined(labels)}", f"with {them}, {error}", *said)
 
 
 def in_words(text: str, closure: Mapping, config: Config) -> Markup:

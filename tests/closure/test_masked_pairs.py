@@ -1,6 +1,7 @@
 """Effects that mask each other in few units."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from bins_helpers import TWO_FOLDS, make_bins, make_traces
 
@@ -91,3 +92,16 @@ def test_an_offset_and_an_asymmetry_of_sigma_2_enter_together():
     bins = make_bins(0, repeats=1, effect=askew, **ONE)
     effects = close_loop(bins, make_traces(bins), TWO_FOLDS).document["effects"]
     assert {(e["id"], e["acts_on"]) for e in effects} == {("zero_offset", "force"), ("asymmetry", "sigma_2")}
+
+
+def test_a_drift_of_the_zero_is_seen_beside_its_own_mean():
+    """The mean of the drift is an offset that hides its change along the campaign, and is hidden by it."""
+    pieces = []
+    for number, piece in enumerate("ABCDE"):
+        own = make_bins(number, speeds=(4.0, 64.0), repeats=1, specimen=0.03, **ONE)
+        hours = own["elapsed_h"] + 2.0 * number
+        own = own.assign(specimen_id=piece, elapsed_h=hours, force_N=own["force_N"] + 0.15 * hours)
+        pieces.append(own.assign(file=piece + own["file"], run_id=piece + own["run_id"]))
+    found = hidden(pd.concat(pieces, ignore_index=True))
+    both = {(("direction",), "force", "add"), (("direction", "elapsed_h"), "force", "add")}
+    assert both in [set(pair.keys) for pair in found]

@@ -14,6 +14,7 @@ POINTS = "aging_days,speed_mm_s\n1,5\n4,5\n"
         (POINTS.replace(",", "|"), 1, "is not separated by commas"),
         ("\n" + POINTS + "7\n", 5, "has 1 cells, and there are 2 columns"),
         ("\na,a\n1\n", 2, "column 'a': appears twice"),
+        ("20,1.5\n20,2.5\n", 1, "numbers in place of column names"),
     ],
 )
 def test_points_that_cannot_be_read_are_refused_with_their_line(tmp_path, text, line, said):

@@ -123,7 +123,9 @@ def test_figures_are_named_for_the_store(reports):
 
 def test_the_verdict_stands_at_the_top(pages):
     text = pages["closed"].text
-    assert text.index("The declared model lacks warming by sliding") < text.index("rms error, held-out runs")
+    assert text.index("The declared model lacks an effect: warming by sliding") < text.index(
+        "rms error, held-out runs"
+    )
     assert "No effect beyond the declared model is significant" in pages["nothing_missing"].text
     assert "A significant residual remains along" in pages["unexplained"].text
 
@@ -202,7 +204,7 @@ def test_without_a_load_effects_act_on_friction_and_the_forces(unsaved):
         "sensitivity": [{**dict.fromkeys(("smallest_N", "smallest_pct", "files_needed")), **place}],
     }
     text = Page(build_report(*made.arguments).html).text
-    assert "The declared model lacks linear in dust mg." in text
+    assert "The declared model lacks an effect: linear in dust mg." in text
     assert "It scales friction and depends on dust mg" in text
     assert "linear in dust mg, factor on friction from linear in dust mg, added to F s Measure" in text
     assert "μ" not in text.split("Next runs")[0].split("Not distinguishable")[0]

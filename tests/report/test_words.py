@@ -69,8 +69,8 @@ def said(closure, config=None):
 
 def test_closed_says_which_effect_was_missing_and_the_errors():
     assert said(document()) == (
-        "The declared model lacks warming by sliding. With it, the rms error on held-out runs falls "
-        "from 1.42 N to 0.31 N (noise floor: 0.29 N). No significant residual remains. The error is 1.1 "
+        "The declared model lacks an effect: warming by sliding. With it, the rms error on held-out runs "
+        "falls from 1.42 N to 0.31 N (noise floor: 0.29 N). No significant residual remains. The error is 1.1 "
         "times the scatter of repeats (lack of fit: p = 0.0002)."
     )
 
@@ -78,14 +78,14 @@ def test_closed_says_which_effect_was_missing_and_the_errors():
 def test_candidates_are_not_among_the_effects():
     text = said(document(effects=(WARMING, RIPPLE, {**RIPPLE, "candidate": True})))
     assert text.startswith(
-        "The declared model lacks warming by sliding and ripple along displacement. With them"
+        "The declared model lacks 2 effects: warming by sliding and ripple along displacement. With them"
     )
 
 
 def test_many_effects_are_named_once_each():
     text = said(document(effects=(WARMING, RIPPLE, RIPPLE, RIPPLE)))
     assert text.startswith(
-        "The declared model lacks warming by sliding and ripple along displacement (3 of them). With "
+        "The declared model lacks 4 effects: warming by sliding and ripple along displacement (3 of them). "
     )
 
 
@@ -147,7 +147,7 @@ def test_unexplained_says_where_it_sits():
     for effects in ((), (WARMING,)):
         text = said({**document("unexplained", effects=effects, **left), "sensitivity": names})
         assert where in text
-        assert text.startswith("The declared model lacks warming") == bool(effects)
+        assert text.startswith("The declared model lacks an effect: warming") == bool(effects)
 
 
 def test_an_error_that_grows_is_not_called_falling():
