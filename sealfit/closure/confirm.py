@@ -32,10 +32,13 @@ LEAST_SETTINGS, MOST_SETTINGS = 3, 15
 TOO_FINE = "it is smaller than the resolution of the recorded force"
 TOO_SMALL = f"it is less than {criteria.LEAST_SIZE:.2%} of the force"
 OF_THE_RISE = f"it is less than {criteria.RISE_ERROR:.0%} of the pre-sliding rise subtracted along strokes"
+AT_THE_START = (
+    f"it explains the force only within {criteria.RISE_LENGTHS:g} bristle lengths of the start of the strokes"
+)
 NO_GAIN = f"it lowers the error on held-out data by less than {criteria.LEAST_GAIN:.2%} of the force"
 NOT_HELD_OUT = "no rows can be held out to confirm it: repeat the runs"
 # Reasons of a refusal after which nothing is left to explain: the effect is too small to matter.
-NEGLIGIBLE = (TOO_FINE, TOO_SMALL, OF_THE_RISE, NO_GAIN)
+NEGLIGIBLE = (TOO_FINE, TOO_SMALL, OF_THE_RISE, AT_THE_START, NO_GAIN)
 NEGATIVE = "it multiplies a quantity by a negative number"
 WHOLE = ("mu", "force")  # Targets that are the whole friction.
 
@@ -265,6 +268,8 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     force, size = _rms(rows.force), _rms(added)
     if reason := _reason_too_small(proposal, added, rows, samples):
         return reason
+    if only_at_start(fitted, proposal):
+        return AT_THE_START
     if not gain.known:
         return NOT_HELD_OUT
     if not gain.real:
@@ -355,6 +360,28 @@ def error_of_rise_N(rows: Rows) -> float:
         return 0.0
     subtracted = rows.table["presliding_N"].to_numpy(dtype=float)
     return criteria.RISE_ERROR * _rms(about_means(subtracted, rows, "stroke"))
+
+
+def only_at_start(before: Fitted, proposal: Proposal) -> bool:
+    """Whether an effect along strokes explains nothing beyond `RISE_LENGTHS` bristle lengths of their start.
+
+    It is what is left of the pre-sliding rise then. What is explained is the fall of the sum of squares about
+    the means of strokes.
+    """
+    rows = before.rows
+    along_strokes = any(follows_strokes(name, rows) for name in proposal.term.channels)
+    if not along_strokes or proposal.term.effect.periodic or not rows.lag.compliance:
+        return False
+    force = np.abs(rows.groups.means(rows.force, "stroke"))[rows.codes("stroke")]
+    beyond = rows.values("distance_mm") > criteria.RISE_LENGTHS * rows.lag.compliance * force
+    if not beyond.any():
+        return False
+    explained = []
+    for own in (np.ones_like(beyond), beyond):
+        part = rows.subset(own)
+        left = [about_means(f.residual[own], part, "stroke") for f in (before, proposal.fitted)]
+        explained.append(float(rows.weight[own] @ (left[0] ** 2 - left[1] ** 2)))
+    return explained[1] < criteria.BEYOND_START * explained[0]
 
 
 def rounding_error_N(samples: pd.DataFrame) -> float:

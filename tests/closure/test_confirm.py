@@ -7,6 +7,7 @@ import pytest
 from bins_helpers import make_bins
 
 from sealfit.closure.confirm import (
+    AT_THE_START,
     NEGATIVE,
     OF_THE_RISE,
     Context,
@@ -16,6 +17,7 @@ from sealfit.closure.confirm import (
     error_of_rise_N,
     gain_between_settings,
     heldout_gain,
+    only_at_start,
     rounding_error_N,
     turns_negative,
     vague_between_speeds,
@@ -160,6 +162,7 @@ def decide(monkeypatch):
         vague=False,
         negative=False,
         rise=0.0,
+        at_start=False,
         **more,
     ):
         held = dict(zip(map(id, proposals), gains, strict=True))
@@ -169,6 +172,7 @@ def decide(monkeypatch):
         monkeypatch.setattr("sealfit.closure.confirm.turns_negative", lambda fitted: negative)
         monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
         monkeypatch.setattr("sealfit.closure.confirm.error_of_rise_N", lambda rows: rise)
+        monkeypatch.setattr("sealfit.closure.confirm.only_at_start", lambda *args: at_start)
         monkeypatch.setattr("sealfit.closure.confirm.about_means", lambda values, rows, level: values)
         monkeypatch.setattr("sealfit.closure.confirm.follows_strokes", lambda name, rows: name == "time_s")
         monkeypatch.setattr(
@@ -252,6 +256,12 @@ def test_what_may_be_an_error_of_the_subtracted_rise_is_refused(decide, channel,
     assert (found is None) == refused
     assert [r.reason for r in reasons] == [OF_THE_RISE] * refused
     assert all(r.negligible for r in reasons)
+
+
+def test_what_is_left_of_the_rise_is_refused_and_nothing_to_explain(decide):
+    found, reasons, _ = decide([proposal(channels=("time_s",))], [GOOD], at_start=True)
+    assert found is None
+    assert [(r.reason, r.negligible) for r in reasons] == [(AT_THE_START, True)]
 
 
 def test_the_error_of_the_rise_is_a_share_of_what_was_subtracted_along_strokes():
@@ -379,3 +389,18 @@ def test_means_are_taken_in_groups_and_directions():
     values = np.array([1.0, 3.0, 5.0, 7.0, 2.0, 6.0])
     assert about_means(values, rows, "run").tolist() == [-1.0, 1.0, 0.0, 0.0, -2.0, 2.0]
     assert about_means(values, rows, None) is values
+
+
+@pytest.mark.parametrize(("s_0", "at_start"), [(1.0, True), (15.0, False)])
+def test_an_effect_within_the_first_bristle_lengths_is_what_is_left_of_the_rise(s_0, at_start):
+    def falls(table, force):
+        return force * (1 - 0.2 * -np.expm1(-table["distance_mm"].to_numpy() / s_0))
+
+    bins = make_bins(3, repeats=1, bins=40, days=(), effect=falls)
+    bins = bins.assign(rise_mm=0.03 * bins["force_N"].abs())  # bristles of one millimetre
+    rows = make_rows(bins, has_aging=True)
+    term = Term(EFFECTS["warming_distance"], ("distance_mm",), "mu", "multiply")
+    before = fit_declared(rows)
+    after = fit(before.model.with_term(term, {"A": 0.2, "s_0": s_0}), rows)
+    assert after.rmse_N < before.rmse_N
+    assert only_at_start(before, SimpleNamespace(term=term, fitted=after)) == at_start

@@ -70,8 +70,8 @@ def said(closure, config=None):
 def test_closed_says_which_effect_was_missing_and_the_errors():
     assert said(document()) == (
         "The declared model lacks an effect: warming by sliding. With it, the rms error on held-out runs "
-        "falls from 1.42 N to 0.31 N (noise floor: 0.29 N). No significant residual remains. The error is 1.1 "
-        "times the scatter of repeats (lack of fit: p = 0.0002)."
+        "falls from 1.42 N to 0.31 N (noise floor: 0.29 N). No significant residual remains. The error is "
+        "1.1 times the scatter of repeats (lack of fit: p = 0.0002)."
     )
 
 
