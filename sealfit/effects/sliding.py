@@ -223,7 +223,7 @@ def power_viscous(inputs, *, A, n):
     reads=("speed_mm_s",),
     acts_on=(("mu", "multiply"), ("mu", "add"), ("mu_c", "multiply"), ("mu_c", "add")),
     parameters=(
-        amplitude("A", "{y}", 0.1, "height of the peak", (-0.95, 10.0)),
+        amplitude("A", "{y}", 0.1, "height of the peak", (0.0, 10.0)),
         Parameter("v_p", "{x}", 10.0, (1e-6, 1e6), "speed at the peak", search="ratio"),
         Parameter("w", "decade", 1.0, (0.05, 10.0), "half-width at 1/e", search=WIDTHS),
     ),

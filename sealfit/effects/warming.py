@@ -5,7 +5,7 @@ import numpy as np
 from sealfit.effects.contract import ROOM, Parameter, amplitude, deviation, effect, factors, reference
 
 FRICTION = factors("mu", "mu_c", "mu_s", "force")
-LOST = (-5.0, 0.95)  # bounds of the share of friction that is lost
+LOST = (0.0, 0.95)  # Bounds of the share of friction that is lost. Friction that grows is no warming.
 FALL = "Fall with temperature: Grosch 1963, Proc. R. Soc. A 274, 21-39, doi:10.1098/rspa.1963.0112."
 LUMPED = "Newtonian (lumped) warming: Carslaw & Jaeger 1959, Conduction of Heat in Solids, Oxford."
 
@@ -29,8 +29,7 @@ def warming_time(inputs, *, A, tau):
 
     A body of heat capacity C that loses heat by conductance G, heated by the power P of friction, warms as
     :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. Rubber friction falls with
-    temperature above its peak (Grosch 1963), to first order in proportion. A is negative if friction rises
-    with temperature. Time is that of the stroke or the file; before 0 the contact is cold. The power is
+    temperature above its peak (Grosch 1963), to first order in proportion. Time is that of the stroke or the file; before 0 the contact is cold. The power is
     assumed to be the same in every run; in `warming_power` it is proportional to speed and load.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)

@@ -89,6 +89,13 @@ def test_nothing_warms_before_sliding_begins():
         npt.assert_array_equal(effect.shape({channel: np.array([-2.0, 0.0])}, **nonzero(effect)), [0.0, 0.0])
 
 
+@pytest.mark.parametrize("name", [*(id for id in EFFECTS if id.startswith("warming")), "grosch_peak"])
+def test_friction_that_grows_is_no_warming_and_a_valley_no_peak(name):
+    (amplitude,) = EFFECTS[name].linear
+    bounds = {p.name: p.bounds for p in EFFECTS[name].parameters}
+    assert bounds[amplitude][0] == 0.0
+
+
 def test_first_repeat_and_first_stroke_are_the_reference():
     for name, channel in (("conditioning", "repeat"), ("run_in", "stroke")):
         effect = EFFECTS[name]
