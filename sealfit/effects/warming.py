@@ -29,8 +29,9 @@ def warming_time(inputs, *, A, tau):
 
     A body of heat capacity C that loses heat by conductance G, heated by the power P of friction, warms as
     :math:`\Delta T = (P / G)(1 - e^{-t / \tau})` with :math:`\tau = C / G`. Rubber friction falls with
-    temperature above its peak (Grosch 1963), to first order in proportion. Time is that of the stroke or the file; before 0 the contact is cold. The power is
-    assumed to be the same in every run; in `warming_power` it is proportional to speed and load.
+    temperature above its peak (Grosch 1963), to first order in proportion. Time is that of the stroke or the
+    file; before 0 the contact is cold. The power is assumed to be the same in every run; in `warming_power`
+    it is proportional to speed and load.
     """
     time = np.maximum(np.asarray(inputs["time_s"], dtype=float), 0.0)
     return A * np.expm1(-time / tau)
