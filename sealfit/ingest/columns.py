@@ -275,9 +275,9 @@ def beside(name: str, taken: Collection[str]) -> str:
     return name
 
 
-def suggestion(name: str, known: Sequence[str]) -> str:
-    """Return a fix for a missing column: the nearest name, or the names that there are."""
-    if close := nearest(name, known):
+def suggestion(name: str, known: Sequence[str], *, used: Collection[str] = ()) -> str:
+    """Return a fix for a missing column: the nearest name that is not used, or the names that there are."""
+    if close := nearest(name, [other for other in known if other not in used]):
         case = " (the case of letters matters)" if close.lower() == name.lower() else ""
         return f"Did you mean {shortened(repr(close))}?{case}"
     names = ", ".join(shortened(repr(n)) for n in known if n)
@@ -353,7 +353,7 @@ def _missing(ours: str, layout: FileLayout, width: int, settings: TraceFormat) -
         return missing_column(theirs, layout, fix, reason)
     fix = "Columns without names go by position, from 1."
     if layout.names:
-        fix = suggestion(theirs, layout.names)
+        fix = suggestion(theirs, layout.names, used=list(settings.their_columns.values()))
         if ours in INSTEAD and not nearest(theirs, layout.names):
             fix += f" Name it under [trace.columns], or {INSTEAD[ours]}."
     if len(layout.names) <= 1 and layout.names_line is not None:

@@ -239,6 +239,15 @@ def test_a_file_that_cannot_be_used_is_left_out_with_a_clear_line(tmp_path, cont
     assert check in [fault.check for fault in caught.value.faults]
 
 
+def test_no_column_that_is_used_already_is_suggested(tmp_path):
+    mapped = 'force_N = "Reibkraft [N]"\nload_N = "Normalkraft [N]"\n'
+    text = f'[trace.columns]\ntime_s = "time_s"\ndisplacement_mm = "displacement_mm"\n{mapped}'
+    rows = [f"{row},1" for row in ROWS]
+    fault = refused(tmp_path, csv_of(rows, "time_s,displacement_mm,Normalkraft [N],cycle"), text)
+    assert fault.column == "Reibkraft [N]"
+    assert fault.fix.startswith("The columns are 'time_s'")
+
+
 def test_decimal_commas_everywhere_name_the_config_key(tmp_path):
     rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
     fault = refused(tmp_path, csv_of(rows, HEADER.replace(",", ";")), 'trace.delimiter = ";"')
