@@ -405,6 +405,10 @@ def condition_keys(names: Names, table: RunsTable | None, header: Collection[str
             reason = f"nothing says {' or '.join(missing)}: the same is assumed for all files."
             where = f"a {RUNS_CSV}" if table is None else table.file
             notes.doubt("condition", reason, f"Add it to {where} if it differs.")
+        if "temperature_C" in aging and "aging_days" not in given:
+            reason = "temperature_C is the temperature of aging, and nothing says the days."
+            fix = "If it is that of the tests, call it test_temperature_C in this file."
+            notes.doubt("condition", reason, fix)
         return
     own = [part.ours for part in names.parts if part.ours and part.ours not in NO_CONDITION]
     own += sorted(of_table - set(NO_CONDITION))
