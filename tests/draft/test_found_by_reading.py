@@ -217,7 +217,7 @@ def test_lines_below_the_data_that_begin_differently_are_a_doubt(tmp_path):
 
 @pytest.mark.parametrize(("aging", "asked"), [("", True), ("Aging: 4 d\n", False)])
 def test_a_temperature_without_days_may_be_that_of_the_tests(tmp_path, aging, asked):
-    files = {f"t{celsius}.csv": f"Temperature: {celsius} C\n{aging}" for celsius in (23, 70)}
+    files = {name: f"Temperature: {celsius} C\n{aging}" for name, celsius in (("a.csv", 23), ("b.csv", 70))}
     made = draft(folder(tmp_path, files))
     assert "temperature_C" in config(made).condition
     assert ("temperature_C is the temperature of aging" in doubts(made)) == asked
