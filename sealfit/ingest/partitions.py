@@ -208,12 +208,17 @@ def _at_speeds(strokes: Mapping[str, list], tolerance: float) -> dict[str, list]
 
 
 def _at_loads(strokes: Mapping[str, list]) -> dict[str, list]:
-    """Return `run_id` with the load where a run was measured at several, and `repeat` counted within each."""
+    """Return `run_id` with the load where files of a run were measured at several, and `repeat` within each.
+
+    A file has one load, the median over its strokes: loading devices have friction, and a direction.
+    """
     names, repeats = np.array(strokes["run_id"], object), np.array(strokes["repeat"], object)
-    loads = np.array(strokes.get("load_N", [math.nan] * len(names)), float)
-    known = np.array(strokes["used"], bool) & np.isfinite(loads)
-    for run in dict.fromkeys(names[known]):
-        own = np.flatnonzero((names == run) & known)
+    load = pd.Series(strokes.get("load_N", [math.nan] * len(names)), dtype=float)
+    loads = (
+        load.where(np.array(strokes["used"], bool)).groupby(strokes["file"]).transform("median").to_numpy()
+    )
+    for run in dict.fromkeys(names):
+        own = np.flatnonzero((names == run) & np.isfinite(loads))
         parts = [own[places] for places in of_one_setting(loads[own], SAME_TESTED_LOAD)]
         for part in parts if len(parts) > 1 else ():
             names[part] = f"{run}, load {np.median(loads[part]):.3g}"

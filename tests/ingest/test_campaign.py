@@ -245,6 +245,16 @@ def test_a_run_measured_at_several_loads_is_a_run_for_each_with_repeats_of_its_o
     assert runs["repeat"].tolist() == [1, 1, 2, 2]
 
 
+def test_a_load_that_differs_between_the_directions_of_a_file_makes_no_run_of_its_own(tmp_path):
+    rows = []
+    for repeat in (1, 2):
+        write_trace(tmp_path / f"{repeat}.csv", both=True, load_N=np.repeat([45.0, 55.0], [500, 499]))
+        rows.append(row(f"{repeat}.csv", "r", repeat))
+        del rows[-1]["load_N"]
+    write_campaign(tmp_path, rows)
+    assert set(ingest_campaign(tmp_path, Config()).tables["runs"]["run_id"]) == {"r+", "r-"}
+
+
 def test_without_a_load_anywhere_it_is_null_in_every_table(tmp_path):
     write_trace(tmp_path / "1.csv")
     cells = row("1.csv", "r", 1)
