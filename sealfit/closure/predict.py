@@ -31,7 +31,7 @@ from sealfit.ingest.quality import NO_VALUE
 
 BEYOND = 1e-6  # Relative tolerance of the tested range.
 FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
-NO_INTERVAL = "no interval: as many parameters in the model as runs; test repeats or more speeds"
+NO_INTERVAL = "no interval: as many parameters in the model as runs; test more speeds"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
 
