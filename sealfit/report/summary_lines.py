@@ -76,8 +76,8 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
             reasons += filter(None, [entry["reason"]])
     if texts:
         found.append(line("", " ".join([f"not identified: {', '.join(texts)}.", *reasons[:1]])))
-    found += [line("", f"{entry['parameter']}: {entry['remark']}") for entry in ranges if entry["remark"]]
-    return found
+    remarks = [f"{entry['parameter']}: {entry['remark']}" for entry in ranges if entry["remark"]]
+    return found + [line("", text) for text in dict.fromkeys(remarks)]
 
 
 def property_lines(properties: Sequence[Mapping]) -> list[str]:

@@ -1,9 +1,12 @@
+import numpy as np
 import pandas as pd
 from report.made_campaigns import aging_campaign, torque_campaign
 from report.made_tables import empty, table
 
 from sealfit.config import Config
 from sealfit.report.parameter_tables import parameter_tables
+from sealfit.report.summary import of_fit
+from sealfit.report.summary_lines import lines
 
 
 def rows_of(found, *columns):
@@ -102,3 +105,17 @@ def test_remarks_on_identified_parameters_stand_beside_them():
 
 def test_nothing_fitted_is_no_table():
     assert parameter_tables(empty("aging_fit"), "aging_fit", Config()) == []
+
+
+def test_a_remark_on_parameters_that_are_identified_stands_in_the_summary_once():
+    mean = "the mean coefficient over these speeds, which are too few for a Stribeck curve."
+    rows = [
+        ("a", "mu_c", 0.6, True, mean),
+        ("b", "mu_c", 0.5, True, mean),
+        ("a", "v_s", np.nan, False, "few"),
+    ]
+    fit = pd.DataFrame(rows, columns=["condition", "parameter", "value", "identified", "reason"])
+    part = of_fit(fit.assign(quantity="steady", unit=""), "condition")
+    found = lines({"fit_steady": part})
+    assert found[-1].strip() == f"mu_c: {mean}"
+    assert sum(mean in text for text in found) == 1
