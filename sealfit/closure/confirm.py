@@ -292,8 +292,8 @@ def _reason_too_small(proposal: Proposal, added: np.ndarray, rows: Rows, samples
         return TOO_FINE
     if _rms(added) <= criteria.LEAST_SIZE * _rms(rows.force):
         return TOO_SMALL
-    along_strokes = any(follows_strokes(name, rows) for name in proposal.term.channels)
-    least = error_of_rise_N(rows) if along_strokes and not proposal.term.effect.periodic else 0.0
+    along_strokes = acts_along_strokes(proposal, rows) and not proposal.term.effect.periodic
+    least = error_of_rise_N(rows) if along_strokes else 0.0
     if least and _rms(about_means(added, rows, "stroke")) <= least:
         return OF_THE_RISE
     return None
@@ -305,7 +305,7 @@ def _reason_of_weak_evidence(proposal: Proposal, gain: Gain, rows: Rows) -> str 
     above = "its p-value is above"
     if p_value > criteria.CURVE_P and not halved and _changes_the_curve(proposal):
         return f"{above} {criteria.CURVE_P:g}, and the scatter of such a coefficient is not known"
-    along_strokes = any(follows_strokes(name, rows) for name in proposal.term.channels)
+    along_strokes = acts_along_strokes(proposal, rows)
     if p_value > criteria.WITHIN_P and not halved and along_strokes and not proposal.term.effect.physical:
         return f"{above} {criteria.WITHIN_P:g}, and it is a shape along strokes without a mechanism"
     if proposal.weak and gain.share < criteria.LEAST_FALL:
@@ -343,6 +343,11 @@ def _changes_the_curve(proposal: Proposal) -> bool:
     return by_speed or term.acts_on not in WHOLE
 
 
+def acts_along_strokes(proposal: Proposal, rows: Rows) -> bool:
+    """Whether one of the effect's channels is the same along all strokes to a part."""
+    return any(follows_strokes(name, rows) for name in proposal.term.channels)
+
+
 def added_force(proposal: Proposal) -> np.ndarray:
     """Return what a fitted proposal adds to the force of the model without it, shape (n,)."""
     fitted = proposal.fitted
@@ -369,8 +374,8 @@ def only_at_start(before: Fitted, proposal: Proposal) -> bool:
     the means of strokes.
     """
     rows = before.rows
-    along_strokes = any(follows_strokes(name, rows) for name in proposal.term.channels)
-    if not along_strokes or proposal.term.effect.periodic or not rows.lag.compliance:
+    along_strokes = acts_along_strokes(proposal, rows) and not proposal.term.effect.periodic
+    if not along_strokes or not rows.lag.compliance:
         return False
     force = np.abs(rows.groups.means(rows.force, "stroke"))[rows.codes("stroke")]
     beyond = rows.values("distance_mm") > criteria.RISE_LENGTHS * rows.lag.compliance * force

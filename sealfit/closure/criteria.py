@@ -47,7 +47,9 @@ LEAST_UNITS_OF_SLOPES = 5  # Least number of units between which slopes are comp
 LEAST_DF = 1.5  # Least Satterthwaite degrees of freedom of a contrast. With fewer, one or two decide it.
 LARGEST_LEVERAGE = 0.98  # Largest leverage of a unit. With more, it determines the contrast alone.
 LEAST_LEVERAGE = 0.05  # Least share of the leverage with which a specimen has a slope of its own.
-CONSISTENT_P = 0.1  # Slopes of two to four specimens are consistent if Student's t has a p-value below this.
+CONSISTENT_P = (
+    0.1  # Two to four specimens agree if the mean of their coefficients has a p-value (F) below this.
+)
 CONSISTENT_P_IF_DIFFERENT = 0.005  # The same where they differ by more than noise.
 DIFFERENT_P = 0.05  # Slopes differ by more than noise if the p-value of chi-squared is below this.
 # Least effective number of specimens whose slopes along strokes may be consistent: two often are by chance.

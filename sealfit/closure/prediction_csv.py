@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from sealfit.errors import RequestError
+from sealfit.ingest.files import as_number
 from sealfit.store.paths import existing_file
 from sealfit.store.staged_writes import replace_file
 
@@ -61,7 +62,7 @@ def _refuse_width(row: list[str], names: list[str], **place: object) -> None:
 
 def _refuse_names(names: list[str], **place: object) -> None:
     """Raise RequestError for numbers in place of names, columns there twice, or those of the answer."""
-    if names and all(_is_number(name) for name in names):
+    if names and all(as_number(name) is not None for name in names):
         fix = "Put a line of column names above it."
         raise RequestError("the first line has numbers in place of column names.", fix=fix, **place)
     doubled = sorted({name for name in names if names.count(name) > 1})
@@ -108,16 +109,7 @@ def _no_formula(cell: str) -> str:
     >>> _no_formula("=cmd()"), _no_formula("-2.5"), _no_formula("-A1"), _no_formula("oil")
     ("'=cmd()", '-2.5', "'-A1", 'oil')
     """
-    return f"'{cell}" if not _is_number(cell) and cell.lstrip().startswith(FORMULA) else cell
-
-
-def _is_number(cell: str) -> bool:
-    """Whether a cell holds a number."""
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+    return f"'{cell}" if as_number(cell) is None and cell.lstrip().startswith(FORMULA) else cell
 
 
 def write_answers(points: pd.DataFrame, answers: pd.DataFrame, output: Path, *, given: Path) -> dict:

@@ -25,6 +25,7 @@ from sealfit.closure.channels import (
     unit_of,
     without_trends,
 )
+from sealfit.closure.forms import ADDED
 from sealfit.closure.multiplicity import adjust_all
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests
 from sealfit.closure.small_sample_test import log_p_of_numbers
@@ -168,7 +169,7 @@ def _shape_candidates(
         halved = channel.name == "direction" and acts_on != "force"
         own = channel.values[:, None] / 2 if halved else shapes
         unit, names = channel.unit, (channel.name,)
-        unsigned = both_ways and (acts_on, operation) == ("force", "add") and channel.name != "direction"
+        unsigned = both_ways and (acts_on, operation) == ADDED and channel.name != "direction"
         # it is seen only as a difference between directions
         if unsigned and FINER[channel.unit] > FINER["stroke"]:
             names = ("direction", channel.name)
@@ -206,7 +207,7 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool, lo
     if channel.name == "direction":
         return both_ways
     if channel.grouping or channel.added_only:
-        return both_ways and (acts_on, operation) == ("force", "add")
+        return both_ways and (acts_on, operation) == ADDED
     if channel.name == "speed_mm_s":  # mu_s, mu_c, v_s and sigma_2 describe the dependence on it
         return acts_on in (("mu", "a", "sigma_2") if loads else ("mu", "a"))
     return not (channel.name == "load_N" and acts_on == "force")
@@ -306,8 +307,7 @@ def candidate_of(term: Term, pair: Sequence[Channel], rows: Rows, p_value: float
 # tests both against the residual scatter of the units, exactly if that is normal with one variance. P-values
 # are adjusted for the number of pairs (Bonferroni). Each of the two must be significant given the other.
 
-OFFSET = ("force", "add")
-OF_DIRECTION = (OFFSET, ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
+OF_DIRECTION = (ADDED, ("mu", "multiply"), ("mu_c", "multiply"), ("sigma_2", "add"))
 LEAST_SINGULAR = 1e-3  # Two unit columns with a smaller singular value are collinear.
 
 
@@ -354,7 +354,7 @@ def _pairs(
     products = [c for c in straight if c.pair]
     for one, other in (*itertools.combinations(lines, 2), *itertools.product(lines, products)):
         own, others = level[id(one)], level[id(other)]
-        if one.channels[0] == other.channels[0] == "direction" and one.target == other.target == OFFSET:
+        if one.channels[0] == other.channels[0] == "direction" and one.target == other.target == ADDED:
             own = others = min(own, others, key=LEVELS.index)  # specimens do not differ in a sensor's zero
         units = rows.groups.starts[own].size
         few_units = criteria.LEAST_UNITS_OF_SLOPES <= units < criteria.JACKKNIFE_UNITS

@@ -18,7 +18,7 @@ from bins_helpers import (
     warm,
 )
 
-from sealfit.closure.confirm import NEGLIGIBLE, TOO_SMALL
+from sealfit.closure.confirm import NO_GAIN, TOO_SMALL
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.closure.result import BeforeAfter
@@ -82,7 +82,7 @@ def test_an_effect_too_small_to_matter_is_refused_and_leaves_nothing_missing():
     document = close(bins).document
     assert document["refused"][0]["id"] == "linear"
     assert document["refused"][0]["reason"] == TOO_SMALL
-    assert {refused["reason"] for refused in document["refused"]} <= set(NEGLIGIBLE)
+    assert {refused["reason"] for refused in document["refused"]} == {TOO_SMALL, NO_GAIN}
     assert document["verdict"] == "nothing_missing"
     assert document["left"]["channel"] is None
 
