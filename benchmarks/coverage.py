@@ -66,6 +66,15 @@ DESIGNS = {
             "noise": 0.01, "setup": 0.01, "speeds": SIX, "together": True,
         },
         "5 speeds one way, noise 4 %": {"noise": 0.04, "speeds": FIVE, "ways": (1,)},
+        "6 speeds one way, 3 conditions of 2 specimens of 4 %": {
+            "noise": 0.01, "specimen": 0.04, "specimens": 2, "speeds": SIX, "ways": (1,),
+        },
+        "6 speeds both ways, 3 conditions of 4 specimens of 3 %, set-up 1 %": {
+            "noise": 0.01, "setup": 0.01, "specimen": 0.03, "specimens": 4, "speeds": SIX,
+        },
+        "5 speeds one way, no repeats, 3 conditions of 3 specimens of 5 %": {
+            "noise": 0.01, "repeats": 1, "specimen": 0.05, "specimens": 3, "speeds": FIVE, "ways": (1,),
+        },
     },
     "aging": {
         "1 series, 7 days, repeats only": {"noise": 0.005},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pandas as pd
 
@@ -23,6 +25,7 @@ def steady_rows(
     noise=0.004,
     setup=0.0,
     specimen=0.0,
+    specimens=1,
     constant=0.0,
     load=49.03,
     ways=(1, -1),
@@ -33,7 +36,7 @@ def steady_rows(
 ):
     """Table `steady` of a campaign with known truth; noise, setup and specimen are relative, constant in N.
 
-    With `together` both directions are in one file and share its set-up and noise.
+    Each condition has `specimens`, tested at all speeds. With `together` both directions are in one file and share its set-up and noise.
     """
     rng = np.random.default_rng(seed)
     rows, drawn = [], {}
@@ -57,34 +60,35 @@ def steady_rows(
             }
             name = f"temperature_C={temperature:g}, compression_ratio_pct={compression:g}"
             condition = "unaged" if day == 0 else f"{name}, aging_days={day:g}"
-            piece = 1 + specimen * rng.normal()
-            for speed in speeds:
-                for way in ways:
-                    force = stribeck_force(way * speed, load if load else 1.0, **truth) * piece
-                    own = speed if together else way * speed
-                    sign = ("+" if way > 0 else "-") if together else ""
-                    force = force * (1 + setup * once(condition, own))
-                    for repeat in range(1, repeats + 1):
-                        rows.append(
-                            {
-                                "file": f"{condition} {own:g} {repeat}.csv",
-                                "run_id": f"{condition} {own:g}{sign}",
-                                "repeat": repeat,
-                                "stroke": 1,
-                                "direction": way,
-                                "specimen_id": condition,
-                                "condition": condition,
-                                "series": "unaged" if day == 0 else name,
-                                "rubber": "rubber",
-                                "speed_mm_s": way * speed,
-                                "speed_set_mm_s": speed if commanded else np.nan,
-                                "load_N": load if load else np.nan,
-                                "force_N": float(force) * (1 + noise * once(condition, own, repeat))
-                                + (constant * rng.normal() if constant else 0.0),
-                                "used": True,
-                                "temperature_C": temperature,
-                                "compression_ratio_pct": compression,
-                                "aging_days": float(day),
-                            }
-                        )
+            for piece, speed, way in product(range(specimens), speeds, ways):
+                own = speed if together else way * speed
+                sign = ("+" if way > 0 else "-") if together else ""
+                specimen_id = condition if specimens == 1 else f"{condition} {piece}"
+                run_id = f"{specimen_id} {own:g}"
+                force = stribeck_force(way * speed, load if load else 1.0, **truth)
+                force *= (1 + specimen * once(specimen_id)) * (1 + setup * once(run_id))
+                for repeat in range(1, repeats + 1):
+                    error = noise * once(run_id, repeat)
+                    rows.append(
+                        {
+                            "file": f"{run_id} {repeat}.csv",
+                            "run_id": f"{run_id}{sign}",
+                            "repeat": repeat,
+                            "stroke": 1,
+                            "direction": way,
+                            "specimen_id": specimen_id,
+                            "condition": condition,
+                            "series": "unaged" if day == 0 else name,
+                            "rubber": "rubber",
+                            "speed_mm_s": way * speed,
+                            "speed_set_mm_s": speed if commanded else np.nan,
+                            "load_N": load if load else np.nan,
+                            "force_N": float(force) * (1 + error)
+                            + (constant * rng.normal() if constant else 0.0),
+                            "used": True,
+                            "temperature_C": temperature,
+                            "compression_ratio_pct": compression,
+                            "aging_days": float(day),
+                        }
+                    )
     return pd.DataFrame(rows)

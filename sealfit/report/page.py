@@ -22,8 +22,14 @@ from sealfit.report.drawing import Tables, draw, inline
 from sealfit.report.figures import draw_all
 from sealfit.report.figures.residual import MOST_CHANNELS
 from sealfit.report.notation import ConditionNames, capital, channel_label, count, given, plain, true_units
-from sealfit.report.summary import of_properties
-from sealfit.report.summary_lines import LACKING, PER_SERIES, property_sentences, values_clause
+from sealfit.report.summary import of_properties, of_specimens
+from sealfit.report.summary_lines import (
+    LACKING,
+    PER_SERIES,
+    property_sentences,
+    specimens_clause,
+    values_clause,
+)
 from sealfit.tables import FITTED, SCHEMAS
 
 MOST_FINDINGS = 400  # listed in the page; quality.parquet has all
@@ -139,6 +145,7 @@ def build_report(tables: Tables, closure: Mapping | None, provenance: Mapping, c
         images=images,
         runs=Markup(runs),
         fitted=_fitted(tables, config),
+        specimens=specimens_clause(of_specimens(tables["steady_fit"])),
         **opening,
     )
     return Report(html, figures)

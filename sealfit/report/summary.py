@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 
 from sealfit.config import AGING_CONDITION
@@ -40,7 +41,7 @@ def of_steps(store: "Store", steps: Iterable[str]) -> dict:
     """Return the summaries of `steps`, all of them current."""
     make = {
         "ingest": lambda: of_ingest({name: store.read(name) for name in OF_INGEST}),
-        "fit-steady": lambda: of_fit(store.read("steady_fit"), "condition"),
+        "fit-steady": lambda: of_steady(store.read("steady_fit")),
         "fit-aging": lambda: of_aging(store),
         "fit-dynamic": lambda: of_dynamic(store.read("dynamic_fit")),
         "close-loop": lambda: (
@@ -99,6 +100,18 @@ def of_fit(fit: pd.DataFrame, of: str) -> dict:
         row |= {"identified": len(known), "of": len(group), "reason": why, "remark": remark}
         ranges.append(row)
     return {of: int(fit[of].nunique()), "parameters": ranges}
+
+
+def of_steady(fit: pd.DataFrame) -> dict:
+    """Return the ranges of the steady parameters, and the scatter of specimens."""
+    return {**of_fit(fit, "condition"), "specimens": of_specimens(fit)}
+
+
+def of_specimens(fit: pd.DataFrame) -> dict:
+    """Return the scatter of specimens in %, None if unknown, and whether the intervals contain it."""
+    scatter = fit.loc[fit["parameter"] == "specimen_sd_pct", ["value", "reason"]]
+    sd_pct, remark = scatter.iloc[0] if len(scatter) else (np.nan, "")
+    return {"sd_pct": None if np.isnan(sd_pct) else float(sd_pct), "remark": remark or ""}
 
 
 def of_aging(store: "Store") -> dict:
@@ -180,7 +193,7 @@ def of_after(store: "Store") -> dict:
     if all(effect["candidate"] for effect in closure["effects"]) and not closure["outlier_files"]:
         return {}
     return {
-        "fit_steady": of_fit(store.read("steady_fit_after"), "condition"),
+        "fit_steady": of_steady(store.read("steady_fit_after")),
         "fit_aging": of_fit(store.read("aging_fit_after"), "series"),
         "fit_dynamic": of_dynamic(store.read("dynamic_fit_after")),
     }

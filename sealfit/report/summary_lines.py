@@ -77,7 +77,17 @@ def _fit_lines(title: str, part: Mapping) -> list[str]:
     if texts:
         found.append(line("", " ".join([f"not identified: {', '.join(texts)}.", *reasons[:1]])))
     remarks = [f"{entry['parameter']}: {entry['remark']}" for entry in ranges if entry["remark"]]
-    return found + [line("", text) for text in dict.fromkeys(remarks)]
+    found += [line("", text) for text in dict.fromkeys(remarks)]
+    if said := specimens_clause(part.get("specimens")):
+        found.append(line("", f"specimens: {said}"))
+    return found
+
+
+def specimens_clause(specimens: Mapping | None) -> str:
+    """Return the scatter of specimens and whether intervals contain it, in words; "" if nothing is known."""
+    if specimens is None or specimens["sd_pct"] is None:
+        return specimens["remark"] if specimens else ""
+    return f"{specimens['sd_pct']:.2g} %, {specimens['remark']}"
 
 
 def property_lines(properties: Sequence[Mapping]) -> list[str]:

@@ -433,3 +433,55 @@ def test_few_speeds_with_forces_along_the_motion_have_no_friction_and_say_so(cam
     row = steady(fits, "mu_c")
     assert row.value == 0.0
     assert not row.identified
+
+
+# ---------------------------------------------------------------- specimens
+PIECES = {"speeds": (1, 2, 4, 8, 16, 32), "ways": (1,), "noise": 0.005, "days": (0, 1), "model": TRUTH}
+
+
+def test_intervals_contain_the_scatter_of_specimens_where_a_condition_has_several(campaign):
+    held = 0
+    for seed in range(8):
+        fits = fit_conditions(campaign(specimen=0.05, specimens=4, seed=seed, **PIECES), Config())
+        row = steady(fits, "mu_s")
+        assert 0.005 < row.se < 0.04  # 0.7 x 5 % / 2 = 0.0175
+        held += row.lo95 <= 0.7 <= row.hi95
+        assert steady(fits, "v_s").se < 0.2  # a factor of all friction does not change v_s
+        assert statistic(fits, "lack_of_fit_p").value > 0.001  # nor is it a lack of fit
+        scatter = statistic(fits, "specimen_sd_pct")
+        assert 2 < scatter.value < 10
+        assert "6 degrees of freedom" in scatter.reason
+    assert held >= 7
+
+
+def test_one_specimen_per_condition_says_for_what_the_intervals_hold(campaign):
+    fits = fit_conditions(campaign(specimen=0.05, **PIECES), Config())
+    assert np.isnan(statistic(fits, "specimen_sd_pct").value)
+    assert "hold for those tested" in statistic(fits, "specimen_sd_pct").reason
+
+
+def test_other_conditions_show_the_scatter_of_a_single_specimen(campaign):
+    table = campaign(specimen=0.05, specimens=4, **PIECES)
+    one = table[(table.aging_days == 1) | table.specimen_id.str.endswith(" 0")]
+    alone = steady(fit_conditions(one, Config()), "mu_s")
+    every = steady(fit_conditions(table, Config()), "mu_s")
+    assert 1.3 < alone.se / every.se < 3
+
+
+def test_specimens_of_one_run_each_are_scatter_between_runs(campaign):
+    table = campaign(setup=0.03, **PIECES)
+    nested = fit_conditions(table.assign(specimen_id=table.run_id), Config())
+    plain = fit_conditions(table, Config())
+    columns = ["parameter", "value", "se", "lo95", "hi95"]
+    pd.testing.assert_frame_equal(nested["steady_fit"][columns], plain["steady_fit"][columns])
+
+
+def test_specimens_that_differ_in_v_s_widen_its_interval(campaign):
+    table = campaign(specimens=4, **PIECES)
+    factor = table.specimen_id.str[-1].map({"0": 0.7, "1": 0.9, "2": 1.1, "3": 1.3})
+    load, fall = 49.03, TRUTH["mu_s"] - TRUTH["mu_c"]
+    moved = np.exp(-((table.speed_mm_s / (6 * factor)) ** 2)) - np.exp(-((table.speed_mm_s / 6) ** 2))
+    differs = fit_conditions(table.assign(force_N=table.force_N + load * fall * moved), Config())
+    same = fit_conditions(table, Config())
+    assert steady(differs, "v_s").se > 4 * steady(same, "v_s").se
+    assert "v_s" in statistic(differs, "specimen_sd_pct").reason

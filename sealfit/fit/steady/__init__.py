@@ -12,12 +12,15 @@ from sealfit.fit.least_squares import t_quantile
 from sealfit.fit.steady.condition import (
     FULL,
     Condition,
+    SpecimenScatter,
     bound,
     drop_flat_curve,
+    find_specimens,
     judge,
     make_condition,
     scatter_of_runs,
     solve,
+    specimen_scatter,
 )
 from sealfit.fit.steady.stribeck import NAMES, linearised
 from sealfit.fit.steady.uncertainty import (
@@ -80,18 +83,21 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
 
     Notes
     -----
-    Intervals are profile-likelihood intervals with Student's t. `u_sys` assumes one unknown error of |force|
+    Intervals are profile-likelihood intervals with Student's t. If some condition has several specimens, the
+    intervals and `se` contain the scatter of specimens, pooled over these conditions; `steady_covariance` does
+    not, as the aging laws estimate it. Otherwise they hold for the specimens tested. `u_sys` assumes one unknown error of |force|
     for all samples, which no averaging reduces. A zero offset of the sensor has opposite signs in the two
     directions and changes the parameters by no more; the loop tests for it.
     """
     conditions, scatter, variance = solve_conditions(steady)
+    specimens = specimen_scatter(conditions, variance["value"].to_numpy())
     keys = condition_keys(steady, config)
     for start in range(0, len(conditions), BLOCK):
         block = slice(start, start + BLOCK)
         bound(conditions[block], variance["rise"].to_numpy()[block])
     rows = {schema: [] for schema in (STEADY_FIT, STEADY_COVARIANCE, STEADY_SHIFT)}
     for c, own in zip(conditions, variance.itertuples(), strict=True):
-        for schema, row in _rows(c, own, scatter, config):
+        for schema, row in _rows(c, own, specimens, scatter, config):
             rows[schema].append({"condition": c.name, **row})
     others = [name for name in keys.columns if name not in STEADY_FIT.names()]
     found = {}
@@ -119,6 +125,7 @@ def solve_conditions(steady: pd.DataFrame) -> tuple[list[Condition], RepeatScatt
     for condition, value, df in zip(conditions, first["value"], first["df"], strict=True):
         if condition.model == FULL:
             drop_flat_curve(condition, value, df)
+    find_specimens(conditions)
     return conditions, scatter, unit_variance(*scatter_of_runs(conditions), scatter.df)
 
 
@@ -146,7 +153,11 @@ def condition_keys(steady: pd.DataFrame, config: Config) -> pd.DataFrame:
 
 
 def _rows(
-    condition: Condition, variance: tuple, scatter: RepeatScatter, config: Config
+    condition: Condition,
+    variance: tuple,
+    specimens: SpecimenScatter,
+    scatter: RepeatScatter,
+    config: Config,
 ) -> Iterator[tuple[Schema, dict]]:
     """Yield the rows of a condition, each with its table; `variance` is its row of `unit_variance`."""
     unit_of = parameter_units(config.units, condition.has_load)
@@ -155,6 +166,7 @@ def _rows(
     covariance, changes = linearised(condition.jacobian(), weight, condition.values, condition.names, moved)
     shift, effects = changes[:, 0], changes[:, 1:]
     covariance = covariance * variance.value + effects @ effects.T
+    of_specimens = specimens.variance_of(condition)
     # Smaller shifts are rounding.
     shift = np.where(np.abs(shift) > 1e-12 * np.abs(condition.values), shift * config.sensor.u, 0.0)
     judged = judge(condition)
@@ -166,16 +178,20 @@ def _rows(
             value = condition.values[j]
             low, high = (None, None) if condition.low is None else (condition.low[j], condition.high[j])
             open_below = name == "v_s" and low == 0.0
-            if effects.any() and low is not None:  # the half-widths are added in quadrature
-                reach = t_quantile(variance.df) * float(np.sqrt((effects[j] ** 2).sum()))
+            reach = np.hypot(
+                t_quantile(variance.df) * np.linalg.norm(effects[j]),
+                t_quantile(specimens.df or np.inf) * np.sqrt(of_specimens[j]),
+            )
+            if reach > 0 and low is not None:  # the half-widths are added in quadrature
                 low = max(value - float(np.hypot(value - low, reach)), 0.0)
                 high = value + float(np.hypot(high - value, reach))
-            se = None if value == 0.0 else np.sqrt(covariance[j, j])  # at its limit: not known with error 0
+            # At its limit a parameter is not known with error 0.
+            se = None if value == 0.0 else np.sqrt(covariance[j, j] + of_specimens[j])
             row |= {"value": value, "se": se}
             row |= {"lo95": None if open_below else low, "hi95": high, "u_sys": abs(shift[j])}
         row |= {"quantity": "steady", "parameter": spelled[name], "unit": unit_of[name]}
         yield STEADY_FIT, table_row(**row)
-    for row in _statistics(condition, variance, scatter, config):
+    for row in _statistics(condition, variance, specimens, scatter, config):
         yield STEADY_FIT, row
     for i, one in enumerate(condition.names if np.isfinite(variance.value) else ()):
         for j, other in enumerate(condition.names[: i + 1]):
@@ -191,11 +207,16 @@ def _rows(
 
 
 def _statistics(
-    condition: Condition, variance: tuple, scatter: RepeatScatter, config: Config
+    condition: Condition,
+    variance: tuple,
+    specimens: SpecimenScatter,
+    scatter: RepeatScatter,
+    config: Config,
 ) -> Iterator[dict]:
     repeated, force_unit = scatter.df > 0, config.units.unit("force")
     no_repeats = "" if repeated else "no run was repeated: there is no pure error to compare with."
-    ratio = condition.chi2 / condition.df if condition.df else None
+    chi2, df = condition.chi2_within, condition.df_within
+    ratio = chi2 / df if df else None
     lack = no_repeats
     if repeated and condition.df == 0:
         lack = "as many parameters as runs: the fit cannot disagree with them."
@@ -208,13 +229,14 @@ def _statistics(
     own = no_repeats or ("own" if variance.own else "pooled")
     residual = condition.arrays[2] - condition.model_force()
     for name, value, unit, reason in (
-        ("chi2", condition.chi2 if repeated else None, "", no_repeats),
-        ("df", condition.df, "", ""),
+        ("chi2", chi2 if repeated else None, "", no_repeats),
+        ("df", df, "", ""),
         ("reduced_chi2", ratio if repeated else None, "", no_repeats),
         ("lack_of_fit_F", variance.f, "", no_repeats),
         ("lack_of_fit_p", variance.p, "", lack.strip()),
         ("birge_ratio", np.sqrt(variance.value) if repeated else None, "", own),
         ("error_df", variance.df, "", "degrees of freedom of the intervals' Student t"),
+        ("specimen_sd_pct", specimens.sd_pct, "%", specimens.remark),
         ("flat_p", condition.flat_p, "", "chance of this much Stribeck curve where mu_s = mu_c"),
         ("rmse_N", np.sqrt(np.mean(residual**2)), force_unit, ""),
         ("n_runs", len(condition.runs), "", ""),

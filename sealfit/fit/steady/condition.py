@@ -1,15 +1,22 @@
 """The model of one condition: the parameters of Eq. 14 that its speeds determine, and their fit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
+from scipy.special import fdtrc
 
 from sealfit.fit.least_squares import project
 from sealfit.fit.steady import stribeck
-from sealfit.fit.steady.stribeck import NAMES, StribeckFit
-from sealfit.fit.steady.uncertainty import shifts_of, speed_levels
+from sealfit.fit.steady.stribeck import NAMES, StribeckFit, free_parameters, linearised
+from sealfit.fit.steady.uncertainty import (
+    POOLING_P,
+    SpecimenPart,
+    shifts_of,
+    specimen_part,
+    speed_levels,
+)
 from sealfit.ingest.strokes import speed_clusters
 from sealfit.physics import stribeck_force
 
@@ -17,6 +24,8 @@ from sealfit.physics import stribeck_force
 FULL, VISCOUS, CONSTANT = 4, 2, 1
 # Level of the test for a Stribeck curve.
 SIGNIFICANT = 0.05
+# Specimens that differ by a factor of all friction.
+FRICTION = "friction"
 # Parameters of each model.
 COLUMNS = {FULL: NAMES, VISCOUS: ("mu_c", "sigma_2"), CONSTANT: ("mu_c",)}
 
@@ -37,6 +46,7 @@ class Condition:
     high: np.ndarray | None = None
     chi2: float = np.nan
     grid: np.ndarray | None = None
+    specimens: dict[str, SpecimenPart] = field(default_factory=dict)  # by the name of what differs
 
     @cached_property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -65,6 +75,16 @@ class Condition:
         """Runs minus parameters; a parameter at its bound counts too, which makes intervals wider."""
         return max(len(self.runs) - len(self.names), 0)
 
+    @property
+    def chi2_within(self) -> float:
+        """Chi-square of the runs without what differences between specimens explain."""
+        return max(self.chi2 - sum(part.explained for part in self.specimens.values()), 0.0)
+
+    @property
+    def df_within(self) -> int:
+        """Degrees of freedom of `chi2_within`."""
+        return self.df - sum(part.df for part in self.specimens.values())
+
     def jacobian(self) -> np.ndarray:
         """Derivative of F sgn v with respect to the parameters, shape (n, p)."""
         speed, load, _, _ = self.arrays
@@ -87,6 +107,18 @@ class Condition:
     def few_speeds(self) -> bool:
         """Whether the speeds are too few for a Stribeck curve."""
         return self.speeds < FULL
+
+    def by_specimen(self, differs: str) -> np.ndarray:
+        """Return the change of F sgn v if a specimen's friction, v_s or sigma_2 grows by 100 %, (n, specimens)."""
+        if differs == FRICTION:
+            change = self.model_force()
+        elif differs in self.names:
+            place = self.names.index(differs)
+            change = self.jacobian()[:, place] * self.values[place]
+        else:
+            change = np.zeros(len(self.runs))
+        code, names = pd.factorize(self.runs["specimen"])
+        return np.where(code[:, None] == np.arange(len(names)), change[:, None], 0.0)
 
     def run_levels(self) -> np.ndarray:
         """Direction and speed level of every run, shape (n, 2)."""
@@ -119,7 +151,7 @@ def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray
     Where several have the same speeds, the model of each is multiplied by one factor per speed and direction,
     common to all. Where too few have, chi-square is no scatter, unless no other condition shows any.
     """
-    chi2, df = (np.array([getattr(c, name) for c in conditions], float) for name in ("chi2", "df"))
+    chi2, df = np.array([(c.chi2_within, c.df_within) for c in conditions], float).T
     few = [k for k, c in enumerate(conditions) if c.model == VISCOUS and c.few_speeds and c.values[0] > 0]
     scatter = np.ones(len(conditions), dtype=bool)
     if not few:
@@ -142,9 +174,99 @@ def scatter_of_runs(conditions: list[Condition]) -> tuple[np.ndarray, np.ndarray
         _, cell = np.unique(np.concatenate([cells[k] for k in group]), axis=0, return_inverse=True)
         factor = np.bincount(cell, weight * model * force) / np.bincount(cell, weight * model**2)
         left = weight * (force - factor[cell] * model) ** 2
-        chi2[group] = np.bincount(np.repeat(np.arange(len(own)), [len(c.runs) for c in own]), left)
-        df[group] = free * spare / free.sum()
+        total = np.bincount(np.repeat(np.arange(len(own)), [len(c.runs) for c in own]), left)
+        explained, between = np.array([(c.chi2 - c.chi2_within, c.df - c.df_within) for c in own]).T
+        chi2[group] = np.maximum(total - explained, 0.0)
+        df[group] = free * spare / free.sum() - between
     return chi2, df, scatter if df[scatter].any() else np.ones_like(scatter)
+
+
+def find_specimens(conditions: list[Condition]) -> None:
+    """Set what differences between specimens explain: of all friction, and of v_s and sigma_2 if they differ.
+
+    Specimens with one run each cannot be distinguished from runs: they explain nothing.
+    """
+    for differs in (FRICTION, "v_s", "sigma_2"):
+        parts = [_specimen_part(c, differs) for c in conditions]
+        found = [(c, part) for c, part in zip(conditions, parts, strict=True) if 0 < part.df < c.df_within]
+        explained, df = (sum(getattr(part, name) for _, part in found) for name in ("explained", "df"))
+        rest = sum(c.chi2_within for c, _ in found) - explained
+        rest_df = sum(c.df_within for c, _ in found) - df
+        if df and (differs == FRICTION or fdtrc(df, rest_df, explained / df * rest_df / rest) <= POOLING_P):
+            for condition, part in found:
+                condition.specimens[differs] = part
+
+
+def _specimen_part(condition: Condition, differs: str) -> SpecimenPart:
+    """Return what specimens explain beyond the model and what they are known to explain.
+
+    With few speeds the model has one force per speed.
+    """
+    if condition.few_speeds:
+        _, cell = np.unique(condition.run_levels(), axis=0, return_inverse=True)
+        model = np.eye(cell.max() + 1)[cell]
+    else:
+        model = condition.jacobian()[:, free_parameters(condition.names, condition.values)]
+    model = np.hstack([model, *map(condition.by_specimen, condition.specimens)])
+    root = np.sqrt(condition.arrays[3])
+    residual = root * (condition.arrays[2] - condition.model_force())
+    return specimen_part(root[:, None] * model, root[:, None] * condition.by_specimen(differs), residual)
+
+
+@dataclass(frozen=True)
+class SpecimenScatter:
+    """The relative variances of what differs between specimens."""
+
+    variances: dict[str, float]
+    df: int  # 0 if unknown
+    single: bool  # whether each condition has one specimen
+
+    @property
+    def sd_pct(self) -> float:
+        """Standard deviation of the friction of specimens in %; NaN if unknown."""
+        return 100 * float(np.sqrt(self.variances.get(FRICTION, np.nan)))
+
+    @property
+    def remark(self) -> str:
+        """What the intervals contain of it."""
+        if self.single:
+            return "no condition has several specimens: the intervals hold for those tested."
+        if not self.df:
+            return ""
+        others = " and of ".join(name for name in self.variances if name != FRICTION)
+        others = others and f", and that of {others}"
+        return f"scatter of the specimens' friction{others}, in the intervals; {self.df} degrees of freedom."
+
+    def variance_of(self, condition: Condition) -> np.ndarray:
+        """Return the variance that the scatter of specimens gives to the parameters, shape (p,)."""
+        own = [np.sqrt(value) * condition.by_specimen(name) for name, value in self.variances.items()]
+        if not own:
+            return np.zeros(len(condition.names))
+        jacobian, weight, moved = condition.jacobian(), condition.arrays[3], np.hstack(own)
+        # The interval of a parameter at its limit is that of a free one.
+        fixed, free = (
+            linearised(jacobian, weight, values, condition.names, moved)[1]
+            for values in (condition.values, np.ones(len(condition.names)))
+        )
+        changes = np.where(condition.values[:, None] == 0.0, free, fixed)
+        return (changes**2).sum(axis=1)
+
+
+def specimen_scatter(conditions: list[Condition], unit: np.ndarray) -> SpecimenScatter:
+    """Return the scatter of specimens, pooled over conditions.
+
+    `unit`, shape (conditions,), are the factors on the variances stated by the weights. Henderson 1953,
+    Biometrics 9(2), 226-252, doi:10.2307/3001853, method 3.
+    """
+    variances, df = {}, 0
+    for differs in dict.fromkeys(name for c in conditions for name in c.specimens):
+        pairs = zip(conditions, unit, strict=True)
+        parts = [(c.specimens[differs], value) for c, value in pairs if differs in c.specimens]
+        excess = sum(part.explained - part.df * value for part, value in parts)
+        variances[differs] = max(excess / sum(part.expected for part, _ in parts), 0.0)
+        df = df or sum(part.df for part, _ in parts)
+    single = all(c.runs["specimen"].nunique() == 1 for c in conditions)
+    return SpecimenScatter(variances, df, single)
 
 
 def stacked(conditions: list[Condition]) -> tuple[np.ndarray, ...]:

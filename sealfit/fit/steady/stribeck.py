@@ -1,5 +1,6 @@
 """Eq. 14 fitted to many conditions at once, with exact intervals of nonnegative coefficients."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -183,13 +184,18 @@ def tangent(speed, load, values) -> np.ndarray:
     return np.stack([load * decay, load * (1 - decay), along_v_s, speed], axis=1)
 
 
+def free_parameters(names: Sequence[str], values: np.ndarray) -> np.ndarray:
+    """Return which parameters are not fixed at their bound 0, shape (p,)."""
+    return np.array([name == "v_s" or value > 0 for name, value in zip(names, values, strict=True)])
+
+
 def linearised(jacobian, weight, values, names, moved):
     """Return the covariance at unit variance, shape (p, p), and the change of the parameters, shape (p, k).
 
     `moved`, shape (n, k), are changes of the forces. A coefficient at its bound 0 is fixed: its variance and
     change are 0.
     """
-    free = np.array([name == "v_s" or value > 0 for name, value in zip(names, values, strict=True)])
+    free = free_parameters(names, values)
     covariance, _ = covariance_of(jacobian * np.sqrt(weight)[:, None], free)
     known = np.where(np.isfinite(covariance), covariance, 0.0)
     return covariance, known @ (jacobian.T @ (weight[:, None] * moved))

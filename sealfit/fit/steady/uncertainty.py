@@ -7,6 +7,7 @@ are widened by the Birge ratio, the square root of the reduced chi-square.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -26,13 +27,16 @@ WORSE_P = 0.01
 SMALLEST_SD = 1e-9
 # Smallest force in a scatter proportional to the force, as a share of the largest force.
 SMALLEST_SHARE = 0.05
+# Share of a column's length below which it is a combination of other columns.
+DEPENDENT = 1e-6
 # Prefix of the columns of `steady_after` with the directions of the subtracted effects' uncertainty.
 SHIFT = "effects_u"
 # `direction` of a row that is the mean of both directions.
 BOTH_DIRECTIONS = 0
 
 NEEDED = (
-    "condition", "series", "rubber", "run_id", "file", "direction", "speed_mm_s", "load_N", "force_N", "used",
+    "condition", "series", "rubber", "run_id", "specimen_id", "file", "direction", "speed_mm_s", "load_N",
+    "force_N", "used",
 )  # fmt: skip
 
 
@@ -100,7 +104,8 @@ def run_means(steady: pd.DataFrame) -> pd.DataFrame:
     keys = ["condition", "run_id", "direction"]
     per_file = numbers.groupby([*keys, "file"], sort=True).mean()
     grouped = per_file.groupby(level=keys, sort=True)
-    runs = grouped.mean().assign(files=grouped.size()).reset_index()
+    specimen = rows["specimen_id"].astype(str).groupby([rows[key] for key in keys]).min()
+    runs = grouped.mean().assign(files=grouped.size(), specimen=specimen).reset_index()
     bad = ~(runs["speed"] > 0) | ~np.isfinite(runs["force"])
     if bad.any():
         first = runs[bad].iloc[0]
@@ -167,6 +172,28 @@ def unit_variance(chi2, df, scatter, pure_df: float) -> pd.DataFrame:
         value, df = np.where(worse, ratio, base), np.where(worse, df, base_df if base_df > 0 else np.nan)
         rise = t_quantile(df) ** 2 * value
     return pd.DataFrame({"value": value, "df": df, "rise": rise, "f": f, "p": p, "own": worse})
+
+
+class SpecimenPart(NamedTuple):
+    """What specimens that differ in one respect explain of the chi-square of a condition's runs."""
+
+    explained: float
+    expected: float  # of `explained`, per variance of the specimens
+    df: int
+
+
+def specimen_part(model: np.ndarray, own: np.ndarray, residual: np.ndarray) -> SpecimenPart:
+    """Return what one number per specimen explains of the residuals of a model.
+
+    `model`, shape (n, p), are its derivatives, `own`, (n, specimens), the change of each specimen's forces,
+    and `residual`, (n,), the residuals, all times the root of the weights.
+    """
+    basis, size, _ = np.linalg.svd(model, full_matrices=False)
+    basis = basis[:, size > DEPENDENT * size.max(initial=0.0)]
+    left = own - basis @ (basis.T @ own)
+    axes, size, _ = np.linalg.svd(left, full_matrices=False)
+    axes = axes[:, size > DEPENDENT * np.linalg.norm(own)]
+    return SpecimenPart(float(((axes.T @ residual) ** 2).sum()), float((left**2).sum()), axes.shape[1])
 
 
 def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
