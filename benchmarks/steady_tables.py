@@ -36,7 +36,8 @@ def steady_rows(
 ):
     """Table `steady` of a campaign with known truth; noise, setup and specimen are relative, constant in N.
 
-    Each condition has `specimens`, tested at all speeds. With `together` both directions are in one file and share its set-up and noise.
+    Each condition has `specimens`, tested at all speeds. With `together` both directions are in one file and
+    share its set-up and noise.
     """
     rng = np.random.default_rng(seed)
     rows, drawn = [], {}

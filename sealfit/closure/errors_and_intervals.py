@@ -18,6 +18,7 @@ from sealfit.closure.score_test import Candidate
 from sealfit.closure.small_sample_test import satterthwaite_df
 from sealfit.effects.sensors import DAY_H
 from sealfit.fit.joint import Fitted
+from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 from sealfit.fit.joint.whitening import KINDS, LEVELS_OF_FORCE
@@ -312,10 +313,7 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
     units = fitted.rows.groups.starts[level].size
     reach = t_quantile(max(units - variance.size - 1, 2)) * np.sqrt(variance)
     values = fitted.model.values[number]
-    for name in (p.name for p in term.effect.nonlinear if p.search == "between"):
-        along = np.unique(term.inputs(fitted.rows)[term.effect.reads[0]])
-        after = int(np.clip(along.searchsorted(values[name]), 1, along.size - 1))
-        held[name] = along[after - 1], along[after]
+    held |= places_of_jumps(term, values, fitted.rows)
     result = {}
     for p, r in zip(term.effect.parameters, reach, strict=True):
         low, high = held.get(p.name, (values[p.name] - r, values[p.name] + r))
@@ -323,6 +321,16 @@ def effect_intervals(fitted: Fitted, number: int, level: str) -> dict[str, Inter
             low, high = np.clip((low, high), *p.bounds)
         result[p.name] = (values[p.name], float(low), float(high))
     return normalised_waves(result)
+
+
+def places_of_jumps(term: Term, values: Mapping[str, float], rows: Rows) -> dict[str, tuple[float, float]]:
+    """Return the two tested values between which each jump of an effect lies, by parameter."""
+    found = {}
+    for name in (p.name for p in term.effect.nonlinear if p.search == "between"):
+        along = np.unique(term.inputs(rows)[term.effect.reads[0]])
+        after = int(np.clip(along.searchsorted(values[name]), 1, along.size - 1))
+        found[name] = float(along[after - 1]), float(along[after])
+    return found
 
 
 def normalised_waves(intervals: dict[str, Interval]) -> dict[str, Interval]:

@@ -14,6 +14,7 @@ from sealfit.closure.errors_and_intervals import (
     degrees_of_freedom,
     mean_half_width,
     mean_se,
+    places_of_jumps,
     robust_covariance,
     sandwiches,
     t_quantile,
@@ -68,6 +69,11 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
                 "information": [[numbers.tolist(), block.tolist()] for numbers, block in own.information],
             }
             for own in sandwiches(after)
+        ],
+        "jumps": [
+            {"effect": number, "parameter": name, "low": low, "high": high}
+            for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True))
+            for name, (low, high) in places_of_jumps(term, values, rows).items()
         ],
         "df": degrees_of_freedom(after),
         "scatter": {

@@ -7,7 +7,7 @@ sensor's accuracy is not included (GUM, type B).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +67,10 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         _note(notes, good, TESTED_ONLY)
     if model["df"] == 0:
         _note(notes, good, NO_INTERVAL)
+    for jump, inside in _in_gaps(model["jumps"], after, table):
+        term = after.terms[jump["effect"]]
+        where = f"{term.channels[0]} {jump['low']:g} and {jump['high']:g}, where nothing was tested"
+        _note(notes, good & inside, f"{term.effect.id} changes somewhere between {where}")
     extrapolated = _outside(table, conditions, code, model, notes, after)
     if good.any():
         own = {"has_load": model["has_load"], "has_aging": model["has_aging"]}
@@ -75,6 +79,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         before_N, _ = evaluate(before, at, jacobian=False)
         at = replace(at, force=before_N)  # its lag
         mean, tangent = evaluate(after, at)
+        least, most = _across_jumps(model["jumps"], after, at, mean)
         reach = t_quantile(model["df"])
         others = []
         for own in model["sandwiches"]:
@@ -84,8 +89,8 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         half = np.sqrt(half**2 + reach**2 * _of_unknown_phase(after, at, mean))
         one = _one_measurement(model["scatter"], loads_of(after, at))
         spread = reach * np.sqrt((half / reach) ** 2 + one)
-        forces = (before_N, mean, mean - half, mean + half)
-        answer[good] = np.column_stack([*forces, mean - spread, mean + spread])
+        forces = (before_N, mean, least - half, most + half)
+        answer[good] = np.column_stack([*forces, least - spread, most + spread])
     return points.reset_index(drop=True).assign(
         **dict(zip(FORCE_COLUMNS, answer.T, strict=True)),
         extrapolated=extrapolated & ~np.isnan(answer[:, 1]),  # of `force_after_N`
@@ -245,6 +250,28 @@ def _outside(
         _note(notes, beyond, f"{name} is outside the tests: {tested[0]:g} to {tested[1]:g}")
         outside |= beyond
     return outside
+
+
+def _in_gaps(jumps: list[dict], after: Model, table: pd.DataFrame) -> Iterator[tuple[dict, np.ndarray]]:
+    """Yield each jump of an effect and which points lie where it may have been, shape (n,)."""
+    for jump in jumps:
+        channel = after.terms[jump["effect"]].channels[0]
+        values = pd.to_numeric(table[channel], errors="coerce").to_numpy(dtype=float)
+        yield jump, (values > jump["low"]) & (values < jump["high"])
+
+
+def _across_jumps(
+    jumps: list[dict], after: Model, at: Rows, mean: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest mean force, shape (n,), wherever the jumps may be."""
+    least, most = mean, mean
+    for jump, inside in _in_gaps(jumps, after, at.table):
+        for place in (jump["low"], jump["high"]):
+            values = list(after.values)
+            values[jump["effect"]] = {**values[jump["effect"]], jump["parameter"]: place}
+            other, _ = evaluate(replace(after, values=tuple(values)), at, jacobian=False)
+            least, most = np.where(inside, [np.minimum(least, other), np.maximum(most, other)], [least, most])
+    return least, most
 
 
 def _of_unknown_phase(after: Model, at: Rows, force: np.ndarray) -> np.ndarray:

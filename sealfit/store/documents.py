@@ -138,6 +138,8 @@ def _sizes_agree(model) -> bool:
         and set(model.conditions.series) <= model.speeds_mm_s.keys()
         and all(_is_square(own, fitted) for own in covariances)
         and all(_are_below(own, fitted) and _is_square(block, len(own)) for own, block in blocks)
+        and all(own.effect < len(model.after.terms) for own in model.jumps)
+        and all(own.parameter in model.after.terms[own.effect].values for own in model.jumps)
     )
 
 
@@ -173,6 +175,8 @@ COMPONENT = record(
     variance=Annotated[Number, Field(ge=0)],
 )
 COMPONENT.__pydantic_config__ = ConfigDict(extra="forbid")
+# An effect of the model after the loop that jumps between two tested values of its variable.
+JUMP = record(effect=Annotated[int, Field(strict=True, ge=0)], parameter=Text, low=Number, high=Number)
 MODEL = record(
     _sizes_agree,
     schema=Literal[1],
@@ -184,6 +188,7 @@ MODEL = record(
     **dict.fromkeys(("before", "after"), FITTED),
     covariance=Matrix,
     sandwiches=list[GROUPED],
+    jumps=list[JUMP],
     df=Annotated[Number, Field(ge=0)],
     scatter=record(s0=Number, g=Number, of_specimens=StrictBool, components=list[COMPONENT]),
     ranges=dict[Text, Names | tuple[Number, Number]],

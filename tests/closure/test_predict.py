@@ -73,3 +73,29 @@ def test_the_direction_of_a_point_is_that_of_its_speed():
         refused = predict(model, points.assign(direction=wrong))
         assert refused["force_after_N"].isna().all()
         assert (refused["note"] == "direction must be 1 or -1, and speed_mm_s must have its sign").all()
+
+
+def test_a_point_in_the_gap_in_which_a_change_happened_may_lie_before_or_after_it():
+    bins = make_bins(temperatures=(60.0,), bins=4)
+    order = np.random.default_rng(1).permutation(bins["file"].nunique())
+    bins["run_order"] = 1.0 + order[bins["run_order"].astype(int) - 1]
+    bins["elapsed_h"] = 0.1 * bins["run_order"]
+    late = bins["elapsed_h"] > bins["elapsed_h"].median()
+    bins.loc[late, "force_N"] *= 1.2
+    bins.loc[late, "elapsed_h"] += 20.0
+    found = close_loop(bins, make_traces(bins), TWO_FOLDS)
+    (jump,) = found.model["jumps"]
+    before, after = bins.loc[~late, "elapsed_h"].max(), bins.loc[late, "elapsed_h"].min()
+    assert (jump["parameter"], jump["low"], jump["high"]) == ("x_0", before, after)
+    point = bins.head(1)
+    first, gap, last = (
+        predict(found.model, point.assign(elapsed_h=hours)).iloc[0] for hours in (before, before + 2, after)
+    )
+    assert gap["note"] == (
+        f"step changes somewhere between elapsed_h {before:g} and {after:g}, where nothing was tested"
+    )
+    assert not first["note"]
+    low, high = "force_after_lo95_N", "force_after_hi95_N"
+    assert gap[low] == pytest.approx(first[low], rel=0.01)
+    assert gap[high] == pytest.approx(last[high], rel=0.01)
+    assert gap[high] / gap[low] > 1.15 > last[high] / last[low]

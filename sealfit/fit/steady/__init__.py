@@ -83,11 +83,12 @@ def fit_conditions(steady: pd.DataFrame, config: Config) -> SteadyFit:
 
     Notes
     -----
-    Intervals are profile-likelihood intervals with Student's t. If some condition has several specimens, the
-    intervals and `se` contain the scatter of specimens, pooled over these conditions; `steady_covariance` does
-    not, as the aging laws estimate it. Otherwise they hold for the specimens tested. `u_sys` assumes one unknown error of |force|
-    for all samples, which no averaging reduces. A zero offset of the sensor has opposite signs in the two
-    directions and changes the parameters by no more; the loop tests for it.
+    Intervals are profile-likelihood intervals with Student's t. If some conditions have several specimens,
+    the intervals and `se` contain the scatter of specimens, pooled over these conditions; `steady_covariance`
+    does not, as the aging laws estimate it. Otherwise they hold for the specimens tested. `u_sys` assumes one
+    unknown error of |force| for all samples, which no averaging reduces. A zero offset of the
+    sensor has opposite signs in the two directions and changes the parameters by no more; the loop tests for
+    it.
     """
     conditions, scatter, variance = solve_conditions(steady)
     specimens = specimen_scatter(conditions, variance["value"].to_numpy())

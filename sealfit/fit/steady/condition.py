@@ -109,7 +109,10 @@ class Condition:
         return self.speeds < FULL
 
     def by_specimen(self, differs: str) -> np.ndarray:
-        """Return the change of F sgn v if a specimen's friction, v_s or sigma_2 grows by 100 %, (n, specimens)."""
+        """Return the change of F sgn v per relative change of a specimen's number, shape (n, specimens).
+
+        `differs` is the number: `FRICTION`, all friction, or the name of a parameter.
+        """
         if differs == FRICTION:
             change = self.model_force()
         elif differs in self.names:
