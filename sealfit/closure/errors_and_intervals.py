@@ -159,10 +159,10 @@ def _residual_of_model(
         np.add.reduceat(values[order], start, axis=0)[chosen]
         / np.bincount(number)[chosen, None]
         * factor[:, None]
-        for values in (fitted.jacobian.values, fitted.loads)
+        for values in (fitted.free_jacobian.values, fitted.loads)
     )
     place = order[start][chosen]  # a row of each run
-    tangent = Tangent(fitted.jacobian.layout.of(place), means)
+    tangent = Tangent(fitted.free_jacobian.layout.of(place), means)
     kinds = [c.kind for c in fitted.scatter.components if c.level == "specimen" and c.variance > 0]
     if not kinds:
         basis = tangent.orthonormal(RANK)

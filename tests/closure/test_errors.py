@@ -43,3 +43,17 @@ def test_strokes_of_a_file_that_are_alike_are_no_further_files():
         return lack_of_fit(fit_declared(make_rows(bins, has_aging=True)))
 
     assert sum(of_files(seed) < 0.05 for seed in range(12)) <= 2
+
+
+def test_a_sigma_2_of_0_does_not_hide_that_friction_falls_at_high_speeds():
+    def falls(table, force):
+        return force * np.select([table["speed_mm_s"] < 6, table["speed_mm_s"] < 30], [1.0, 1.03], 0.9)
+
+    for seed in (1, 3):
+        fitted = fit_declared(
+            make_rows(
+                make_bins(seed, speeds=(1.0, 5.0, 20.0, 60.0), bins=4, effect=falls, gain=0.003),
+                has_aging=True,
+            )
+        )
+        assert lack_of_fit(fitted) < 1e-3
