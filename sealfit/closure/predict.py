@@ -29,7 +29,7 @@ from sealfit.ingest.columns import add_keys, condition_columns
 from sealfit.ingest.derived_columns import with_day_0
 from sealfit.ingest.quality import NO_VALUE
 
-BEYOND = 1e-6  # Relative tolerance of the tested range.
+BEYOND = 0.005  # Share of the largest tested value by which a point may exceed the range: rounded units.
 FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 NO_INTERVAL = "no interval: as many parameters in the model as runs; test more speeds"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"

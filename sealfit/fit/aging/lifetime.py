@@ -73,9 +73,11 @@ def lifetime(
     place = _place(law, temperature_C, compression_ratio_pct)
     days = _days(law, law.x, goal, place)
     if 0 < days < FOREVER:
-        with np.errstate(divide="ignore", invalid="ignore"):  # the lifetime may be 0 or inf nearby
+        # The lifetime may be 0 or inf nearby, or change too fast.
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
-        half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if np.isfinite(slope).all() else np.inf
+            known = np.isfinite(slope).all()
+            half = law.t * float(np.sqrt(slope @ law.covariance @ slope)) if known else np.inf
         low, high = (float(days * np.exp(np.clip(s * half, -700, 700))) for s in (-1, 1))
     else:  # the start or the limit of the law may lie on the other side of the threshold
         low, high = (float(end) for end in np.quantile(_drawn(law, goal, place), ENDS, method=OF_DRAWS))

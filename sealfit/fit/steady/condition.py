@@ -345,7 +345,7 @@ def judge(condition: Condition) -> dict[str, tuple[bool, str]]:
         verdict = {name: (known, why or why_not) for name, (known, why) in verdict.items()}
     zero = {name for name, value in zip(condition.names, condition.values, strict=True) if value == 0.0}
     if "sigma_2" in zero:
-        at_zero = "at its physical limit 0: friction does not rise with speed here."
+        at_zero = "at its physical limit 0: this Stribeck curve leaves no rise; faster speeds would show one."
         # A Stribeck curve that falls may hide a rise; few speeds do not show it.
         verdict["sigma_2"] = verdict["v_s"] if condition.few_speeds else (verdict["sigma_2"][0], at_zero)
     for name in zero & {"mu_s", "mu_c"}:
