@@ -203,3 +203,18 @@ def test_runs_that_the_model_goes_through_show_no_scatter():
     for speeds, shown in (((2.0, 6.0, 18.0, 50.0), False), ((2.0, 6.0, 12.0, 18.0, 50.0), True)):
         rows = make_rows(make_bins(speeds=speeds, days=(), repeats=3, bins=4), has_aging=True)
         assert ("run" in {level for level, _ in usable_components(rows)}) == shown
+
+
+def test_components_that_differ_by_orders_of_magnitude_are_all_found():
+    rng = np.random.default_rng(4)
+    codes = {"stroke": np.arange(336), "file": np.arange(336) // 4, "run": np.arange(336) // 12}
+    force = rng.uniform(50, 150, 336) * np.tile([1, -1], 168)
+    file, run = rng.normal(0, 0.01, 84), rng.normal(0, 0.02, 28)
+    residual = force * (file[codes["file"]] + run[codes["run"]]) + rng.normal(0, 0.02, 336)
+    kinds = [(level, kind) for level in codes for kind in ("offset", "gain")]
+    means = GroupMeans(residual, np.full(336, 0.02**2), loads_of(force), Groups.of(codes))
+    _, found = reml(means, Tangent.dense(force[:, None] / np.linalg.norm(force)), kinds)
+    size = {(c.level, c.kind): np.sqrt(c.variance) for c in found}
+    assert 0.008 < size["file", "gain"] < 0.012
+    assert 0.014 < size["run", "gain"] < 0.026
+    assert size["stroke", "gain"] < 1e-4

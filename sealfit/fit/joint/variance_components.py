@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from sealfit.fit.joint.declared import declare, tested_speeds
 from sealfit.fit.joint.rows import LEVELS, Groups, Rows, cached
@@ -28,7 +28,7 @@ from sealfit.ingest.scatter import two_nonnegative
 # The likelihood goes from the finest level up, its gradient back. Searle, Casella & McCulloch 1992,
 # *Variance Components*, doi:10.1002/9780470316856, chapter 6.
 
-# Smallest start of a component, as a share of the residual variance. From 0 a few descents end elsewhere.
+# Smallest start of a component, as a share of the residual variance.
 LEAST_START = 0.03
 # Largest relative standard deviation of a gain. With a larger one a force near 0 would fit any data.
 MOST_GAIN = 0.5
@@ -73,18 +73,32 @@ def reml(
     most = np.where(limited, MOST_GAIN**2 / unit, np.inf)
     high = np.clip(most, LEAST, MOST_SHARE)
     first = np.full(len(kinds), 0.2) if start is None else np.maximum(np.asarray(start) / unit, LEAST_START)
-    # Not standard deviations, whose gradient is 0 at 0: a component that a step makes 0 would stay there.
-    best = minimize(
-        objective,
-        np.minimum(first, 0.36 * high),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(0.0, most) for most in high],
-        options={"maxiter": 200, "ftol": 1e-10},  # so that rounding in the residual changes no estimate
-    )
+    best = _minimum(objective, np.minimum(first, 0.36 * high), high)
     variances = np.where(best.x > LEAST, unit * best.x, 0.0)
     parts = zip(kinds, variances.tolist(), strict=True)
     return float(best.fun), tuple(Component(level, kind, v) for (level, kind), v in parts)
+
+
+def _minimum(
+    objective: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray, high: np.ndarray
+) -> OptimizeResult:
+    """Return the minimum of a function and its gradient between 0 and `high`, shape (k,).
+
+    The first descent is in logarithms, as the slopes along components of different size differ by orders of
+    magnitude, which ends other descents early. The second one is in the variances, so that they may become 0.
+    """
+
+    def in_logarithms(u: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = objective(np.exp(u))
+        return value, gradient * np.exp(u)
+
+    def descend(function: Callable, x: np.ndarray, low: float, high: np.ndarray) -> OptimizeResult:
+        bounds = [(low, most) for most in high]
+        options = {"maxiter": 200, "ftol": 1e-10}  # so that rounding in the residual changes no estimate
+        return minimize(function, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+
+    first = descend(in_logarithms, np.log(start), np.log(LEAST / 10), np.log(high))
+    return descend(objective, np.exp(first.x), 0.0, high)
 
 
 class RestrictedLikelihood:
