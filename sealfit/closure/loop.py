@@ -121,7 +121,8 @@ def close_loop(
         "residuals_after": _residual_table(bins, after, models.held_after),
         **drawn,
     }
-    return Closure(document, to_record(before, after, config), tables, after)
+    candidate = next((e["label"] for e in document["effects"] if e["candidate"]), None)
+    return Closure(document, to_record(before, after, config, candidate), tables, after)
 
 
 def _drawn_tables(

@@ -38,8 +38,11 @@ from sealfit.tables import CHANNELS, CURVES, SHAPE_POINTS, SHAPES
 # ---------------------------------------------------------------- model record
 
 
-def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
-    """Return OUT/model.json: both fitted models with covariance, scatter and tested ranges."""
+def to_record(before: Fitted, after: Fitted, config: Config, candidate: str | None) -> dict:
+    """Return OUT/model.json: both fitted models with covariance, scatter and tested ranges.
+
+    `candidate` is the label of an effect that too few specimens show: it is not in the models.
+    """
     rows, declared, scatter = after.rows, after.model.declared, after.scatter
     series = rows.conditions["series"].to_numpy(dtype=object)[rows.condition]
     speeds = {
@@ -70,6 +73,7 @@ def to_record(before: Fitted, after: Fitted, config: Config) -> dict:
             }
             for own in sandwiches(after)
         ],
+        "candidate": candidate,
         "jumps": [
             {"effect": number, "parameter": name, "low": low, "high": high}
             for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True))

@@ -32,6 +32,7 @@ from sealfit.ingest.quality import NO_VALUE
 BEYOND = 0.005  # Share of the largest tested value by which a point may exceed the range: rounded units.
 FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 NO_INTERVAL = "no interval: as many parameters in the model as runs; test more speeds"
+NOT_IN_MODEL = "without the candidate {}, which too few specimens show"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
 
@@ -65,6 +66,8 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     answer = np.full((len(table), len(FORCE_COLUMNS)), np.nan)
     if not model["scatter"]["of_specimens"]:
         _note(notes, good, TESTED_ONLY)
+    if model["candidate"]:
+        _note(notes, good, NOT_IN_MODEL.format(model["candidate"]))
     if model["df"] == 0:
         _note(notes, good, NO_INTERVAL)
     for jump, inside in _in_gaps(model["jumps"], after, table):

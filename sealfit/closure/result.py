@@ -65,8 +65,9 @@ class BeforeAfter:
 
         With weak evidence the held-out error must be lower. If a level is given, the errors about the means
         of its groups are compared, and the whole errors may be larger by `HARMLESS`. This needs evidence that
-        is not weak, or a held-out error about the means that is halved. With both, and halved in sample too,
-        the whole held-out error is not compared: it is mostly that of the level of other runs.
+        is not weak, or a held-out error about the means that is halved. Otherwise the whole held-out error
+        must be lower too, as the means of the groups would contradict the effect. With both, and halved in
+        sample too, the whole held-out error is not compared: it is mostly that of the level of other runs.
         """
         whole = self._ratios(None)
         inside = whole if around is None else self._ratios(around)
@@ -74,8 +75,9 @@ class BeforeAfter:
             return False
         if around is not None and not weak and max(inside) < criteria.HALVED:
             return whole[0] <= criteria.HARMLESS
-        strong = not weak or inside[1] < criteria.HALVED
-        return max(whole) <= (criteria.HARMLESS if strong else criteria.SAME_ERROR)
+        if not weak or inside[1] < criteria.HALVED:
+            return max(whole) <= criteria.HARMLESS
+        return whole[0] <= criteria.SAME_ERROR and whole[1] < 1
 
     @property
     def halved(self) -> bool:

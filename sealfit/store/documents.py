@@ -189,6 +189,7 @@ MODEL = record(
     covariance=Matrix,
     sandwiches=list[GROUPED],
     jumps=list[JUMP],
+    candidate=Text | None,
     df=Annotated[Number, Field(ge=0)],
     scatter=record(s0=Number, g=Number, of_specimens=StrictBool, components=list[COMPONENT]),
     ranges=dict[Text, Names | tuple[Number, Number]],
