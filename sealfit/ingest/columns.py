@@ -1,5 +1,6 @@
 """Columns of a trace file, columns of a campaign's listing, and the keys of conditions built from them."""
 
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -22,6 +23,8 @@ Columns = dict[str, Column]
 
 LONGEST_LIST = 400  # characters of the names of columns that a message lists
 NO_COLUMN = "there is no such column."
+# A unit at the end of a column's name.
+UNIT_IN_BRACKETS = re.compile(r"[\[(]([^\])]+)[\])]\s*$")
 SLOTS = (*MEASURED, "load_N")  # always numbers
 # Columns that our tables make themselves: a channel of that name gets another, `stroke_file`.
 RESERVED = {*BINS.names(), *RUNS.names(), "line", "steady"} - set(SLOTS)
@@ -310,22 +313,29 @@ def missing_column(column: str | int, layout: FileLayout, fix: str, reason: str 
 
 
 def header_units(layout: FileLayout, settings: TraceFormat, units: Units, clock: bool) -> list[Fault]:
-    """Return a warning for each slot with another unit in the header than that its numbers are taken in.
+    """Return a warning for each column with another unit in the header than that its numbers are taken in.
 
     With `clock` the times are times of day, whatever the header says.
     """
     faults, names = [], layout.names
     row = split_line(layout.header[-1], settings.delimiter) if settings.units_row and layout.header else []
-    for ours in SLOTS[1:] if clock else SLOTS:
-        column = settings.columns.get(ours)
-        if column is None or column.name not in (*names, *range(1, len(names) + 1)):
+    for ours, column in settings.columns.items():
+        taken = "" if clock and ours == SLOTS[0] else column.unit or units.of(ours)
+        if column.name not in (*names, *range(1, len(names) + 1)) or not taken:
             continue
         at = column.name - 1 if isinstance(column.name, int) else names.index(column.name)
-        cell = row[at].strip(" []") if at < len(row) else ""
-        said = cell if cell[:1].isalpha() else names[at].rpartition("[")[2].rpartition("]")[0].strip()
+        cell = row[at].strip(" []()") if at < len(row) else ""
+        said = cell if cell[:1].isalpha() else _unit_in_name(names[at], taken)
         place = {"line": layout.names_line, "column": names[at]}
-        faults += unit_said(said, ours, column, column.unit or units.of(ours), "trace.columns", place)
+        faults += unit_said(said, ours, column, taken, "trace.columns", place)
     return faults
+
+
+def _unit_in_name(name: str, taken: str) -> str:
+    """Return the unit in brackets at the end of a name. Round ones may hold anything but another unit."""
+    found = UNIT_IN_BRACKETS.search(name)
+    said = found[1].strip() if found else ""
+    return "" if name.endswith(")") and not other_unit(said, taken) else said
 
 
 def unit_said(

@@ -352,7 +352,7 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
         if other != i:
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
             fix = "Give every file of a run its own repeat number, files of different runs a run_id each, "
-            fix += "or each stroke of a repeat its number."
+            fix += "or each stroke of a repeat its number. Is the speed of one of the two right?"
             if conditions[i].startswith(UNAGED):
                 fix += " Pieces of unaged rubber that were tested with several series "
                 fix += "need a specimen_id each."

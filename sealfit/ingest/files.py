@@ -13,8 +13,9 @@ from pathlib import Path, PurePosixPath
 import regex
 
 from sealfit.config import Config, TraceFormat
-from sealfit.errors import ROW_OUT, BadFile, ConfigError, Fault, did_you_mean, shortened
+from sealfit.errors import KEPT, ROW_OUT, BadFile, ConfigError, Fault, did_you_mean, shortened
 from sealfit.store.manifest import Fingerprint, fingerprint_of
+from sealfit.units import other_unit
 
 LINE_ENDS = b"\r\n\x1a"  # the last is DOS's end of a file
 MOST_CUT = 0.25  # Largest share of text files without a line end that are taken for cut: one of four.
@@ -122,6 +123,8 @@ def read_marked(campaign: Path, file: str, *, head: bool = False) -> tuple[bytes
 
 # ---------------------------------------------------------------- text
 
+# The rest of a header line after a number, if it is a unit.
+AT_END = regex.compile(r"""[\s"',;\[(]*([^\W\d_][^\s"',;\])]*)[\s"',;\])]*""")
 TEXT_COLUMNS = ("run_id", "specimen_id", "started_at")  # "007" is a name here, not the number 7
 
 HEAD_BYTES = 65_536  # a header longer than this is no header
@@ -267,10 +270,7 @@ def header_fields(header: tuple[str, ...], config: Config) -> dict[str, float | 
     """Return the channels that a config reads from header lines: the first match of each, in our units."""
     found: dict[str, float | str] = {}
     units = config.conversions("names")
-    for name, pattern in config.trace.header_fields.items():
-        match = next(filter(None, (found_by(pattern, line) for line in header)), None)
-        if match is None:
-            continue
+    for name, _, match in _first_matches(header, config):
         value = (match.group(1) if match.re.groups else match.group()) or ""
         stays = name in (*TEXT_COLUMNS, *config.files.text_parts)
         number = None if stays else as_number(value, config.trace.decimal)
@@ -278,6 +278,29 @@ def header_fields(header: tuple[str, ...], config: Config) -> dict[str, float | 
             number = units[name].of_cell(number)
         found[name] = value.strip() if number is None else number
     return found
+
+
+def _first_matches(header: Sequence[str], config: Config) -> Iterator[tuple[str, int, regex.Match]]:
+    """Yield the name of each header field that is found, its line from 1, and the match."""
+    for name, pattern in config.trace.header_fields.items():
+        lines = ((number, found_by(pattern, line)) for number, line in enumerate(header, start=1))
+        if found := next((pair for pair in lines if pair[1] is not None), None):
+            yield name, *found
+
+
+def header_field_units(header: Sequence[str], config: Config) -> list[Fault]:
+    """Return a warning for each header line that ends in another unit than its number is taken in."""
+    faults = []
+    for name, line, match in _first_matches(header, config):
+        taken = config.files.units.get(name) or config.units.of(name)
+        said = AT_END.fullmatch(match.string, match.end(1 if match.re.groups else 0))
+        unit = other_unit(said[1], taken) if said and taken else None
+        if unit is not None:
+            reason = f"the header line says '{said[1]}', and the config takes the number in {taken}."
+            fix = f'If the line is right, set {name} = "{unit or said[1]}" under [files.units]. '
+            fix += "Files with another unit than the rest need a config of their own."
+            faults.append(Fault("unit", reason, fix=fix, line=line, column=name, **KEPT))
+    return faults
 
 
 def as_number(cell: str, decimal: str = ".") -> float | None:

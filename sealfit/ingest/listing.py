@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sealfit.config import AGING_CONDITION, Config, Files
 from sealfit.errors import KEPT, NOTED, BadFile, CampaignError, ConfigError, Fault, nearest, printable
-from sealfit.ingest.columns import NO_COLUMN, Columns, mapped, suggestion, unit_said
+from sealfit.ingest.columns import NO_COLUMN, UNIT_IN_BRACKETS, Columns, mapped, suggestion, unit_said
 from sealfit.ingest.expression import evaluate, parse
 from sealfit.ingest.files import TEXT_COLUMNS, as_number, found_by, inside, split_line
 from sealfit.ingest.workbooks import text_of_runs
@@ -22,7 +22,6 @@ from sealfit.store.paths import runs_tables
 from sealfit.units import Conversion
 
 NUMBERS = (*AGING_CONDITION, "load_N", "speed_mm_s")
-UNIT_IN_BRACKETS = re.compile(r"[\[(]([^\])]+)[\])]\s*$")
 KNOWN = (*TEXT_COLUMNS, *NUMBERS, "repeat")
 # Words, and codes of loggers, for no value.
 MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "-", "?", "-999", "-9999", "-99999"}

@@ -28,6 +28,7 @@ from sealfit.ingest.files import (
     as_utf8,
     bad_file,
     find_layout,
+    header_field_units,
     header_fields,
     in_file,
     placed,
@@ -67,7 +68,8 @@ def parse_trace(raw: bytes, ref: TraceRef, config: Config) -> Trace:
         else:
             rows = _read_text(content, layout, settings, ref.cut)
         trace = _trace(rows, layout, ref, config)
-        trace = trace.with_faults(header_units(layout, settings, config.units, trace.clock))
+        units = header_units(layout, settings, config.units, trace.clock)
+        trace = trace.with_faults([*units, *header_field_units(layout.header, config)])
     return replace(trace, faults=placed(trace.faults, ref.file))
 
 

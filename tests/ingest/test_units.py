@@ -189,3 +189,33 @@ def test_units_as_a_draft_writes_them_are_those_of_the_header():
     said = {text: unit.name for text in spelled if (unit := unit_of(text)) is not None}
     assert {text for text, unit in said.items() if other_unit(text, unit) is not None} == set()
     assert [other_unit(text, "N") for text in ("kN", "G", "MN")] == ["kN", "gf", "MN"]
+
+
+@pytest.mark.parametrize("form", ["(N)", "[N]", "N"])
+def test_a_row_of_units_may_have_brackets_and_counts_for_columns_of_the_campaign_too(tmp_path, form):
+    rows = [f"s,mm,{form}", *ROWS]
+    rig = "trace.units_row = true\n[trace.columns]\ntime_s = 'time_s'\ndisplacement_mm = 'displacement_mm'\n"
+    for name, unit, said in (("force_N", "lbf", 1), ("force_raw_N", "kN", 1), ("force_N", "N", 0)):
+        own = rig + f"{name} = {{name = 'force_N', unit = '{unit}'}}\n"
+        own += "[trace.compute]\nforce_N = '-force_raw_N'\n" if name != "force_N" else ""
+        found = read(tmp_path, csv_of(rows), own).faults
+        assert [f.check for f in found] == ["unit"] * said
+        assert all(f"says 'N', and the config takes the numbers in {unit}" in f.reason for f in found)
+
+
+@pytest.mark.parametrize(
+    ("line", "warned"),
+    [
+        ('# "Normal load","111.2","N"', True),
+        ('# "Normal load","25.00","lbf"', False),
+        ("# Normal load: 25.00", False),
+        ("# Normal load: 25.00 in the oven", False),
+        ("# Normal load: 111.2 [N]", True),
+    ],
+)
+def test_a_header_line_with_another_unit_is_a_warning(tmp_path, line, warned):
+    rig = "trace.header_lines = 2\nfiles.units.load_N = 'lbf'\n"
+    rig += "trace.header_fields.load_N = 'Normal load\\W*([\\d.]+)'\n"
+    found = read(tmp_path, f"{line}\n{csv_of(ROWS)}", rig).faults
+    assert [f.check for f in found] == ["unit"] * warned
+    assert not warned or "the header line says 'N', and the config takes the number in lbf" in found[0].reason
