@@ -295,13 +295,14 @@ def _samples(trace: Trace, strokes: Sequence[Stroke], config: Config) -> dict[st
     first = int(trace.channels.get("stroke", 1))  # other files hold the strokes of the record before it
     size = [stroke.stop - stroke.start for stroke in strokes]
     origin = np.array([stroke.origin for stroke in strokes])
+    since = time_s[origin] if len(strokes) > 1 else np.zeros(1)
     turn, turns = config.strokes.turn, np.zeros(len(strokes))  # where the turn of each stroke begins
     if turn is not None:
         middle = [np.median(displacement[stroke.start : stroke.stop]) for stroke in strokes]
         turns = turn * np.floor(np.array(middle) / turn)
     return {
         "stroke": np.repeat(np.arange(len(strokes)), size) + first,
-        "time_s": time_s - np.repeat(time_s[origin], size),
+        "time_s": time_s - np.repeat(since, size),
         "displacement_mm": displacement - np.repeat(turns, size),
         "force_N": force,
         "steady": np.concatenate([stroke.steady for stroke in strokes]),

@@ -156,9 +156,9 @@ def test_the_force_of_a_ramp_is_friction_once_the_mass_is_taken_off(tmp_path):
     for mass, expected in ((0.0, 4.0), (MASS_KG, 0.0)):
         tables = ingested(tmp_path / f"{mass:g}", [(time, x, force)], ONE + f"rig.moving_mass_kg = {mass}\n")
         trace = tables.tables["traces"]
-        for begin, end, sign in ((0.2, 0.4, 1), (1.6, 1.8, -1)):  # from the start of the motion
+        for begin, end, sign in ((0.5, 0.7, 1), (1.9, 2.1, -1)):
             own = trace["time_s"].between(begin, end)
-            speed, _ = np.polyfit(trace["time_s"][own], trace["displacement_mm"][own], 1)  # of the mean
+            speed = np.interp(trace["time_s"][own], [0.3, 0.8, 1.8, 2.3], [0.0, 50.0, 50.0, 0.0])
             more = trace["force_N"][own] - MU * LOAD_N - SIGMA_2 * speed
             assert more.mean() == pytest.approx(sign * expected, abs=0.1)
 
@@ -186,12 +186,3 @@ def test_the_inertia_of_a_motion_in_steps_of_the_encoder_is_smooth(speed):
     x = np.round(speed * time, 1)
     noise = max(displacement_noise_mm(x, order=4), resolution_mm(x) / np.sqrt(12.0))
     assert np.abs(acceleration(time, x, noise, 500.0)).max() < 5000.0  # a step is 0.1 mm / (1 ms)^2 = 1e5
-
-
-def test_time_counts_from_the_start_of_the_motion_however_long_the_rig_rests_before_it(tmp_path):
-    found = []
-    for rest in (0.3, 2.3):
-        own = moved([(rest, 0.0), (0.1, 20.0), (1.0, 20.0), (0.1, 0.0), (0.3, 0.0)], mass_kg=0.0)
-        found.append(ingested(tmp_path / f"{rest:g}", [own]).tables["bins"]["time_s"].to_numpy())
-    npt.assert_allclose(found[1], found[0], atol=0.02)
-    assert 0.0 < found[0][0] < 0.3
