@@ -87,7 +87,7 @@ def specimens_clause(specimens: Mapping | None) -> str:
     """Return the scatter of specimens and whether intervals contain it, in words; "" if nothing is known."""
     if specimens is None or specimens["sd_pct"] is None:
         return specimens["remark"] if specimens else ""
-    return f"{specimens['sd_pct']:.2g} %, {specimens['remark']}"
+    return f"{specimens['sd_pct']:.2g} % {specimens['remark']}"
 
 
 def property_lines(properties: Sequence[Mapping]) -> list[str]:

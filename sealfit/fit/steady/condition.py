@@ -237,8 +237,8 @@ class SpecimenScatter:
         if not self.df:
             return ""
         others = " and of ".join(name for name in self.variances if name != FRICTION)
-        others = others and f", and that of {others}"
-        return f"scatter of the specimens' friction{others}, in the intervals; {self.df} degrees of freedom."
+        others = others and f" and that of {others}"
+        return f"scatter of friction; the intervals contain it{others} ({self.df} degrees of freedom)."
 
     def variance_of(self, condition: Condition) -> np.ndarray:
         """Return the variance that the scatter of specimens gives to the parameters, shape (p,)."""
