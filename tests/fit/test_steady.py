@@ -485,3 +485,9 @@ def test_specimens_that_differ_in_v_s_widen_its_interval(campaign):
     same = fit_conditions(table, Config())
     assert steady(differs, "v_s").se > 4 * steady(same, "v_s").se
     assert "v_s" in statistic(differs, "specimen_sd_pct").reason
+
+
+def test_specimens_with_exact_forces_are_fitted_too(campaign):
+    fits = fit_conditions(campaign(**{**PIECES, "noise": 0.0}, specimens=3, repeats=1), Config())
+    npt.assert_allclose([steady(fits, name).value for name in TRUTH], list(TRUTH.values()), rtol=1e-6)
+    assert statistic(fits, "specimen_sd_pct").value < 1e-6

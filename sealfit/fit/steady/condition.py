@@ -24,6 +24,8 @@ from sealfit.physics import stribeck_force
 FULL, VISCOUS, CONSTANT = 4, 2, 1
 # Level of the test for a Stribeck curve.
 SIGNIFICANT = 0.05
+# Smallest chi-square that is divided by: exact forces leave none.
+TINY = 1e-300
 # Specimens that differ by a factor of all friction.
 FRICTION = "friction"
 # Parameters of each model.
@@ -193,7 +195,7 @@ def find_specimens(conditions: list[Condition]) -> None:
         parts = [_specimen_part(c, differs) for c in conditions]
         found = [(c, part) for c, part in zip(conditions, parts, strict=True) if 0 < part.df < c.df_within]
         explained, df = (sum(getattr(part, name) for _, part in found) for name in ("explained", "df"))
-        rest = sum(c.chi2_within for c, _ in found) - explained
+        rest = max(sum(c.chi2_within for c, _ in found) - explained, TINY)
         rest_df = sum(c.df_within for c, _ in found) - df
         if df and (differs == FRICTION or fdtrc(df, rest_df, explained / df * rest_df / rest) <= POOLING_P):
             for condition, part in found:
