@@ -332,7 +332,10 @@ def header_units(layout: FileLayout, settings: TraceFormat, units: Units, clock:
 
 
 def _unit_in_name(name: str, taken: str) -> str:
-    """Return the unit in brackets at the end of a name. Round ones may hold anything but another unit."""
+    """Return the unit in brackets at the end of a name; "" if round ones hold no other unit of its quantity.
+
+    Round brackets may hold a remark: the "(s)" of a displacement is no unit.
+    """
     found = UNIT_IN_BRACKETS.search(name)
     said = found[1].strip() if found else ""
     return "" if name.endswith(")") and not other_unit(said, taken) else said

@@ -272,6 +272,7 @@ def test_what_ripples_gain_is_seen_inside_strokes():
     assert not ends(1.2).gains("stroke", weak=False)
     assert ends(1.1).gains("stroke", weak=True)
     assert ends(1.1, left=0.8).gains("stroke", weak=False)
+    assert not ends(1.1, left=0.8).gains("stroke", weak=True)
     assert not ends(1.015, left=0.8).gains("stroke", weak=True)  # the whole error grows by less than 0.5 %
     assert ends(1.0, left=0.8).gains("stroke", weak=True)
     assert ends(40.0, determined=~every).gains("stroke", weak=False)

@@ -235,7 +235,7 @@ class SpecimenScatter:
     def remark(self) -> str:
         """What the intervals contain of it."""
         if self.single:
-            return "no condition has several specimens: the intervals hold for those tested."
+            return "one per condition; the intervals hold for those tested."
         if not self.df:
             return ""
         others = " and of ".join(name for name in self.variances if name != FRICTION)
