@@ -18,7 +18,7 @@ from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri, stdtrit
 from sealfit.closure import criteria
 from sealfit.closure.channels import FINER, Channel, scatter_level, too_short
 from sealfit.closure.confirm import about_means, error_of_rise_N
-from sealfit.closure.multiplicity import critical_many, critical_small_sample
+from sealfit.closure.multiplicity import critical_many, critical_small_sample, number_of_contrasts
 from sealfit.closure.score_test import Candidate, ScoreTests, project
 from sealfit.closure.selection import Selection
 from sealfit.closure.small_sample_test import (
@@ -163,7 +163,8 @@ class _Search:
         slopes = [j.slopes for j in results if j.slopes]
         small_sample = [test for c in self.candidates if (test := self._retested(c)) is not None]
         many = [j for j in results if j.small_sample is None and not j.slopes]
-        self.contrasts = N_VARIANCES * sum(own[0].slope.size for own in slopes)
+        contrasts = N_VARIANCES * number_of_contrasts(self.candidates)
+        self.contrasts = {c.channels: n for c, n in zip(self.candidates, contrasts, strict=True)}
         tests = [test for own in slopes for test in own]
         self.moderated = {id(t): m for t, m in zip(tests, moderated(tests), strict=True)}
         lines = [c for c in self.candidates if c.test_result.slopes and c.target == FRICTION and not c.pair]
@@ -242,7 +243,7 @@ class _Search:
             units = [ClusterTests(one, known.level) for one in (noise, effect)]
             by_test = min(_by_numbers(units, left, known.target, tail) for left in variants)
         if test_result.slopes:
-            tail = self.level / self.contrasts / (1 if known is None else N_VARIANCES)
+            tail = self.level / self.contrasts[candidate.channels] / (1 if known is None else N_VARIANCES)
             pairs = zip(variants, test_result.slopes, strict=True)
             return max(by_test, min(self._by_slopes(noise, effect, left, test, tail) for left, test in pairs))
         if known is not None:

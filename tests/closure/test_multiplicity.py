@@ -160,6 +160,10 @@ def test_draws_of_four_numbers_have_uniform_p_values():
     assert np.mean(p_values < 0.1) == pytest.approx(0.1, abs=0.02)  # four standard errors
 
 
+def candidate(name, result):
+    return Candidate((name,), "mu", "multiply", "run", np.ones((4, 1)), result)
+
+
 def slopes_of(*sizes):
     """Contrasts of some sizes, in standard errors, from eight units that differ by noise."""
     deviations = np.random.default_rng(2).normal(size=(8, len(sizes)))
@@ -171,27 +175,35 @@ def slopes_of(*sizes):
 def test_contrasts_are_adjusted_by_how_many_there_are():
     first, second = slopes_of(6.0, 0.5), slopes_of(1.0)
     results = [ScoreTestResult(1.0, 1, 8, NOWHERE, slopes=(test,)) for test in (first, second)]
-    found = adjust_slopes([*results, ScoreTestResult(1.0, 1, 8, NOWHERE)])
+    results.append(ScoreTestResult(1.0, 1, 8, NOWHERE))
+    found = adjust_slopes([candidate("oil", result) for result in results])
     logs = slope_log_p([first, second])
     assert found[0] == pytest.approx(3 * np.exp(logs[0].min()))  # three contrasts in all
     assert found[0] < 0.01
     assert found[1:].tolist() == [1.0, 1.0]
 
 
+def test_the_variables_of_operation_have_half_of_the_error_rate():
+    first, second = slopes_of(6.0), slopes_of(*[0.5] * 40)
+    results = [ScoreTestResult(1.0, 1, 8, NOWHERE, slopes=(test,)) for test in (first, second)]
+    of_speed, of_column = (
+        adjust_slopes([candidate(name, results[0]), candidate("oil", results[1])])[0]
+        for name in ("speed_mm_s", "humidity")
+    )
+    assert of_speed == pytest.approx(2 * np.exp(slope_log_p([first, second])[0][0]))
+    assert of_column == pytest.approx(41 / 2 * of_speed)
+
+
 def test_of_the_variants_of_a_contrast_that_counts_which_says_least():
     weak, strong = slopes_of(2.0), slopes_of(9.0)
     both = ScoreTestResult(1.0, 1, 8, NOWHERE, slopes=(strong, weak))
-    (found,) = adjust_slopes([both])
+    (found,) = adjust_slopes([candidate("oil", both)])
     logs = slope_log_p([strong, weak])
     assert found == pytest.approx(np.exp(logs[1][0]))
     assert logs[0][0] < logs[1][0]
 
 
 # ---------------------------------------------------------------- a whole search
-def candidate(name, result):
-    return Candidate((name,), "mu", "multiply", "run", np.ones((4, 1)), result)
-
-
 def test_a_search_says_the_strongest_evidence_first_with_p_values_for_two_searches():
     given = [candidate("idle", scored(np.array([[1.0], [-1.0]] * 4))), candidate("oil", alike(8))]
     found = adjust_all(
