@@ -62,11 +62,17 @@ DISTANCE = Column("distance_mm", "distance slid since the start of the motion")
 TIME = Column("time_s", "time in the file; from the start of the motion in a file of several strokes")
 RUN_ORDER = Column("run_order", "place of the file in the order of started_at; null if not given")
 ELAPSED = Column("elapsed_h", "time since the campaign's first file; null if not given")
-CALENDAR = ("run_order", "elapsed_h")  # both from started_at
+USE = Column(
+    "specimen_use",
+    "place of the file among those of its specimen, in the order of started_at; null if fewer than two "
+    "specimens are named",
+)
+CALENDAR = ("run_order", "elapsed_h")  # when a file was recorded, from started_at
+HISTORY = (*CALENDAR, "specimen_use")  # what was recorded before it
 
 _CONDITION = (CONDITION, SERIES, RUBBER)
 _SETTINGS = (SPEED, SPEED_SET, LOAD)
-_WHEN = (RUN_ORDER, ELAPSED)
+_WHEN = (RUN_ORDER, ELAPSED, USE)
 KEYS = (FILE, RUN, REPEAT, STROKE, DIRECTION, SPECIMEN, *_CONDITION)
 
 # ---------------------------------------------------------------- ingest

@@ -99,6 +99,7 @@ _MEANING = {
     "distance_mm": "sliding distance",
     "run_order": "run order",
     "elapsed_h": "time since first run",
+    "specimen_use": "use of the specimen",
     "aging_days": "aging time",
     "temperature_C": "aging temperature",
     "compression_ratio_pct": "compression ratio",

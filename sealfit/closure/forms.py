@@ -22,7 +22,7 @@ from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Term, mean_derivatives, shape_of
 from sealfit.fit.joint.rows import Rows
 from sealfit.fit.steady import FORCES
-from sealfit.tables import CALENDAR
+from sealfit.tables import HISTORY
 
 ADDED, MU = ("force", "add"), ("mu", "multiply")
 MOST_PLACES = 60  # Largest number of places of a jump on a grid, or of pairs of two jumps.
@@ -126,7 +126,7 @@ def _may_follow(effect: Effect, channel: Channel, fitted: Fitted) -> bool:
     if effect.id == "offset_slope":  # not along strokes, and not if the offset is in the model
         has_offset = any(term.effect.id == "zero_offset" for term in fitted.model.terms)
         return FINER[channel.unit] > FINER["stroke"] and not has_offset
-    return channel.name not in CALENDAR or effect.along_calendar
+    return channel.name not in HISTORY or effect.along_calendar
 
 
 def _all_read(

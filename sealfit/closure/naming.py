@@ -26,7 +26,7 @@ from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Model
 from sealfit.fit.joint.search import search_nonlinear, solve_linear
 from sealfit.fit.joint.whitening import Scatter, Whitening
-from sealfit.tables import CALENDAR
+from sealfit.tables import HISTORY
 
 REFITTED = 8  # Proposals that are refitted jointly.
 FORMS_EACH = 2  # Proposals that are refitted for each further quantity and each further set of variables.
@@ -50,7 +50,7 @@ def propose(
     forms = [(*form, c) for c in contenders for form in terms_of(c, channels, fitted, effects)]
     forms.sort(key=lambda form: (form[2].channels[-1], form[0].effect.id))  # the order of exact equals
     found = [*also, *(p for form in forms for p in linearised(fitted, *form))]
-    calendar = [p for p in found if set(p.term.channels) & set(CALENDAR)]
+    calendar = [p for p in found if set(p.term.channels) & set(HISTORY)]
     others = [p for p in found if p not in calendar]
     most, of_others = (max((p.chi2 for p in own), default=-np.inf) for own in (calendar, others))
     if not calendar or of_others < criteria.HALF_OF_CALENDAR * most:

@@ -23,7 +23,7 @@ from sealfit.fit.joint.model import Model, Term, evaluate, mean_derivatives
 from sealfit.fit.joint.rows import ALONG, POWER, Rows, sliding_power
 from sealfit.fit.joint.search import bounds_of
 from sealfit.ingest.columns import condition_columns
-from sealfit.tables import CALENDAR
+from sealfit.tables import HISTORY
 
 # ---------------------------------------------------------------- aliases
 # A sensor offset in a campaign with one direction is the same as friction; a drift over time, with one
@@ -296,7 +296,7 @@ def _followed(rows: Rows, channels: Sequence[str]) -> dict[str, str]:
     numeric = [n for n in channels if n not in ("direction", AGING) and rows.unsigned(n).dtype.kind == "f"]
     ranks = {name: pd.Series(rows.unsigned(name)).rank() for name in numeric}
     for one, other in itertools.combinations(numeric, 2):
-        calendar = (one in CALENDAR) + (other in CALENDAR)
+        calendar = (one in HISTORY) + (other in HISTORY)
         if calendar != 1 and one not in found and abs(ranks[one].corr(ranks[other])) > ONE_ORDER:
             found.setdefault(other, one)
     return found

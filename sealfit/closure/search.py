@@ -34,6 +34,7 @@ from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import LEVELS, POWER, Rows, open_columns
 from sealfit.fit.joint.variance_components import orthonormal
+from sealfit.tables import HISTORY
 
 TARGETS = (
     ("mu", "multiply"), ("force", "add"), ("force", "multiply"), ("mu_s", "multiply"), ("mu_c", "multiply"),
@@ -221,7 +222,7 @@ def _allowed(channel: Channel, acts_on: str, operation: str, both_ways: bool, lo
 # The variable whose influence each coefficient describes.
 VARIABLE_OF = {"a": "aging_days", "b": "aging_days", "v_s": "speed_mm_s", "sigma_2": "speed_mm_s"}
 # Direction has tests of its own, and the calendar interacts with nothing.
-NOT_IN_PAIRS = {"direction", "run_order", "elapsed_h"}
+NOT_IN_PAIRS = {"direction", *HISTORY}
 
 
 def search_pairs(

@@ -35,6 +35,7 @@ from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import ALONG, LEVELS
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
+from sealfit.tables import HISTORY
 
 TINY = 1e-6  # Size of an effect, as a share of the force, that changes no estimate.
 # Ratio of the stated size to that which is significant with a power of 80 %. Some significant effects are
@@ -48,7 +49,7 @@ SPECIMEN, SPECIMENS = "specimen_id", "specimen"
 FRICTION = ("mu", "multiply")
 
 # Channels that describe the order of the tests. They do not make the verdict `cannot_tell`.
-ASIDE = ("run_order", "elapsed_h", "repeat")
+ASIDE = (*HISTORY, "repeat")
 LEVEL_NAMES = {
     "sample": "trace", "stroke": "stroke", "file": "repeat", "run": "run", "set_up": "set_up",
     "specimen": "condition",

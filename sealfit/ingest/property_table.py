@@ -13,10 +13,10 @@ from sealfit.ingest.cells import LISTED
 from sealfit.ingest.columns import NO_COLUMN, Columns, keys_of, known, suggestion, where
 from sealfit.ingest.listing import Entry, read_table, stopped
 from sealfit.store.manifest import BATCH
-from sealfit.tables import CALENDAR
+from sealfit.tables import HISTORY
 
 DAYS = "aging_days"
-NO_PROPERTY = (*derived.NUMBERS, *derived.COUNTS, *CALENDAR)  # columns of numbers
+NO_PROPERTY = (*derived.NUMBERS, *derived.COUNTS, *HISTORY)  # columns of numbers
 LABELS = ("specimen_id", "run_id", "file", "started_at", BATCH)  # columns that are read as labels
 
 

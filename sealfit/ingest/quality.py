@@ -16,7 +16,7 @@ from sealfit.errors import KEPT, NOTED, STROKE_OUT, ConfigError, Fault
 from sealfit.ingest.cells import Trace
 from sealfit.ingest.strokes import Stroke
 from sealfit.ingest.trace_checks import resolution, with_unit
-from sealfit.tables import CALENDAR, QUALITY, STEADY
+from sealfit.tables import CALENDAR, HISTORY, QUALITY, STEADY
 from sealfit.units import Conversion, conversion
 
 LEAST_DIFFERENT = 10  # forces at the beginning of a stroke that tell it from others
@@ -308,7 +308,7 @@ def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) ->
     used = steady[steady["used"].to_numpy(bool)]
     aged = used["aging_days"] != 0 if aged_only else True
     files = used["file"].nunique()
-    fixed, faults = set(STEADY.names()) - set(CALENDAR) - {"load_N"}, []
+    fixed, faults = set(STEADY.names()) - set(HISTORY) - {"load_N"}, []
     for name in used.columns:
         if name in fixed:
             continue
@@ -316,7 +316,8 @@ def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) ->
         if 0 < missing < files:
             follows = _what_follows(name, used[name], missing / files)
             reason = f"{missing} of {files} files have no value: {follows}."
-            fix = "Fill started_at." if name in CALENDAR else "Fill it for these files too."
+            from_columns = "started_at" if name in CALENDAR else "started_at and specimen_id"
+            fix = f"Fill {from_columns}." if name in HISTORY else "Fill it for these files too."
             if NO_VALUE in follows:
                 fix += " If it holds remarks, list it under loop.ignore_channels."
             about = {"column": name, "value": float(missing), "fix": fix, **KEPT}
@@ -328,7 +329,7 @@ def _what_follows(name: str, column: pd.Series, share: float) -> str:
     if name == "load_N":
         return "the loop fits forces in place of coefficients"
     numeric = pd.api.types.is_numeric_dtype(column)
-    if name in CALENDAR or (numeric and share > 1 - LEAST_KNOWN):
+    if name in HISTORY or (numeric and share > 1 - LEAST_KNOWN):
         return "the search for effects leaves the column out"
     if numeric:
         return "the search for effects takes them at the mean of their run, else of all files"

@@ -90,7 +90,7 @@ def join_date_and_time(entries: list[Entry], columns: Columns, config: Config) -
 
 
 def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[Columns, list[Fault]]:
-    """Return the columns with `run_order` and `elapsed_h` where files have start times; faults of bad times.
+    """Return the columns with `HISTORY` where files have start times, and faults of bad times.
 
     Times in one of the config's formats, and Excel's serial numbers, become ISO 8601. Equal times share their
     order. A time with a zone is an instant; one without is UTC beside others with zones.
@@ -121,7 +121,11 @@ def add_order(entries: list[Entry], columns: Columns, config: Config) -> tuple[C
     if not moments.notna().any():
         return columns, faults
     hours = (moments - moments.min()) / pd.Timedelta(hours=1)
-    for name, values in (("run_order", moments.rank(method="min")), ("elapsed_h", hours)):
+    orders = {"run_order": moments.rank(method="min"), "elapsed_h": hours}
+    specimens = pd.Series(columns.get("specimen_id", [None] * len(entries)), dtype=object)
+    if specimens.nunique() > 1:
+        orders["specimen_use"] = moments.groupby(specimens).rank(method="min")
+    for name, values in orders.items():
         columns[name] = values.astype(object).where(values.notna(), None).tolist()
     return columns, faults
 

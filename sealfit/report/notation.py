@@ -8,7 +8,7 @@ from markupsafe import Markup, escape
 
 from sealfit.config import Config
 from sealfit.ingest.columns import UNAGED
-from sealfit.tables import CALENDAR
+from sealfit.tables import HISTORY
 from sealfit.units import Units
 
 NOTHING = "–"
@@ -145,7 +145,7 @@ GREEK = {
 _SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])(?:_?([0-9]+)|_([A-Za-z0-9]{{1,4}}))?")
 _SLOTS = ("speed_set_mm_s", "displacement_from_mm", "displacement_to_mm", "displacement_mm", "distance_mm",
           "speed_mm_s", "force_N", "load_N", "time_s", "aging_days", "temperature_C",
-          "compression_ratio_pct", *CALENDAR)  # fmt: skip
+          "compression_ratio_pct", *HISTORY)  # fmt: skip
 
 
 def symbol_html(name: str) -> Markup:

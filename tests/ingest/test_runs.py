@@ -32,12 +32,21 @@ def test_full_table_reads_as_written(tmp_path):
         "started_at": "2024-03-01T09:00:00",
         "run_order": 2.0,
         "elapsed_h": 1.0,
+        "specimen_use": 1.0,
         "batch": "A",
         "humidity_pct": 40.0,
     }
     assert refs[1].channels["elapsed_h"] == 2.5
     assert refs[2].channels["run_order"] == 1.0
     assert "humidity_pct" not in refs[1].channels
+
+
+def test_the_files_of_each_named_specimen_are_counted(tmp_path):
+    refs, _ = list_traces(campaign(tmp_path, FULL), config())
+    assert [ref.channels["specimen_use"] for ref in refs] == [1.0, 2.0, 1.0]
+    one_specimen = FULL.replace("S2", "S1")  # it would be a copy of run_order
+    refs, _ = list_traces(campaign(tmp_path / "one", one_specimen), config())
+    assert "specimen_use" not in refs[0].channels
 
 
 @pytest.mark.parametrize("change", [("a.csv", '"a.csv"'), ("B,42.5", "B,42.5,"), ("b.csv", " b.csv")])
