@@ -125,7 +125,7 @@ def test_document_is_json_and_tables_keep_their_schemas(warming):
     assert after["weight"].sum() == pytest.approx(1.0)
     rmse = np.sqrt(after["weight"] @ after["residual_N"] ** 2)
     assert rmse == pytest.approx(closure.document["after"]["rmse_N"])
-    lacking = {"presliding_N", "speed_bin_mm_s"}  # of bins made without traces
+    lacking = {"presliding_N", "speed_bin_mm_s", "specimen_use"}  # of bins made without traces
     assert set(RESIDUALS_AFTER.names()) - lacking <= set(after.columns)
 
 

@@ -344,14 +344,21 @@ def without_load_noise(bins: pd.DataFrame) -> pd.DataFrame:
 
     Deviations from a stroke's mean are multiplied by their reliability, the share of their variance that is
     not noise (regression calibration: Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapter
-    4). The noise is estimated from the differences of neighbours. The force does not follow it.
+    4). The noise is estimated from the differences of neighbours, less the share that the force follows:
+    this is a change of the load itself.
     """
     if "load_N" not in bins or bins["load_N"].isna().any():
         return bins
-    load, stroke = bins["load_N"].to_numpy(dtype=float), bins["stroke_id"].to_numpy()
-    deviation = load - bins.groupby("stroke_id")["load_N"].transform("mean").to_numpy()
+    values = bins[["load_N", "force_N"]].astype(float)
+    load, force = values.to_numpy().T
+    mean_load, mean_force = values.groupby(bins["stroke_id"]).transform("mean").to_numpy().T
+    deviation = load - mean_load
     squares = float(deviation @ deviation)  # with as many degrees of freedom as there are neighbours
-    noise = float((np.diff(load)[np.diff(stroke) == 0] ** 2).sum()) / 2
+    neighbours = np.diff(bins["stroke_id"]) == 0
+    change, of_force = np.diff(load)[neighbours], np.diff(force)[neighbours]
+    expected = (mean_force / mean_load)[1:][neighbours] * change  # if the force follows the load
+    followed = np.clip(of_force @ expected / max(expected @ expected, 1e-300), 0.0, 1.0)
+    noise = float((1.0 - followed) * (change @ change)) / 2
     return bins.assign(load_N=load - deviation * min(noise / squares, 1.0)) if squares > 0 else bins
 
 
