@@ -11,7 +11,7 @@ import pandas as pd
 
 from sealfit.closure import criteria
 from sealfit.closure.channels import follows_strokes, level_values, settings, varies
-from sealfit.closure.errors_and_intervals import mean_se
+from sealfit.closure.errors_and_intervals import mean_se, robust_covariance
 from sealfit.closure.forms import describe
 from sealfit.closure.left_out import between_speeds, blocks, covered, foldable, folds, whole_settings
 from sealfit.closure.linearised import Proposal
@@ -34,6 +34,10 @@ TOO_SMALL = f"it is less than {criteria.LEAST_SIZE:.2%} of the force"
 OF_THE_RISE = f"it is less than {criteria.RISE_ERROR:.0%} of the pre-sliding rise subtracted along strokes"
 AT_THE_START = (
     f"it explains the force only within {criteria.RISE_LENGTHS:g} bristle lengths of the start of the strokes"
+)
+NO_AMPLITUDE = (
+    "the bins are as long as its waves and do not determine its amplitude: raise per_stroke, or lower "
+    "min_samples, under [bins]"
 )
 NO_GAIN = f"it lowers the error on held-out data by less than {criteria.LEAST_GAIN:.2%} of the force"
 NOT_HELD_OUT = "no rows can be held out to confirm it: repeat the runs"
@@ -268,6 +272,8 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     force, size = _rms(rows.force), _rms(added)
     if reason := _reason_too_small(proposal, added, rows, samples):
         return reason
+    if proposal.term.effect.periodic and not _amplitude_determined(proposal):
+        return NO_AMPLITUDE
     if only_at_start(fitted, proposal):
         return AT_THE_START
     if not gain.known:
@@ -327,6 +333,17 @@ def vague_between_speeds(before: Fitted, proposal: Proposal) -> bool:
         return False
     largest = [float(mean_se(evaluate(f.model, points)[1], f.covariance).max()) for f in fits]
     return largest[1] > max(criteria.VAGUER * largest[0], before.rmse_N)
+
+
+def _amplitude_determined(proposal: Proposal) -> bool:
+    """Whether an amplitude of a ripple is larger than its error."""
+    fitted, effect = proposal.fitted, proposal.term.effect
+    own = fitted.model.term_slice(len(fitted.model.terms) - 1)
+    variances = np.maximum(fitted.covariance, robust_covariance(fitted, proposal.unit)).diagonal()[own]
+    return any(
+        p.linear and fitted.model.values[-1][p.name] ** 2 > criteria.AMPLITUDE_ERRORS**2 * variance
+        for p, variance in zip(effect.parameters, variances, strict=True)
+    )
 
 
 def _changes_the_curve(proposal: Proposal) -> bool:

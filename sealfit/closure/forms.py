@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -215,9 +215,16 @@ def _knots(values: np.ndarray, count: int) -> tuple[float, ...]:
 
 
 def periodic_terms(
-    fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
+    fitted: Fitted,
+    peak: Peak,
+    samples: pd.DataFrame,
+    effects: Mapping[str, Effect],
+    channels: Collection[str],
 ) -> Iterator[tuple[Term, dict, Candidate]]:
-    """Yield the terms that a periodic component may be, each with its grid and a candidate."""
+    """Yield the terms that a periodic component may be, each with its grid and a candidate.
+
+    Its amplitude may change with those of the `channels` in `CHANGES_A_WAVE`.
+    """
     rows = fitted.rows
     effect = _near(effects["ripple"] if peak.axis == "displacement_mm" else effects["sinusoid"], peak)
     changing = _near(effects["sinusoid_changing"], peak)
@@ -244,8 +251,8 @@ def periodic_terms(
         candidate = Candidate((peak.axis,), *target, "file", no_columns, test_result, peak.p_value)
         yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
         for name in CHANGES_A_WAVE:
-            if name in rows.table and np.ptp(values := rows.unsigned(name)) > 0:
-                own = {**fixed, "z_ref": reference(values)}
+            if name in channels:
+                own = {**fixed, "z_ref": reference(rows.unsigned(name))}
                 yield Term(changing, (peak.axis, name), *target, fixed=own), names, candidate
 
 

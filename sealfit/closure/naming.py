@@ -6,7 +6,7 @@ and the BIC decides. Of equal forms a physical effect is preferred, then a close
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 
@@ -69,16 +69,26 @@ def _calendar_last(fitted: Fitted, others: list[Proposal], calendar: list[Propos
 
 
 def propose_ripples(
-    fitted: Fitted, peak: Peak, samples: pd.DataFrame, effects: Mapping[str, Effect]
+    fitted: Fitted,
+    peak: Peak,
+    samples: pd.DataFrame,
+    effects: Mapping[str, Effect],
+    channels: Collection[str],
 ) -> list[Proposal]:
-    """Return jointly refitted proposals for a periodic component, best first."""
-    forms = periodic_terms(fitted, peak, samples, effects)
+    """Return jointly refitted proposals for a periodic component, best first; none if no fit converges.
+
+    Its amplitude may change with some of the `channels`.
+    """
+    forms = periodic_terms(fitted, peak, samples, effects, channels)
     found = [p for form in forms for p in linearised(fitted, *form)]
     constant = [p for p in found if len(p.term.channels) == 1]
     refitted = _refitted(fitted, _best_few(found), found)
     refitted = [p for p in refitted if len(p.term.channels) == 1 or _changes(p)]
-    best, *others = _ordered(fitted, refitted or _refitted(fitted, constant))
-    return [best, *(p for p in others if len(p.term.channels) == 1)]  # other changes were not found
+    ordered = _ordered(fitted, refitted or _refitted(fitted, constant))
+    return [
+        *ordered[:1],
+        *(p for p in ordered[1:] if len(p.term.channels) == 1),
+    ]  # other changes were not found
 
 
 def _changes(proposal: Proposal) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from sealfit.closure.channels import channels_of
 from sealfit.closure.confirm import AcceptedEffect, Context, RefusedEffect, confirmed
 from sealfit.closure.naming import propose_ripples
 from sealfit.closure.ripples import Peak, find_ripple
@@ -44,7 +45,8 @@ class Ripples:
         while self.found is not None and len(self.added) < self.context.config.loop.max_rounds:
             number = len(self.added) + 1
             self.context.say(f"round {number}: a significant ripple in the samples, before all other effects")
-            proposals = propose_ripples(own, self.found, self.samples, self.context.effects)
+            names = {c.name for c in channels_of(own.rows, self.context.config)}
+            proposals = propose_ripples(own, self.found, self.samples, self.context.effects, names)
             accepted, failed = confirmed(own, proposals, self.samples, self.context, number)
             if accepted is None:
                 self.refused += failed[:1]
@@ -69,7 +71,8 @@ class Ripples:
     def _find(self, model: Model | None = None) -> Peak | None:
         pairs = zip(model.terms, model.values, strict=True) if model else ()
         known, config = [(term.channels[0], own["lambda_"]) for term, own in pairs], self.context.config
-        peak = find_ripple(self.samples, common_phase=config.position_origin == "rig", known=known)
+        common, ignored = config.position_origin == "rig", config.loop.ignore_channels
+        peak = find_ripple(self.samples, common_phase=common, known=known, ignored=ignored)
         return peak if peak is not None and peak.p_value <= config.loop.family_error else None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,6 +23,7 @@ from sealfit.closure.spectrum import (
 )
 from sealfit.fit.joint.model import passes
 from sealfit.fit.joint.rows import Rows
+from sealfit.ingest.strokes import SPEEDS_APART
 
 # Bins are too coarse for short waves, so the samples of every stroke are transformed: :math:`Z_u(f)` is the
 # complex amplitude of unit u (a file) at frequency f. A ripple of the rig has the same phase in all files, so
@@ -62,19 +63,27 @@ WAVE_OF_CURVE = 0.95
 
 
 def find_ripple(
-    samples: pd.DataFrame, *, common_phase: bool, known: Sequence[tuple[str, float]] = ()
+    samples: pd.DataFrame,
+    *,
+    common_phase: bool,
+    known: Sequence[tuple[str, float]] = (),
+    ignored: Collection[str] = (),
 ) -> Peak | None:
     """Return the strongest periodic component of the samples' residual, or None if none can be tested.
 
     The samples are steady and ordered by stroke: stroke_id, direction, unit, the axes, `residual_N`. With
     `common_phase`, displacement means the same place in every file (`position_origin = "rig"`). `known` are
-    axis and wavelength of the components in the model.
+    axis and wavelength of the components in the model. The axes that are `ignored` are not searched.
     """
     peaks, locked = [], []
     if common_phase and samples["unit"].nunique() < criteria.LEAST_GROUPS_HELD_OUT:
         samples = samples.assign(unit=samples["stroke_id"])  # strokes are held out, too
-    for axis in AXES:
+    speed = _one_speed(samples)
+    for axis in (name for name in AXES if name not in ignored):
         lengths = [length for own, length in known if own == axis]
+        if speed:  # a wave in time is the same as one along displacement
+            factor = 1 / speed if axis == "time_s" else speed
+            lengths += [length * factor for own, length in known if own != axis]
         if common_phase and axis == "displacement_mm":
             peaks += _long_waves(samples, lengths)
         spectrum = spectrum_of(samples, axis, lengths)
@@ -99,6 +108,14 @@ def find_ripple(
     if common_phase and not best.common_phase:
         best = _with_shared_phase(best, samples)
     return replace(best, p_value=min(1.0, best.p_value * len(peaks)))
+
+
+def _one_speed(samples: pd.DataFrame) -> float:
+    """Return the speed of the samples in units of the axes, or 0 if their strokes differ in it."""
+    ends = samples.groupby("stroke_id")[list(AXES)].agg(["min", "max"])
+    spans = [ends[axis]["max"] - ends[axis]["min"] for axis in AXES]
+    speeds = (spans[0] / spans[1].where(spans[1] > 0)).dropna()
+    return float(speeds.median()) if speeds.size and speeds.max() <= SPEEDS_APART * speeds.min() else 0.0
 
 
 def _with_shared_phase(peak: Peak, samples: pd.DataFrame) -> Peak:

@@ -25,6 +25,7 @@ CHANNELS = {
     "asymmetry": ("direction",), "offset_slope": ("oil_ppm", "direction"),
 }  # fmt: skip
 KNOTS = {"knots": [0.0, 1.0, 2.0], "x_ref": 0.0}
+CHANGING = {"speed_mm_s"}  # along which the amplitude of a wave may change
 ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 
 
@@ -249,7 +250,7 @@ def test_rivals_are_told_apart_under_the_noise_that_the_effect_leaves():
     bins = bins.assign(displacement_mm=place, force_N=bins["force_N"] + np.sin(2 * np.pi * place / 8.0))
     peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0)
     fitted = fit_declared(make_rows(bins, has_aging=True))
-    first, second = naming.propose_ripples(fitted, peak, bins.iloc[:0], EFFECTS)[:2]
+    first, second = naming.propose_ripples(fitted, peak, bins.iloc[:0], EFFECTS, CHANGING)[:2]
     assert (first.term.acts_on, first.term.operation) == ("force", "add")
     assert second.term.effect.id == "ripple"
     assert second.bic - first.bic > 100
@@ -263,7 +264,8 @@ def test_a_ripple_of_one_direction_has_an_amplitude_that_changes_with_the_direct
     strength = np.where(bins["direction"] > 0, 0.3, back * 0.3)
     rows = make_rows(bins.assign(force_N=bins["force_N"] + strength * wave), has_aging=True)
     peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0)
-    first, *others = naming.propose_ripples(fit_declared(rows), peak, bins.iloc[:0], EFFECTS)
+    changing = {"direction", "speed_mm_s"}
+    first, *others = naming.propose_ripples(fit_declared(rows), peak, bins.iloc[:0], EFFECTS, changing)
     assert (first.term.effect.id == "sinusoid_changing") == changes
     assert first.term.channels == ("displacement_mm", "direction")[: 1 + changes]
     assert all(len(p.term.channels) == 1 for p in others)
@@ -277,9 +279,9 @@ def test_a_ripple_far_from_position_0_has_its_phase_near_the_positions():
     bins["force_N"] += 0.3 * np.sin(2 * np.pi * bins["displacement_mm"] / 8.0)
     peak = Peak("displacement_mm", 8.0, True, True, 0.0, 0.0, 1.0)
     near, far = (
-        naming.propose_ripples(fit_declared(make_rows(moved, has_aging=True)), peak, bins.iloc[:0], EFFECTS)[
-            0
-        ]
+        naming.propose_ripples(
+            fit_declared(make_rows(moved, has_aging=True)), peak, bins.iloc[:0], EFFECTS, CHANGING
+        )[0]
         for moved in (bins, bins.assign(displacement_mm=bins["displacement_mm"] + 1e6))
     )
     assert (near.term.fixed["x_ref"], far.term.fixed["x_ref"]) == (0.0, 1e6)

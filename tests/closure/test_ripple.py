@@ -93,6 +93,22 @@ def test_hum_in_time_is_not_taken_for_position():
     assert peak.wavelength == pytest.approx(0.3, rel=0.02)
 
 
+def test_at_one_speed_a_known_wave_of_the_position_is_not_found_again_in_time():
+    samples = make_samples(amplitude=0.15)
+    at_10_mm_s = 5.0 + 10.0 * samples["time_s"] * samples["direction"] + 40.0 * (samples["direction"] < 0)
+    rest = 0.15 * np.sin(2 * np.pi * at_10_mm_s / 3.1)  # a wave of another length is what is left of it
+    samples = samples.assign(displacement_mm=at_10_mm_s, residual_N=samples["residual_N"] + rest)
+    assert find_ripple(samples, common_phase=True).p_value < 1e-4
+    found = find_ripple(samples, common_phase=True, known=[("displacement_mm", 3.1)])
+    assert found.p_value > 0.01 or abs(found.wavelength - (0.31 if found.axis == "time_s" else 3.1)) > 0.05
+
+
+def test_axes_that_the_config_ignores_are_not_searched():
+    samples = make_samples(amplitude=0.15, along="t")
+    assert find_ripple(samples, common_phase=True, ignored=["time_s", "displacement_mm"]) is None
+    assert find_ripple(samples, common_phase=True, ignored=["time_s"]).axis == "displacement_mm"
+
+
 @pytest.mark.long
 def test_noise_alone_seldom_looks_like_a_ripple():
     white = [find_ripple(make_samples(seed=s, files=10), common_phase=True).p_value for s in range(60)]
@@ -267,7 +283,8 @@ def test_a_round_that_tries_a_ripple_says_so_first(monkeypatch):
     monkeypatch.setattr(ripple_selection, "find_ripple", lambda *samples, **known: peak)
     monkeypatch.setattr(ripple_selection, "propose_ripples", lambda *tried: said.append("tried") or [])
     ripples = ripple_selection.Ripples(pd.DataFrame({"force_N": [1.0]}), Context(Config(), {}, said.append))
-    ripples.added_to(SimpleNamespace(), None)
+    monkeypatch.setattr(ripple_selection, "channels_of", lambda rows, config: [])
+    ripples.added_to(SimpleNamespace(rows=None), None)
     assert said == ["round 1: a significant ripple in the samples, before all other effects", "tried"]
 
 

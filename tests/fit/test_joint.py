@@ -313,7 +313,6 @@ def test_a_load_that_changes_along_strokes_is_kept_and_white_noise_is_not():
 
 
 def test_a_load_that_changes_at_once_is_kept_if_the_force_follows_it():
-    """Without the force all of it is taken for noise, and with noise beside it the force follows 1.65 times."""
     rng, bins = np.random.default_rng(1), pd.DataFrame({"stroke_id": np.repeat(np.arange(200), 20)})
     load = 50 + 0.15 * rng.normal(size=len(bins))
     measured = load + 0.1 * rng.normal(size=len(bins))
