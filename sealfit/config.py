@@ -174,7 +174,7 @@ class TraceFormat(Strict):
     those that `force_N` is computed from.
     """
     integrate_displacement: str | None = None
-    """Speed column whose integral over time is the displacement."""
+    """Speed column whose integral over time is the displacement; converted if its unit is given."""
     integrate_per: Literal["s", "min"] = "s"
     """Time unit of that speed; `"min"` for rpm."""
 
@@ -449,6 +449,7 @@ class Config(Strict):
     @model_validator(mode="after")
     def _units_convert(self) -> Config:
         units, parts = self.units, self.files.units
+        integrated = f"{units.unit('displacement')}/{self.trace.integrate_per}"
         copies = {n: parts[p] for n, p in self.files.copies.items() if p in parts and not units.of(p)}
         for table, place, columns in (
             ("trace", "trace.columns", {name: column.unit for name, column in self.trace.columns.items()}),
@@ -459,7 +460,8 @@ class Config(Strict):
                 if not unit:
                     continue
                 # A channel of the campaign's own keeps its numbers, and labels show its unit.
-                to = units.of(name) or self._kept_units.setdefault(name, unit)
+                own = integrated if (table, name) == ("trace", self.trace.integrate_displacement) else unit
+                to = units.of(name) or self._kept_units.setdefault(name, own)
                 try:
                     self._conversions.setdefault(table, {})[name] = conversion(unit, to)
                 except ConfigError as error:

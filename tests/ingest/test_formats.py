@@ -86,6 +86,19 @@ def test_displacement_integrates_a_speed_in_turns_per_minute(tmp_path):
     )
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1000.0), ("mm/min", 1 / 60), (None, 1.0)])
+def test_the_speed_that_is_integrated_is_converted_from_its_unit(tmp_path, unit, factor):
+    given = f'{{name = "v", unit = "{unit}"}}' if unit else '"v"'
+    rig = f"""
+    [trace]
+    columns = {{time_s = "t", speed = {given}, force_N = "F"}}
+    integrate_displacement = "speed"
+    drop_columns = ["speed"]
+    """
+    trace = read(tmp_path, csv_of([f"{0.1 * k:.1f},0.02,1.0" for k in range(100)], "t,v,F"), rig)
+    npt.assert_allclose(trace.table["displacement_mm"].iloc[-1], 9.9 * 0.02 * factor)
+
+
 def test_channels_are_numbers_or_labels_and_remarks_are_named(tmp_path):
     extra = [
         f"{row},{20 + i % 3},{'up' if i < 50 else 'down'},"
