@@ -272,6 +272,18 @@ def test_lack_of_fit_names_both_of_its_causes(campaign):
     assert 1 < statistic(fit, "mu_s:specimen_sd_pct").value < 8
 
 
+def test_as_many_parameters_as_days_leave_the_scatter_of_specimens_of_the_steady_fits(campaign):
+    table = campaign(days=(0.0, 4.0, 16.0), noise=0.002, specimen=0.03, specimens=4, seed=2)
+    steady = fit_conditions(table, Config())
+    fit, own = fit_series(steady, Config()), steady["steady_fit"]
+    unaged = own[(own.parameter == "mu_s") & (own.aging_days == 0)].iloc[0]
+    row = law(fit, "mu_s", "mu_0")
+    assert row.value == pytest.approx(unaged.value)
+    npt.assert_allclose([row.lo95, row.hi95], [unaged.lo95, unaged.hi95], rtol=0.05)
+    assert row.reason == ""
+    assert statistic(fit, "mu_s:error_df").value == 9  # of three conditions with four specimens each
+
+
 def test_rubber_that_does_not_age_has_no_b(campaign):
     model = {"mu_s": 0.7, "mu_c": 0.45, "v_s": 6.0, "sigma_2": 0.03}
     fit = fit_series(fit_conditions(campaign(days=DAYS, model=model, seed=5), Config()), Config())

@@ -27,6 +27,8 @@ CURVE_POINTS = 61
 
 # Rows of tables `aging_fit` and `aging_covariance`.
 LawRows = tuple[list[dict], list[dict]]
+# Per quantity the relative scatter of the conditions' means between specimens, and its degrees of freedom.
+Specimens = Mapping[str, tuple[float, float]]
 
 
 def fit_series(steady_fit: SteadyFit, config: Config) -> dict[str, pd.DataFrame]:
@@ -96,7 +98,18 @@ def _fit_rubber(steady_fit: SteadyFit) -> LawRows:
     moved = sensor.reindex(pd.MultiIndex.from_frame(found[["condition", "quantity"]])).to_numpy(float)
     series = list(dict.fromkeys(own.loc[own["aging_days"].to_numpy(float) > 0, "series"]))
     found = found.assign(moved=np.nan_to_num(moved))
-    return laws_of_series(found, series, pair, steady_covariance(found, steady_fit["steady_covariance"]))
+    covariance = steady_covariance(found, steady_fit["steady_covariance"])
+    return laws_of_series(found, series, pair, covariance, specimens=_specimens_of(found, own, covariance))
+
+
+def _specimens_of(found: pd.DataFrame, own: pd.DataFrame, covariance: csr_array) -> Specimens:
+    """Return what the steady fits know of the scatter of specimens: it is in their `se` only."""
+    df = own.loc[own["parameter"] == "specimen_df", "value"].max()
+    if not df > 0:
+        return {}
+    variance = np.maximum(found["se"].to_numpy(float) ** 2 - covariance.diagonal(), 0.0)
+    relative = pd.Series(variance / found["value"].to_numpy(float) ** 2, found.index)
+    return {name: (np.sqrt(mean), df) for name, mean in relative.groupby(found["quantity"]).mean().items()}
 
 
 def _of_one_meaning(found: pd.DataFrame, own: pd.DataFrame, pair: tuple[str, str]) -> pd.DataFrame:
@@ -172,13 +185,19 @@ def between_scatter(values: Values) -> tuple[float, LawFit]:
 
 
 def laws_of_series(
-    found: pd.DataFrame, series: Sequence[str], quantities: Sequence[str], covariance, **replicates
+    found: pd.DataFrame,
+    series: Sequence[str],
+    quantities: Sequence[str],
+    covariance: csr_array | np.ndarray,
+    *,
+    specimens: Specimens | None = None,
+    **replicates,
 ) -> LawRows:
     """Return the rows of the laws of one rubber in the order of `series` and `quantities`.
 
     `found` has `series`, `quantity`, `aging_days`, `value`, `unit`, and `moved`, the change of values if the
     sensor reads one standard uncertainty too high; values of one condition are adjacent. `covariance`, shape
-    (n, n), and `replicates` are as in `Values`.
+    (n, n), and `replicates` are as in `Values`. `specimens` is used where the law leaves no residual.
     """
     quantities = [name for name in quantities if (found["quantity"] == name).any()]
     curves = _curves_of(found, series, quantities)
@@ -193,10 +212,12 @@ def laws_of_series(
     number = np.where(unaged, -1, [place.get(key, -1) for key in keys])
     kept = unaged | (number >= 0)
     values = Values(days, value, origin, number, covariance, **replicates).part(kept)
-    return _rows(values, curves, fitted, moved[kept])
+    return _rows(values, curves, fitted, moved[kept], specimens or {})
 
 
-def _rows(values: Values, curves: list[SeriesCurve], fitted: list[str], moved: np.ndarray) -> LawRows:
+def _rows(
+    values: Values, curves: list[SeriesCurve], fitted: list[str], moved: np.ndarray, specimens: Specimens
+) -> LawRows:
     """Return the rows of all curves; `fitted` are the quantities with a law, in the order of their origin."""
     quantities = {}
     model = np.empty(values.value.size)
@@ -208,6 +229,9 @@ def _rows(values: Values, curves: list[SeriesCurve], fitted: list[str], moved: n
         squares = (own.whitening @ (own.value - alone.model)) ** 2
         series = len({c.series for c in curves if c.place >= 0 and c.quantity == name})
         df, level_df = (own.df(alone.df, tau, level=level) for level in (False, True))
+        if alone.df <= 0 and name in specimens:
+            tau, df = specimens[name]
+            level_df = df
         quantities[name] = OneQuantity(part, squares, tau, series, t_quantile(df or np.inf), level_df)
     joint = fit_law(_with_specimens(values, [one.tau for one in quantities.values()], model))
     intervals = law_table.curve_intervals(joint, np.array([one.t**2 for one in quantities.values()]))

@@ -238,6 +238,7 @@ def _statistics(
         ("birge_ratio", np.sqrt(variance.value) if repeated else None, "", own),
         ("error_df", variance.df, "", "degrees of freedom of the intervals' Student t"),
         ("specimen_sd_pct", specimens.sd_pct, "%", specimens.remark),
+        ("specimen_df", specimens.df or None, "", "degrees of freedom of specimen_sd_pct"),
         ("flat_p", condition.flat_p, "", "chance of this much Stribeck curve where mu_s = mu_c"),
         ("rmse_N", np.sqrt(np.mean(residual**2)), force_unit, ""),
         ("n_runs", len(condition.runs), "", ""),
