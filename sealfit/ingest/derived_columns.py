@@ -216,6 +216,9 @@ def swapped_columns(entries: list[Entry], columns: Columns) -> list[Fault]:
 SETTING = 0.005
 # Share by which measured speeds of one commanded speed differ at most; rigs repeat within a few percent.
 SAME_TESTED_SPEED = 0.05
+# Share by which a measured load may exceed the next smaller one of its run. Settings differ by more, and
+# drift, friction of the loading device and the noise of a sensor by less.
+SAME_TESTED_LOAD = 0.1
 
 
 def _text(value: float | str) -> str:
@@ -249,7 +252,8 @@ def add_runs(
 ) -> tuple[Columns, list[Fault]]:
     """Return the columns with a `run_id` for every file, and what is to be said of it.
 
-    Where none is given there is one per condition, commanded speed, load (of several) and (named) specimen.
+    Where none is given there is one per condition, commanded speed, load (of several; measured ones within
+    10 % are one) and (named) specimen.
     Without a commanded speed it is that `measured`, in `unit` (nan where one is commanded): files within 5 %
     share a run. So do files with several speeds each (nan), and strokes there and back of one record, a file
     each, as the column `stroke` tells them.
@@ -259,7 +263,7 @@ def add_runs(
     run_ids: dict[int, str] = {}
     groups = defaultdict(list)
     specimens, speeds = columns.get("specimen_id", none), columns.get("speed_mm_s", none)
-    loads = columns.get("load_N", none)
+    loads = load_settings(columns.get("load_N", none))
     several_loads = len({load for load in loads if load is not None}) > 1
     for i in np.flatnonzero(~known(given)).tolist():
         words = [conditions[i]]
@@ -287,6 +291,16 @@ def add_runs(
     reason = "neither run_id nor a commanded speed is given; "
     reason += "files of one condition share a run within 5 % of speed."
     return added, [Fault("run_id_derived", reason, fix="Give run_id or speed_mm_s.", **NOTED)]
+
+
+def load_settings(loads: Column) -> Column:
+    """Return loads, those within 10 % of the next one as the middle one of their setting."""
+    usual: dict[float, float] = {}
+    values = np.array([value for value in set(loads) if value is not None])
+    for own in of_one_setting(values, SAME_TESTED_LOAD):
+        middle = float(np.sort(values[own])[own.size // 2]) if own.size else 0.0
+        usual.update(dict.fromkeys(values[own].tolist(), middle))
+    return mapped(loads, lambda value: usual.get(value, value))
 
 
 def of_one_setting(values: np.ndarray, tolerance: float) -> list[np.ndarray]:
@@ -344,6 +358,7 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
     run, repeat, specimen = (columns[name] for name in ("run_id", "repeat", "specimen_id"))
     stroke = columns.get("stroke", none)
     told = {name: columns.get(name, none) for name in ("speed_mm_s", "load_N")} | {"condition": conditions}
+    settings = told | {"load_N": load_settings(told["load_N"])}
     first: dict[object, int] = {}  # file of each run, and of each repeat
     faults = []
     for i, entry in enumerate(entries):
@@ -351,15 +366,20 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
         other = first.setdefault((run[i], repeat[i], stroke[i]), i)
         if other != i:
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
-            fix = "Give every file of a run its own repeat number, files of different runs a run_id each, "
-            fix += "or each stroke of a repeat its number. Is the speed of one of the two right?"
+            fix = (
+                "Give every file of a run its own repeat number, and files of different runs a run_id each. "
+            )
+            fix += (
+                "If one file has the stroke forward and the other the stroke back of a repeat, number them 1 "
+            )
+            fix += "and 2 in a column stroke. Is the speed of one of the two right?"
             if conditions[i].startswith(UNAGED):
                 fix += " Pieces of unaged rubber that were tested with several series "
                 fix += "need a specimen_id each."
             faults.append(entry.fault("duplicate_repeat", reason, "repeat", value=repeat[i], fix=fix))
         for name, column in told.items():
             mine, theirs = column[i], column[j]
-            if mine != theirs:
+            if settings[name][i] != settings[name][j]:
                 there = "none" if theirs is None else _text(theirs)
                 reason = f"differs from the other repeats of run '{run[i]}', {_place(entries[j])}: {there}."
                 fix = "One run is one condition, speed and load: give it another run_id, or correct the cell."

@@ -15,7 +15,7 @@ from sealfit.config import Config
 from sealfit.errors import Fault
 from sealfit.ingest.averages import ALONG, FileStrokes, bin_table, mean_traces, read_strokes
 from sealfit.ingest.columns import Listing, columns_of, condition_columns, keys_of
-from sealfit.ingest.derived_columns import of_one_setting
+from sealfit.ingest.derived_columns import SAME_TESTED_LOAD, of_one_setting
 from sealfit.ingest.files import as_number
 from sealfit.ingest.strokes import several_speeds
 from sealfit.store import parquet
@@ -28,9 +28,6 @@ INNER = (
     "several", "several_speeds", "left", "equal", "extreme", "begins", "begins_half", "run", "sliding", "row",
     "by_itself",
 )  # fmt: skip
-# Share by which a measured load may exceed the next smaller one of its run. Settings differ by more, and
-# drift, friction of the loading device and the noise of a sensor by less.
-SAME_TESTED_LOAD = 0.1
 IN_PANDAS = {FLOAT: float, INT: np.int64, TEXT: "str", BOOL: bool}
 
 

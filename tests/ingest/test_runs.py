@@ -157,6 +157,19 @@ def test_settings_that_differ_by_rounding_are_one(tmp_path):
     assert refs[2].channels["speed_set_mm_s"] == 5.05
 
 
+@pytest.mark.parametrize("named", [True, False])
+def test_a_load_that_was_measured_for_every_file_is_kept_and_makes_no_runs(tmp_path, named):
+    table = "file,run_id,repeat,temperature_C,compression_ratio_pct,aging_days,load_N,speed_mm_s\n"
+    run = "r1" if named else ""
+    other = "r2" if named else ""
+    table += f"a.csv,{run},1,60,80,4,49.0,5\nb.csv,{run},2,60,80,4,50.6,5\nc.csv,{other},1,60,80,4,98,5\n"
+    refs, found = list_traces(campaign(tmp_path, table), config())
+    assert found == []
+    assert [ref.channels["load_N"] for ref in refs] == [49.0, 50.6, 98.0]
+    first, second, third = (ref.channels["run_id"] for ref in refs)
+    assert first == second != third
+
+
 def test_without_run_id_settings_that_differ_by_rounding_are_one_run(tmp_path):
     table = (
         "file,temperature_C,compression_ratio_pct,aging_days,speed_mm_s\n"
