@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -37,6 +38,8 @@ from sealfit.tables import EFFECTS
 from sealfit.units import Units
 
 OFFSET = "zero_offset"
+# Symbols of equations for the references of channels, by the names under which a term has their values.
+REFERENCES = {"N_ref": "load_N_ref", "v_ref": "speed_mm_s_ref", "s_ref": "distance_mm_ref"}
 SLOTS = ("force_N", "displacement_mm", "speed_mm_s", "load_N", "time_s")
 
 
@@ -248,14 +251,15 @@ def effect_level(term: Term, rows: Rows) -> str:
 
 
 def form_of(term: Term) -> str:
-    """Return the effect's equation in plain text with its fixed reference value."""
+    """Return the effect's equation in plain text with the values of its references."""
     text = term.effect.form.replace("{x}", term.channels[0]).replace("{z}", term.channels[-1])
     for name in ("x_ref", "z_ref"):
         if name in term.fixed:
             if term.fixed[name] == 0.0:
                 text = text.replace(f"({name[0]} - {name})", name[0])
             text = text.replace(name, f"{term.fixed[name]:g}")
-    return text
+    known = {name: f"{term.fixed[key]:g}" for name, key in REFERENCES.items() if key in term.fixed}
+    return re.sub(r"\b\w_ref\b", lambda found: known.get(found[0], found[0]), text)
 
 
 def parameter_unit(unit: str, term: Term, units: Units) -> str:

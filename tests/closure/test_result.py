@@ -267,3 +267,6 @@ def test_an_equation_is_written_with_its_reference():
     assert form_of(ripple) == "A sin(2 pi x / lambda + phi)"
     far = Term(EFFECTS["ripple"], ("displacement_mm",), "force", "add", {"x_ref": 1e6})
     assert form_of(far) == "A sin(2 pi (x - 1e+06) / lambda + phi)"
+    fixed = {"speed_mm_s_ref": 6.82, "distance_mm_ref": 39.4}
+    warming = Term(EFFECTS["warming_conduction"], ("distance_mm", "speed_mm_s"), "mu", "multiply", fixed)
+    assert form_of(warming) == "-A sqrt(|v| s / (6.82 39.4))"
