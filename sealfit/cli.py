@@ -359,13 +359,16 @@ def lifetime(
     ] = None,
     law: Annotated[str | None, Option("--law", help="log, stretched, power, induction.")] = None,
     model: Annotated[str, Option("--model", help="after (with the loop's effects) or before.")] = "after",
+    rubber: Annotated[str | None, Option("--rubber", help="Which one, where several were aged.")] = None,
     as_json: Json = False,
 ) -> None:
     """Compute the days until a quantity reaches a threshold."""
     from sealfit import commands
     from sealfit.report import summary_lines
 
-    asked = commands.LifetimeRequest(quantity, threshold, loss, temperature, compression, years, law, model)
+    asked = commands.LifetimeRequest(
+        quantity, threshold, loss, temperature, compression, years, law, model, rubber
+    )
     end("lifetime", commands.lifetime(out, asked), summary_lines.lifetime_lines, as_json)
 
 

@@ -125,6 +125,7 @@ class LifetimeRequest:
     years: float | None = None  # seek the temperature at which a seal lasts so long
     law: str | None = None  # None: the likeliest one
     model: str = "after"
+    rubber: str | None = None  # needed where several were aged
 
 
 def require_model(name: str) -> None:
@@ -172,14 +173,27 @@ def _laws_of(
         from sealfit.fit.aging.property import laws_of_property
 
         store.require("fit-aging")
-        return laws_of_property(store.read("property_values"), asked.quantity, asked.law), [], []
+        values = _of_rubber(store.read("property_values"), asked.rubber)
+        return laws_of_property(values, asked.quantity, asked.law), [], []
     from sealfit.fit.aging.all_series import law_of
 
     (steady, fits), taken_out = _fits_of(store, model)
+    steady = _of_rubber(steady, asked.rubber)
+    fits = {name: table[table["rubber"].isin(steady["rubber"])] for name, table in fits.items()}
     own = fits["steady_fit"]
     own = own[(own["parameter"] == asked.quantity) & own["identified"].astype(bool)]
     notes = [text for text in own["reason"].fillna("").unique().tolist() if text]
     return law_of(steady, fits, asked.quantity, asked.law), taken_out, notes
+
+
+def _of_rubber(table: "pd.DataFrame", rubber: str | None) -> "pd.DataFrame":
+    """Return the rows of one rubber of a table, or all; RequestError if it has no such rubber."""
+    if rubber is None:
+        return table
+    there = sorted(table["rubber"].unique().tolist())
+    if rubber not in there:
+        raise RequestError(f"there is no rubber '{rubber}'.", fix=f"Choose one of: {', '.join(there)}.")
+    return table[table["rubber"] == rubber]
 
 
 def _fits_of(store: Store, model: str) -> "tuple[tuple[pd.DataFrame, SteadyFit], list[dict]]":

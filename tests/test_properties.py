@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,21 @@ def test_other_columns_are_another_question(table, tmp_path):
     made = pipeline.fit_properties(table, out, names=(PROPERTY,), batch="batch")
     assert made["done"] == ["fit-aging"]
     assert Store.open(out).command("fit-aging").endswith(f"--property {PROPERTY}")
+
+
+def test_of_several_rubbers_one_is_chosen(table, tmp_path):
+    rows = pd.read_csv(table, dtype=str)
+    both = pd.concat([rows.assign(rubber="EPDM"), rows.assign(rubber="NBR")])
+    both.to_csv(table, index=False)
+    config, out = tmp_path / "two.toml", tmp_path / "out"
+    config.write_text('condition = ["rubber", "temperature_C", "aging_days"]\nrubber = ["rubber"]\n', "utf-8")
+    pipeline.fit_properties(table, out, config=config)
+    with pytest.raises(RequestError, match="several rubbers: EPDM, NBR") as told:
+        commands.lifetime(out, TO_80)
+    assert "--rubber" in told.value.fix
+    assert commands.lifetime(out, replace(TO_80, rubber="NBR"))["days"] > 100
+    with pytest.raises(RequestError, match="no rubber 'FKM'"):
+        commands.lifetime(out, replace(TO_80, rubber="FKM"))
 
 
 def test_a_damaged_result_is_made_again(table, tmp_path):

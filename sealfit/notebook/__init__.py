@@ -269,7 +269,8 @@ class Results:
         temperature_C : float, optional
             Temperature of use, in degrees Celsius; needed where several were tested.
         **options
-            `compression_ratio_pct`, `years` (find the temperature that lasts so long), `law` and `model`.
+            `compression_ratio_pct`, `years` (find the temperature that lasts so long), `law`, `model`, and
+            `rubber`, where several were aged.
 
         Raises
         ------

@@ -336,7 +336,8 @@ def laws_of(values: AgedValues, quantity: str, name: str | None = None) -> list[
         there = ", ".join(dict.fromkeys(one for _, one in values)) or "none"
         raise RequestError(f"there is no '{quantity}' to follow.", fix=f"Choose one of: {there}.")
     if len(aged) > 1:
-        raise RequestError(f"there are several rubbers: {', '.join(aged)}.", fix="Analyse them one by one.")
+        fix = f"Choose one: --rubber '{next(iter(aged))}'."
+        raise RequestError(f"there are several rubbers: {', '.join(aged)}.", fix=fix)
     if name is not None and name not in LOSSES:
         raise RequestError(f"there is no law '{name}'.", fix=f"Choose one of: {', '.join(LOSSES)}.")
     try:
