@@ -51,7 +51,8 @@ def test_the_interval_over_all_laws_is_given_if_the_first_law_never_ends():
     laws = sorted(fit_laws(Aged(days, value)), key=lambda law: law.loss.name != "stretched")
     text = said(laws, Goal(0.1))
     assert "0.1 is not reached within 1e9 d" in text
-    assert "95 % interval over all laws, weighted: " in text
+    assert "the interval is over all laws" in text
+    assert "95 % interval if this law is true: more than 1e9 d" in text
 
 
 def test_the_temperature_for_years_has_an_interval_and_is_marked_beyond_the_tests(laws):

@@ -296,12 +296,14 @@ def lifetime_lines(part: Mapping) -> list[str]:
     law = f"{part['quantity']} = {part['form']}, {_change(part)}"
     found.append(line("law", f"{law}; it {clause}" if clause else law))
     found += [line("note", f"{part['quantity']} is {note}") for note in part["notes"]]
-    found.append(line("life" if "days" in part else "use", _life(part)))
+    if part.get("ci95_over_laws") and part["rivals"] and part["days"] != 0:
+        found.append(line("life", _life({**part, "ci95": part["ci95_over_laws"]})))
+        found.append(line("", "the interval is over all laws, weighted by their likelihood"))
+        found.append(line("", f"95 % interval if this law is true: {_days_between(part['ci95'])}"))
+    else:
+        found.append(line("life" if "days" in part else "use", _life(part)))
     if part.get("ci95_resampled"):
         found.append(line("", f"95 % interval by resampling: {_days_between(part['ci95_resampled'])}"))
-    if part.get("ci95_over_laws") and part["rivals"] and part["days"] != 0:
-        weighted = _days_between(part["ci95_over_laws"])
-        found.append(line("", f"95 % interval over all laws, weighted: {weighted}"))
     if part.get("before"):
         found.append(line("before", f"{_life(part['before'])}, without the effects"))
     for rival in part["rivals"]:
