@@ -252,6 +252,10 @@ def _outside(
         beyond = (code >= 0) & ((values < tested[0] - slack) | (values > tested[1] + slack))
         _note(notes, beyond, f"{name} is outside the tests: {tested[0]:g} to {tested[1]:g}")
         outside |= beyond
+    if ranges.get("direction") == [1.0, 1.0]:  # a speed without a sign is forwards
+        back = (code >= 0) & (table["direction"].to_numpy(dtype=float) < 0)
+        _note(notes, back, "backward motion was not tested")
+        outside |= back
     return outside
 
 

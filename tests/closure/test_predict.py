@@ -59,6 +59,15 @@ def test_a_point_outside_the_tests_says_which_of_its_numbers_is(of_three_speeds)
     assert "speed_mm_s is outside the tests: 1 to 64" in note
 
 
+def test_a_direction_that_was_not_tested_is_extrapolated(of_three_speeds):
+    bins, model = of_three_speeds
+    points = bins.groupby("condition").head(1).drop(columns="direction")
+    assert not predict(model, points)["extrapolated"].any()
+    back = predict(model, points.assign(speed_mm_s=-points["speed_mm_s"]))
+    assert back["extrapolated"].all()
+    assert back["note"].str.contains("backward motion was not tested").all()
+
+
 def test_the_direction_of_a_point_is_that_of_its_speed():
     bins = make_bins(
         temperatures=(60.0,), directions=(1, -1), bins=4, repeats=2, effect=lambda table, force: force + 1.5
