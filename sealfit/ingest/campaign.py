@@ -13,7 +13,7 @@ from sealfit.config import Config
 from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.columns import condition_columns, force_inputs
-from sealfit.ingest.partitions import SAMPLED, Asked, PartitionResult, plan_parts, shaped
+from sealfit.ingest.partitions import INNER, SAMPLED, Asked, PartitionResult, plan_parts, shaped
 from sealfit.ingest.quality import computed_force, improbable_loads, incomplete_columns, quality_table
 from sealfit.ingest.repeat_checks import judged, outlying_files, settings_within_runs, turned_sign
 from sealfit.ingest.runs import FIX, list_traces
@@ -143,7 +143,7 @@ def ingest_campaign(
     steady, found = outlying_files(strokes[strokes["used"]].reset_index(drop=True), config)
     faults += found
     inputs = force_inputs(config)
-    seen = steady.drop(columns=[*config.loop.ignore_channels, *inputs], errors="ignore")
+    seen = steady.drop(columns=[*INNER, *config.loop.ignore_channels, *inputs], errors="ignore")
     faults += incomplete_columns(seen, config.series_columns if config.aging else ())
     faults += improbable_loads(steady, config) + computed_force(inputs & {*steady.columns})
     faults += settings_within_runs(seen, {*STEADY.names(), *condition_columns(config)})

@@ -370,8 +370,9 @@ def _judge_form(condition: Condition) -> dict[str, tuple[bool, str]]:
         few = f"{condition.speeds} speeds in one direction: "
         few += "the Stribeck curve needs four, two of them below about 2 v_s."
         verdict |= {name: (False, few) for name in ("mu_s", "v_s")}
-        mean = "the mean coefficient over these speeds, which are too few for a Stribeck curve."
-        verdict["mu_c"] = (True, mean)
+        viscous = condition.values[condition.names.index("sigma_2")] > 0.0
+        meaning = "of a straight line through" if viscous else "the mean coefficient over"
+        verdict["mu_c"] = (True, f"{meaning} these speeds, which are too few for a Stribeck curve.")
     elif condition.model == VISCOUS:
         flat = f"mu_s = mu_c is not rejected (p = {condition.flat_p:.2g}): no Stribeck curve is seen"
         verdict["mu_s"] = (False, f"{flat}, mu_s is mu_c.")
