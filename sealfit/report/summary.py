@@ -366,7 +366,8 @@ def untold_clause(closure: Mapping, units: Units) -> str:
         size, more = "no effect is detectable", f"; at least {files} files are needed"
         if smallest is not None:
             size = f"detection limit {_two_digits(smallest)} % of the force"
-            more = f"; 1 % needs about {_two_digits(files or 0)} files"
+            many = "more than 100 times as many" if smallest > 10 else f"about {_two_digits(files or 0)}"
+            more = f"; 1 % needs {many} files"
         variable = f"{units.label(entry['variable'])} {level_words(entry['level'])}"
         texts.append(f"{variable} ({size}{more if files else ''})")
     return ", ".join(texts)

@@ -138,6 +138,9 @@ def test_cannot_tell_says_of_what_and_what_would_do():
         "(detection limit 1.2 % of the force; 1 % needs about 40 files), "
         "oil temp between runs (no effect is detectable; at least 12 files are needed)."
     ) in text
+    large = {**SEEN, "smallest_pct": 49.0, "files_needed": 310000}  # of four specimens
+    text = said({**closure, "sensitivity": [large]})
+    assert "detection limit 49 % of the force; 1 % needs more than 100 times as many files" in text
 
 
 def test_unexplained_says_where_it_sits():
