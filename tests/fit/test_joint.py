@@ -306,19 +306,22 @@ def test_noise_of_the_measured_load_does_not_turn_dry_friction_into_viscous():
 def test_a_load_that_changes_along_strokes_is_kept_and_white_noise_is_not():
     line = np.tile(np.linspace(-1.0, 1.0, 20), 50)
     white = np.random.default_rng(0).normal(size=1000)
-    bins = pd.DataFrame({"stroke_id": np.repeat(np.arange(50), 20), "force_N": 40.0})
+    noise = 0.1 * np.random.default_rng(2).normal(size=1000)
+    bins = pd.DataFrame({"stroke_id": np.repeat(np.arange(50), 20), "run_id": "r", "force_N": 40.0 + noise})
+    bins = bins.assign(distance_mm=np.tile(np.arange(20.0), 50))
     found = [without_load_noise(bins.assign(load_N=load))["load_N"] for load in (50 + line, 50 + 0.1 * white)]
     npt.assert_allclose(found[0], 50 + line, atol=0.03)
-    assert np.std(found[1] - 50) < 0.3 * 0.1
+    assert np.std(found[1] - 50) < 0.35 * 0.1  # a straight line in the noise of 20 bins: 0.23
 
 
 def test_a_load_that_changes_at_once_is_kept_if_the_force_follows_it():
     rng, bins = np.random.default_rng(1), pd.DataFrame({"stroke_id": np.repeat(np.arange(200), 20)})
+    bins = bins.assign(run_id=bins["stroke_id"] // 50, distance_mm=np.tile(np.arange(20.0), 200))
     load = 50 + 0.15 * rng.normal(size=len(bins))
     measured = load + 0.1 * rng.normal(size=len(bins))
     found = without_load_noise(bins.assign(load_N=measured, force_N=-0.8 * load))["load_N"].to_numpy()
     reliability = 0.15**2 / (0.15**2 + 0.1**2)
-    npt.assert_allclose(np.std(found) / np.std(measured), reliability, rtol=0.05)
+    npt.assert_allclose(np.std(found) / np.std(measured), reliability, rtol=0.08)  # lines are kept
 
 
 def test_subset_keeps_conditions_and_fits_the_same_numbers():
