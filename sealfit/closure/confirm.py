@@ -11,12 +11,12 @@ import pandas as pd
 
 from sealfit.closure import criteria
 from sealfit.closure.channels import follows_strokes, level_values, settings, varies
-from sealfit.closure.errors_and_intervals import mean_se, robust_covariance
+from sealfit.closure.errors_and_intervals import mean_se
 from sealfit.closure.forms import describe
 from sealfit.closure.left_out import between_speeds, blocks, covered, foldable, folds, whole_settings
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import rivals
-from sealfit.closure.ripples import agreement, pass_shifts
+from sealfit.closure.ripples import agreement, pass_shifts, waves_of
 from sealfit.config import Config, Loop
 from sealfit.effects.contract import Effect
 from sealfit.fit.joint import Fitted, fit, with_reml_smoothness
@@ -272,7 +272,7 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     force, size = _rms(rows.force), _rms(added)
     if reason := _reason_too_small(proposal, added, rows, samples):
         return reason
-    if proposal.term.effect.periodic and not _amplitude_determined(proposal):
+    if _amplitude_too_large(proposal, samples):
         return NO_AMPLITUDE
     if only_at_start(fitted, proposal):
         return AT_THE_START
@@ -335,15 +335,15 @@ def vague_between_speeds(before: Fitted, proposal: Proposal) -> bool:
     return largest[1] > max(criteria.VAGUER * largest[0], before.rmse_N)
 
 
-def _amplitude_determined(proposal: Proposal) -> bool:
-    """Whether an amplitude of a ripple is larger than its error."""
-    fitted, effect = proposal.fitted, proposal.term.effect
-    own = fitted.model.term_slice(len(fitted.model.terms) - 1)
-    variances = np.maximum(fitted.covariance, robust_covariance(fitted, proposal.unit)).diagonal()[own]
-    return any(
-        p.linear and fitted.model.values[-1][p.name] ** 2 > criteria.AMPLITUDE_ERRORS**2 * variance
-        for p, variance in zip(effect.parameters, variances, strict=True)
-    )
+def _amplitude_too_large(proposal: Proposal, samples: pd.DataFrame) -> bool:
+    """Whether the amplitude of a ripple on the bins is several times that on the samples."""
+    term, fitted = proposal.term, proposal.fitted
+    if not term.effect.periodic or "residual_N" not in samples:
+        return False
+    values = fitted.model.values[-1]
+    own = waves_of(samples, np.array([values["lambda_"]]), term.channels[0]).amplitudes[:, 0]
+    size = 1.0 if term.operation == "add" else _rms(fitted.rows.force)
+    return abs(values["A"]) * size > criteria.AMPLITUDE_RATIO * _rms(np.hypot(*own.T))
 
 
 def _changes_the_curve(proposal: Proposal) -> bool:

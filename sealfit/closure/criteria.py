@@ -72,9 +72,7 @@ LEAST_FILES_OF_RIPPLE = 9
 LEAST_SAMPLES_OF_STROKE = 16  # Fewest steady samples of a stroke that is used in the search for ripples.
 NEIGHBOURS = 25  # Frequencies on each side of a frequency that make its local background.
 LOBE = 4  # Frequencies on each side of a peak over which the taper spreads it.
-AMPLITUDE_ERRORS = (
-    2.0  # Standard errors that an amplitude must exceed: bins as long as a wave do not show it.
-)
+AMPLITUDE_RATIO = 3.0  # Largest ratio of a ripple's amplitude on the bins to that on the samples.
 REACHED = 0.25  # Least share of the strokes that must reach a frequency for it to be searched.
 
 # ---------------------------------------------------------------- forms: which are tried, which is reported

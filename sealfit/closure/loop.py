@@ -35,8 +35,8 @@ from sealfit.effects.user import load_user_effects
 from sealfit.engine.run_map import run_map
 from sealfit.fit.joint import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate, shape_of
-from sealfit.fit.joint.rows import LEVELS, SET_UP, Rows, make_rows, records, without_load_noise
-from sealfit.fit.joint.set_ups import with_set_ups
+from sealfit.fit.joint.rows import LEVELS, SET_UP, Rows, make_rows, records
+from sealfit.fit.joint.set_ups import with_set_ups, with_straight_loads
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import Silent, timed
 
@@ -67,7 +67,7 @@ def close_loop(
     say = on_progress or Silent().say
     effects = EFFECTS | load_user_effects(config.loop.effects_folder)
     context = Context(config, effects, say, workers=workers)
-    columns, counted = list(bins.columns), without_load_noise(numbered(bins.reset_index(drop=True)))
+    columns, counted = list(bins.columns), with_straight_loads(numbered(bins.reset_index(drop=True)))
     del bins
     rows = make_rows(with_set_ups(counted), has_aging=config.aging, speed_factor=config.units.speed_factor)
     outliers = outlier_files(rows)

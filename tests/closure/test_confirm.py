@@ -164,7 +164,7 @@ def decide(monkeypatch):
         negative=False,
         rise=0.0,
         at_start=False,
-        amplitude=True,
+        too_large=False,
         **more,
     ):
         held = dict(zip(map(id, proposals), gains, strict=True))
@@ -175,7 +175,7 @@ def decide(monkeypatch):
         monkeypatch.setattr("sealfit.closure.confirm.added_force", lambda p: np.full(3, added))
         monkeypatch.setattr("sealfit.closure.confirm.error_of_rise_N", lambda rows: rise)
         monkeypatch.setattr("sealfit.closure.confirm.only_at_start", lambda *args: at_start)
-        monkeypatch.setattr("sealfit.closure.confirm._amplitude_determined", lambda proposal: amplitude)
+        monkeypatch.setattr("sealfit.closure.confirm._amplitude_too_large", lambda *args: too_large)
         monkeypatch.setattr("sealfit.closure.confirm.about_means", lambda values, rows, level: values)
         monkeypatch.setattr("sealfit.closure.confirm.follows_strokes", lambda name, rows: name == "time_s")
         monkeypatch.setattr(
@@ -330,7 +330,7 @@ def test_a_ripple_is_no_curve_between_the_speeds(decide):
     found, refused, _ = decide([wave], [GOOD], vague=True)
     assert found is not None
     assert refused == []
-    found, refused, _ = decide([wave], [GOOD], amplitude=False)  # bins as long as the waves
+    found, refused, _ = decide([wave], [GOOD], too_large=True)  # bins as long as the waves
     assert found is None
     assert [r.reason for r in refused] == [NO_AMPLITUDE]
 

@@ -339,32 +339,6 @@ def fill_missing(table: pd.DataFrame, groups: Groups) -> dict[str, np.ndarray]:
     return found
 
 
-def without_load_noise(bins: pd.DataFrame) -> pd.DataFrame:
-    """Return `bins`, numbered and in order of their strokes, with loads without the noise of their sensor.
-
-    The deviations of the load from a straight line along each stroke are multiplied by their reliability, the
-    share of them that the force of the run follows (regression calibration: Carroll et al. 2006, *Measurement
-    Error in Nonlinear Models*, chapter 4). The force follows no noise, and fast changes with a delay.
-    """
-    if "load_N" not in bins or bins["load_N"].isna().any():
-        return bins
-    stroke, run = bins["stroke_id"], bins["run_id"]
-    values = bins[["load_N", "force_N", "distance_mm"]].astype(float)
-    means = values.groupby(stroke).transform("mean")
-    values = values - means
-    place = values["distance_mm"]
-    load, force = (x - _slope(place, x, stroke) * place for x in (values["load_N"], values["force_N"]))
-    following = load * means["force_N"] / means["load_N"]  # deviations of a force that follows the load
-    reliability = _slope(following, force, run).clip(0.0, 1.0)
-    return bins.assign(load_N=bins["load_N"] - (1.0 - reliability) * load)
-
-
-def _slope(x: pd.Series, y: pd.Series, group: pd.Series) -> pd.Series:
-    """Return the slope of y along x through 0 in the group of each row, 0 where x is."""
-    product, square = (values.groupby(group).transform("sum") for values in (x * y, x**2))
-    return product / square.where(square > 0, 1.0)
-
-
 def one_load(load_N: np.ndarray | pd.Series) -> bool:
     """Return whether loads, shape (n,), are one setting but for the noise of its sensor."""
     return bool(np.abs(load_N).max() <= SAME_LOAD * np.abs(load_N).min())

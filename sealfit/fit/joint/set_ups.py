@@ -1,4 +1,6 @@
-"""Set-ups that several runs share: the files of a specimen with the same repeat, if these scatter alike.
+"""What is found in `bins` before the fit: set-ups that several runs share, and loads without noise.
+
+Set-ups are the files of a specimen with the same repeat, if these scatter alike.
 
 A run is one set-up at one speed, and its repeats are recorded without a new one. If the specimen is mounted
 anew for every repeat instead, all speeds are measured in one set-up, and their files scatter together.
@@ -83,3 +85,30 @@ def _fitted(values: np.ndarray, factors: Sequence[pd.Series]) -> tuple[np.ndarra
     # Effects of two factors are determined up to a constant in each connected part of their table.
     tied = connected_components(columns.T @ columns)[0] if len(codes) > 1 else 0
     return residual, values.size - columns.shape[1] + tied
+
+
+# ---------------------------------------------------------------- measured loads
+def with_straight_loads(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return numbered `bins` with loads on a straight line along each stroke, and the forces at these loads.
+
+    What the force of a run follows of the load's deviations from the line is subtracted. They are noise of
+    the sensor, which the force does not follow, and fast changes, which it follows with a delay: at the
+    measured loads friction would seem to depend on the load.
+    """
+    if "load_N" not in bins or bins["load_N"].isna().any():
+        return bins
+    stroke = bins["stroke_id"]
+    values = bins[["load_N", "force_N", "distance_mm"]].astype(float)
+    means = values.groupby(stroke).transform("mean")
+    values = values - means
+    place = values["distance_mm"]
+    load, force = (x - _slope(place, x, stroke) * place for x in (values["load_N"], values["force_N"]))
+    following = load * means["force_N"] / means["load_N"]  # deviations of a force in proportion to the load
+    followed = _slope(following, force, bins["run_id"]) * following
+    return bins.assign(load_N=bins["load_N"] - load, force_N=bins["force_N"] - followed)
+
+
+def _slope(x: pd.Series, y: pd.Series, group: pd.Series) -> pd.Series:
+    """Return the slope of y along x through 0 in the group of each row, 0 where x is."""
+    product, square = (values.groupby(group).transform("sum") for values in (x * y, x**2))
+    return product / square.where(square > 0, 1.0)
