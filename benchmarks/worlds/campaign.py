@@ -166,6 +166,6 @@ def points_csv(world: World, points: pd.DataFrame) -> pd.DataFrame:
     """Return the points as `predict` reads them."""
     drop = ["file", "run_id", "specimen_id", "series", "start_mm", *OWN]
     drop += [] if world.days.size else ["aging_days"]
-    drop += [] if world.rig["calendar"] else ["elapsed_h", "run_order"]
+    drop += [] if world.rig["calendar"] else ["elapsed_h", "run_order", "specimen_use"]
     drop += [] if world.rig["load_column"] else ["load_N"]
     return points.drop(columns=drop)

@@ -242,6 +242,7 @@ def _calendar(world: World, rng) -> pd.DataFrame:
             start = hours[here].max() + 0.5
     files["elapsed_h"] = np.round(hours * 3600) / 3600
     files["run_order"] = np.arange(1.0, len(files) + 1)
+    files["specimen_use"] = 1.0 + files.groupby("specimen_id").cumcount()
     files["start_mm"] = rig["start_mm"] + rig["start_scatter_mm"] * rng.normal(size=len(files))
     files["_speed_error"] = np.clip(rig["speed_error"] * rng.normal(size=len(files)), -0.02, 0.02)
     files["_clock_error"] = rig["clock_error"] * rng.normal(size=len(files))

@@ -85,10 +85,8 @@ def propose_ripples(
     refitted = _refitted(fitted, _best_few(found), found)
     refitted = [p for p in refitted if len(p.term.channels) == 1 or _changes(p)]
     ordered = _ordered(fitted, refitted or _refitted(fitted, constant))
-    return [
-        *ordered[:1],
-        *(p for p in ordered[1:] if len(p.term.channels) == 1),
-    ]  # other changes were not found
+    # Changes of the amplitude other than the best one were not found.
+    return [*ordered[:1], *(p for p in ordered[1:] if len(p.term.channels) == 1)]
 
 
 def _changes(proposal: Proposal) -> bool:

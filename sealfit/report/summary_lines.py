@@ -298,7 +298,7 @@ def lifetime_lines(part: Mapping) -> list[str]:
     found += [line("note", f"{part['quantity']} is {note}") for note in part["notes"]]
     if part.get("ci95_over_laws") and part["rivals"] and part["days"] != 0:
         found.append(line("life", _life({**part, "ci95": part["ci95_over_laws"]})))
-        found.append(line("", "the interval is over all laws, weighted by their likelihood"))
+        found.append(line("", "the interval is over all laws, weighted by their BIC"))
         found.append(line("", f"95 % interval if this law is true: {_days_between(part['ci95'])}"))
     else:
         found.append(line("life" if "days" in part else "use", _life(part)))

@@ -1,9 +1,8 @@
 """What is found in `bins` before the fit: set-ups that several runs share, and loads without noise.
 
-Set-ups are the files of a specimen with the same repeat, if these scatter alike.
-
-A run is one set-up at one speed, and its repeats are recorded without a new one. If the specimen is mounted
-anew for every repeat instead, all speeds are measured in one set-up, and their files scatter together.
+Set-ups are the files of a specimen with the same repeat, if these scatter alike. A run is one set-up at one
+speed, and its repeats are recorded without a new one. If the specimen is mounted anew for every repeat
+instead, all speeds are measured in one set-up, and their files scatter together.
 """
 
 from __future__ import annotations
@@ -91,9 +90,9 @@ def _fitted(values: np.ndarray, factors: Sequence[pd.Series]) -> tuple[np.ndarra
 def with_straight_loads(bins: pd.DataFrame) -> pd.DataFrame:
     """Return numbered `bins` with loads on a straight line along each stroke, and the forces at these loads.
 
-    What the force of a run follows of the load's deviations from the line is subtracted. They are noise of
-    the sensor, which the force does not follow, and fast changes, which it follows with a delay: at the
-    measured loads friction would seem to depend on the load.
+    The deviations of the load from the line are noise of the sensor, which the force does not follow, and
+    fast changes, which it follows with a delay. With them friction would seem to depend on the load. The
+    force of each run is fitted to them, and this part of it is subtracted.
     """
     if "load_N" not in bins or bins["load_N"].isna().any():
         return bins
