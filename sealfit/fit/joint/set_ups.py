@@ -24,6 +24,7 @@ SET_UP_P = 0.001
 OF_THE_OTHERS_P = 0.05
 # Smallest scatter of set-ups, as a share of the force, that matters; below lies the rounding of equal files.
 LEAST_SET_UP = 1e-4
+ROUNDING = 1e-9  # Relative deviation of a load from its mean along a stroke that is rounding.
 
 
 def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
@@ -102,6 +103,7 @@ def with_straight_loads(bins: pd.DataFrame) -> pd.DataFrame:
     values = values - means
     place = values["distance_mm"]
     load, force = (x - _slope(place, x, stroke) * place for x in (values["load_N"], values["force_N"]))
+    load = load.where(load.abs() > ROUNDING * means["load_N"].abs(), 0.0)
     following = load * means["force_N"] / means["load_N"]  # deviations of a force in proportion to the load
     followed = _slope(following, force, bins["run_id"]) * following
     return bins.assign(load_N=bins["load_N"] - load, force_N=bins["force_N"] - followed)
