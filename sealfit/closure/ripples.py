@@ -78,7 +78,7 @@ def find_ripple(
     peaks, locked = [], []
     if common_phase and samples["unit"].nunique() < criteria.LEAST_GROUPS_HELD_OUT:
         samples = samples.assign(unit=samples["stroke_id"])  # strokes are held out, too
-    speed = _one_speed(samples)
+    speed = _one_speed(samples) if known else 0.0
     for axis in (name for name in AXES if name not in ignored):
         lengths = [length for own, length in known if own == axis]
         if speed:  # a wave in time is the same as one along displacement

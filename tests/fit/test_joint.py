@@ -315,9 +315,8 @@ def test_a_load_that_changes_along_strokes_is_kept_and_white_noise_is_not():
     found = [with_straight_loads(bins.assign(load_N=load)) for load in (50 + line, 50 + 0.1 * white)]
     npt.assert_allclose(found[0]["load_N"], 50 + line, rtol=1e-12)
     assert np.std(found[1]["load_N"] - 50) < 0.35 * 0.1  # a straight line in the noise of 20 bins: 0.23
-    npt.assert_allclose(
-        found[1]["force_N"], bins["force_N"], atol=0.02
-    )  # the force does not follow the noise
+    # The force does not follow the noise.
+    npt.assert_allclose(found[1]["force_N"], bins["force_N"], atol=0.02)
 
 
 @pytest.mark.parametrize("viscous_N", [0.0, 10.0])
