@@ -16,7 +16,7 @@ from sealfit.closure import criteria
 from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.rows import ALONG, LEVELS, POWER, Rows, one_load, open_columns
-from sealfit.ingest.columns import force_inputs
+from sealfit.ingest.columns import condition_columns, force_inputs
 from sealfit.ingest.quality import STILL_RISING
 from sealfit.ingest.strokes import SPEEDS_APART
 from sealfit.tables import CALENDAR
@@ -51,7 +51,7 @@ def channels_of(rows: Rows, config: Config) -> list[Channel]:
     ignored = {*config.loop.ignore_channels, *force_inputs(config)}
     if config.position_origin != "rig":  # displacement is not the same place in every file
         ignored.add("displacement_mm")
-    return find_channels(rows, ignored, conditions=config.condition)
+    return find_channels(rows, ignored, conditions=condition_columns(config))
 
 
 def searched(channels: Iterable[Channel], rows: Rows) -> list[Channel]:
@@ -82,10 +82,12 @@ def find_channels(
 ) -> list[Channel]:
     """Return every channel of the rows that varies and is not a grouping or a text with hundreds of values.
 
-    Groupings are kept among `conditions`: an offset between directions may differ between these.
+    Groupings are kept among `conditions`: an offset between directions may differ between these. One of them
+    may be called `rubber`, as the column of table `bins` that has the names of rubbers.
     """
     found = []
-    for name in (name for name in rows.channels if name not in ignore):
+    own = [name for name in conditions if name == "rubber" and name in rows.table]
+    for name in (name for name in [*rows.channels, *own] if name not in ignore):
         values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
         if values.dtype.kind == "f":
             if not (np.isfinite(values).all() and varies(values)) or _one_setting(name, values):
