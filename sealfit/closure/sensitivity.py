@@ -3,8 +3,8 @@
 The effect is a factor on mu, linear in the variable at one of its levels, or an offset force for the
 direction. It is added to the residual, and the scatter is re-estimated, because part of the effect is taken
 for scatter. The smallest effect exceeds the critical value of the whole search with a power of 80 %
-(noncentral F), has the least size that is reported and, with weak evidence, lowers the held-out error. The
-stated size is larger by `TO_BE_ADDED`.
+(noncentral F), has the least size that is reported, and lowers the held-out error: by `LEAST_GAIN`, and with
+weak evidence by `LEAST_FALL`. The stated size is larger by `TO_BE_ADDED`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import ALONG, LEVELS
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
-from sealfit.tables import HISTORY
+from sealfit.tables import CALENDAR, HISTORY
 
 TINY = 1e-6  # Size of an effect, as a share of the force, that changes no estimate.
 # Ratio of the stated size to that which is significant with a power of 80 %. Some significant effects are
@@ -82,7 +82,9 @@ def sensitivity(selection: Selection, alpha: float) -> list[dict]:
                 effect = part * fitted.slope(*target)
                 effect *= force / np.sqrt(rows.weight @ effect**2)
                 times = search.smallest(own[0], effect)
-                times = max(times, min(_times_to_lower(fitted, effect, level), search.surer(times, own[0])))
+                whole = name == "direction" or name in CALENDAR  # their error is not about means of groups
+                gained, lowered = _times_to_lower(fitted, effect, None if whole else level)
+                times = max(times, gained, min(lowered, search.surer(times, own[0])))
                 rise = error_of_rise_N(rows) / force if level == "sample" else 0.0
                 stated = max(TO_BE_ADDED * times, criteria.SIZE_MARGIN * max(criteria.LEAST_SIZE, rise))
                 smallest = float(force * stated) if stated < 1 else None
@@ -110,19 +112,27 @@ def _channels_in_model(selection: Selection) -> set[str]:
     return {name for added in selection.added for name in added.proposal.term.channels}
 
 
-def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str) -> float:
-    """Return the factor on an effect at a level, shape (n,), with which it lowers the error by `LEAST_FALL`.
+def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str | None) -> tuple[float, float]:
+    """Return factors on an effect, shape (n,), with which it lowers the error by `LEAST_GAIN`, `LEAST_FALL`.
 
-    Effect and error are taken about the means of the groups within which the effect varies.
+    Effect and error are taken about the means of the groups within which an effect at the level varies.
     """
     rows = fitted.rows
-    around = dict(zip(FINER, (*LEVELS, None), strict=True))[level]
-    own = project(fitted, effect[:, None])[:, 0] / fitted.whitening.unit  # not explained by the model
+    around = dict(zip(FINER, (*LEVELS, None), strict=True)).get(level)
+    free = ~fitted.at_limit
+    white, tangent = fitted.white_jacobian.columns(free), fitted.jacobian.columns(free)
+    taken, *_ = np.linalg.lstsq(
+        white.gram(), white.against(fitted.whitening(effect[:, None])[:, 0]), rcond=1e-10
+    )
+    own = effect - tangent @ taken
     squares = [rows.weight @ about_means(x, rows, around) ** 2 for x in (own, fitted.residual)]
     size, left = np.sqrt(squares).tolist()
     if not size > 0:
-        return np.inf
-    return criteria.SIZE_MARGIN * left * float(np.sqrt(1 / (1 - criteria.LEAST_FALL) ** 2 - 1)) / size
+        return np.inf, np.inf
+    least = criteria.LEAST_GAIN * float(np.sqrt(rows.weight @ fitted.force**2))
+    larger = np.array([left + least, left / (1 - criteria.LEAST_FALL)])
+    gained, lowered = (criteria.SIZE_MARGIN * np.sqrt(larger**2 - left**2) / size).tolist()
+    return gained, lowered
 
 
 def _parts(
