@@ -48,8 +48,10 @@ class OutlierFile(NamedTuple):
     instead: tuple[str, ...] = ()  # files that may be the wrong ones instead; it is not left out then
 
 
-def outlier_files(rows: Rows) -> list[OutlierFile]:
-    """Return the files whose mean force is far off what all other files predict, the farthest first.
+def outlier_files(rows: Rows) -> tuple[list[OutlierFile], Fitted]:
+    """Return the files whose mean force is far off what all other files predict, and the fit without them.
+
+    The farthest is the first.
 
     Model and scatter are fitted without the file. It is an outlier if the gain that would explain it is
     significant beside the scatter of the others, which are then judged without it. In linear regression the
@@ -67,7 +69,7 @@ def outlier_files(rows: Rows) -> list[OutlierFile]:
         if found[-1].instead:
             break
         fitted = kept
-    return sorted(found, key=lambda one: -abs(one.deviation))
+    return sorted(found, key=lambda one: -abs(one.deviation)), fitted
 
 
 def _wrong_instead(one: OutlierFile, tried: Sequence[tuple[OutlierFile, Fitted]]) -> tuple[str, ...]:

@@ -36,7 +36,7 @@ from sealfit.engine.run_map import run_map
 from sealfit.fit.joint import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, SET_UP, Rows, make_rows, records
-from sealfit.fit.joint.set_ups import with_set_ups, with_straight_loads
+from sealfit.fit.joint.set_ups import with_both_directions, with_set_ups, with_straight_loads
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import Silent, timed
 
@@ -70,15 +70,16 @@ def close_loop(
     columns, counted = list(bins.columns), with_straight_loads(numbered(bins.reset_index(drop=True)))
     del bins
     rows = make_rows(with_set_ups(counted), has_aging=config.aging, speed_factor=config.units.speed_factor)
-    outliers = outlier_files(rows)
+    outliers, fitted = outlier_files(rows)
     left_out = [one.file for one in outliers if not one.instead]
     if left_out:
         say("left out, far off all others: " + ", ".join(left_out))
-        rest = counted[~records(counted).isin(left_out).to_numpy()]
-        # Set-ups are looked for again: one wrong file hides that they scatter.
-        rows = make_rows(with_set_ups(rest), has_aging=config.aging, campaign=rows)
+        counted = counted[~records(counted).isin(left_out).to_numpy()]
+    # Set-ups are looked for again: one wrong file hides that they scatter.
+    counted = with_both_directions(with_set_ups(counted), fitted)
+    rows = make_rows(counted, has_aging=config.aging, campaign=rows)
     if SET_UP in rows.table:
-        say("files of a specimen with the same repeat scatter alike: they are one set-up")
+        say("files of a specimen with the same repeat, or of both directions, scatter alike: one set-up")
     del counted  # it takes much memory, and `rows` contains it
     start = None
     for part in subsamples(rows, config.loop.seed):

@@ -10,7 +10,7 @@ from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import SET_UP, make_rows
-from sealfit.fit.joint.set_ups import with_set_ups
+from sealfit.fit.joint.set_ups import with_both_directions, with_set_ups
 
 SMALL = {"temperatures": (60.0,), "bins": 4}
 
@@ -29,6 +29,40 @@ def test_files_of_a_specimen_and_repeat_that_scatter_alike_are_a_set_up(seed):
     assert rows.groups.starts["run"].size == 15
     assert rows.level_name("run") == "set_up"
     assert SET_UP not in rows.channels
+
+
+BOTH = {"temperatures": (60.0,), "bins": 4, "directions": (1, -1), "repeats": 1}
+
+
+def both_directions(bins):
+    return with_both_directions(bins, fit_declared(make_rows(bins, has_aging=True)))
+
+
+def test_directions_that_scatter_by_themselves_are_no_set_ups_though_friction_is_asymmetric():
+    for seed in range(20):  # nominal 0.001
+        bins = make_bins(seed, setup=0.01, **BOTH)
+        bins["force_N"] *= 1 + 0.03 * np.sign(bins["speed_mm_s"])
+        assert SET_UP not in both_directions(bins)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forward_and_backward_at_one_speed_that_scatter_alike_are_one_set_up(seed):
+    bins = make_bins(seed, **BOTH)
+    visit = bins["condition"] + bins["speed_set_mm_s"].astype(str)
+    bins["force_N"] *= (
+        1 + np.random.default_rng(seed).normal(0, 0.02, visit.nunique())[pd.factorize(visit)[0]]
+    )
+    found = both_directions(bins)
+    assert (found.groupby(SET_UP)["run_id"].nunique() == 2).all()
+    assert (found.groupby(SET_UP)["speed_set_mm_s"].nunique() == 1).all()
+    assert make_rows(found, has_aging=True).groups.starts["run"].size == bins["run_id"].nunique() // 2
+
+
+def test_files_with_both_directions_and_files_of_one_are_left_as_they_are():
+    bins = make_bins(0, **BOTH)
+    one_file = bins["condition"] + bins["speed_set_mm_s"].astype(str)
+    for own in (bins.assign(file=one_file), make_bins(0, **SMALL)):
+        assert SET_UP not in both_directions(own)
 
 
 def test_a_change_with_the_repeat_that_specimens_have_in_common_is_none_of_set_ups():

@@ -1,8 +1,9 @@
-"""What is found in `bins` before the fit: set-ups that several runs share, and loads without noise.
+"""What is found in `bins` before the search: set-ups that several runs share, and loads without noise.
 
 Set-ups are the files of a specimen with the same repeat, if these scatter alike. A run is one set-up at one
 speed, and its repeats are recorded without a new one. If the specimen is mounted anew for every repeat
-instead, all speeds are measured in one set-up, and their files scatter together.
+instead, all speeds are measured in one set-up, and their files scatter together. Runs forward and backward at
+one speed are one set-up, too, if they scatter alike.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import lsmr
 from scipy.special import fdtrc
 
+from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import SET_UP, nesting_run, records
 
 # Level of the F test of set-ups. Campaigns whose files scatter independently have set-ups that often.
@@ -85,6 +87,46 @@ def _fitted(values: np.ndarray, factors: Sequence[pd.Series]) -> tuple[np.ndarra
     # Effects of two factors are determined up to a constant in each connected part of their table.
     tied = connected_components(columns.T @ columns)[0] if len(codes) > 1 else 0
     return residual, values.size - columns.shape[1] + tied
+
+
+def with_both_directions(bins: pd.DataFrame, fitted: Fitted) -> pd.DataFrame:
+    """Return table `bins` with a column `SET_UP` if runs forward and backward scatter alike, else as it is.
+
+    Such runs of a specimen at one speed, in files of their own, are then one set-up, as if one file had both.
+    If they scatter independently, the sums and differences of their residuals, less the means of specimens,
+    have the same variance. The two are compared by F.
+    """
+    table = fitted.rows.table
+    if SET_UP in bins or not (nesting_run(table, table["record"]) == table["run_id"]).all():
+        return bins
+    left = pd.Series(fitted.residual / fitted.friction).groupby(table["run_id"]).mean()
+    runs = _runs_both_ways(bins).assign(left=left)
+    pairs = runs.pivot_table(index=["specimen", "set_up"], columns="forward", values="left").dropna()
+    df = len(pairs) - pairs.index.unique("specimen").size
+    if pairs.shape[1] < 2 or df < 1:
+        return bins
+    forward, backward = (pairs - pairs.groupby("specimen").transform("mean")).to_numpy().T
+    alike, opposed = (float(((forward + sign * backward) ** 2).sum()) / df for sign in (1, -1))
+    if alike <= LEAST_SET_UP**2 or fdtrc(df, df, alike / max(opposed, 1e-300)) >= SET_UP_P:
+        return bins
+    return bins.assign(**{SET_UP: bins["run_id"].map(runs["set_up"])})
+
+
+def _runs_both_ways(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return the specimen, set-up and direction of each run.
+
+    The first run forward at a speed is of the set-up of the first one backward, and so on.
+    """
+    names = {"specimen": "specimen_id", "condition": "condition", "speed": "speed_set_mm_s"}
+    runs = bins.assign(forward=bins["speed_mm_s"] > 0, order=bins.get("run_order", 0.0))
+    runs = runs.groupby("run_id").agg(
+        **{key: (name, "first") for key, name in names.items()},
+        forward=("forward", "first"),
+        order=("order", "min"),
+    )
+    runs["specimen"] = runs["specimen"].astype(str)
+    runs["number"] = runs.sort_values("order").groupby([*names, "forward"]).cumcount()
+    return runs.assign(set_up=runs.groupby([*names, "number"]).ngroup().map("set-up {}".format))
 
 
 # ---------------------------------------------------------------- measured loads
