@@ -53,7 +53,7 @@ def reference_of(term: Term, values: Mapping[str, float], config: Config) -> str
     labels = {name: config.units.label(name) for name in term.channels}
     known = {"x": labels[term.channels[0]], "z": labels[term.channels[-1]], **labels}
     numbers = {**term.fixed, **values}
-    known |= {name: f"{value:.4g}" for name, value in numbers.items() if np.isscalar(value)}
+    known |= {name: f"{value:.4g}" for name, value in numbers.items() if isinstance(value, int | float)}
     words = term.effect.reference or f"where {term.effect.form} = 0"
     return re.sub(r"\{(\w+)\}", lambda found: str(known.get(found[1], found[1])), words)
 

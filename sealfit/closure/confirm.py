@@ -19,6 +19,7 @@ from sealfit.closure.naming import rivals
 from sealfit.closure.ripples import agreement, pass_shifts, waves_of
 from sealfit.config import Config, Loop
 from sealfit.effects.contract import Effect
+from sealfit.effects.free import WITHIN
 from sealfit.fit.joint import Fitted, fit, with_reml_smoothness
 from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import ALONG, LEVELS, Rows
@@ -349,11 +350,14 @@ def _amplitude_too_large(proposal: Proposal, samples: pd.DataFrame) -> bool:
 def _changes_the_curve(proposal: Proposal) -> bool:
     """Whether it acts on one coefficient, or is a shape of the speed and another variable.
 
-    Mechanisms between strokes are exempt, and so is what differs between specimens.
+    Mechanisms between strokes are exempt, and so is what differs between specimens. A shape of the speed in
+    one category is tested against the scatter of specimens if they are enough.
     """
     term = proposal.term
     if proposal.unit == "specimen":
         return False
+    if term.effect.id == WITHIN:
+        return proposal.fitted.rows.groups.starts["specimen"].size < criteria.LEAST_UNITS_OF_SLOPES
     if term.effect.physical:
         return term.acts_on not in WHOLE and not set(ALONG).isdisjoint(term.channels)
     by_speed = len(term.channels) > 1 and "speed_mm_s" in term.channels

@@ -17,7 +17,7 @@ from sealfit.closure.ripples import Peak, common_wavelength, pass_shifts
 from sealfit.closure.score_test import Candidate, ScoreTestResult, project
 from sealfit.closure.small_sample_test import SmallSampleTest
 from sealfit.effects.contract import CHANNEL, READS_ANY, SECOND, Effect
-from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_effect, natural
+from sealfit.effects.free import LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, WITHIN, free_effect, natural
 from sealfit.fit.joint import Fitted, fit, reestimated
 from sealfit.fit.joint.model import Term, mean_derivatives, shape_of
 from sealfit.fit.joint.rows import Rows
@@ -50,7 +50,11 @@ def terms_of(
     name = candidate.channels[-1]
     channel = channels[name]
     knots = min(criteria.MOST_KNOTS, candidate.test_result.units // criteria.UNITS_PER_KNOT)
-    for term, grid in _terms_of_single(channel, target, channels, fitted, effects, knots):
+    if candidate.category is None:
+        forms = _terms_of_single(channel, target, channels, fitted, effects, knots)
+    else:
+        forms = [(within_term(free_term(channel, *target, knots=knots), candidate), {})]
+    for term, grid in forms:
         fits = len(term.effect.parameters) <= room_along(channel, fitted, term.target)
         # a smoothing spline has fewer effective degrees of freedom
         if fits or len(term.channels) > 1 or term.smoothness is not None:
@@ -185,6 +189,13 @@ def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = cr
     categories, count = np.unique(channel.values, return_counts=True)
     fixed = {"categories": tuple(categories.tolist()), "means": tuple((count / count.sum()).tolist())}
     return Term(free_effect(LEVELS, fixed), (channel.name,), acts_on, operation, fixed)
+
+
+def within_term(term: Term, candidate: Candidate) -> Term:
+    """Return a free shape of a number in the one category of a candidate."""
+    fixed = {"category": candidate.category, "knots": term.fixed["knots"]}
+    names = (*term.channels, candidate.channels[0])
+    return replace(term, effect=free_effect(WITHIN, fixed), channels=names, fixed=fixed)
 
 
 def surface_term(one: Channel, other: Channel, acts_on: str, operation: str) -> Term:

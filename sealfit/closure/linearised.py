@@ -12,14 +12,14 @@ import numpy as np
 from sealfit.closure.criteria import IDENTIFIABLE, PAIR_PENALTY, WEAK_P
 from sealfit.closure.score_test import Candidate, project
 from sealfit.effects.contract import SECOND
-from sealfit.effects.free import SMOOTH, SURFACE
+from sealfit.effects.free import SMOOTH, SURFACE, WITHIN
 from sealfit.fit.joint import Fitted, effective_df
 from sealfit.fit.joint.model import Term, mean_derivatives
 from sealfit.fit.joint.prior import penalised, reml_smoothness, roughness_of
 from sealfit.fit.joint.rows import Rows
 
 PART = 32  # Grid points that are whitened at once.
-UNNAMED = (SMOOTH, SURFACE)
+UNNAMED = (SMOOTH, SURFACE, WITHIN)
 ZERO_OFFSET = (("direction",), "force", "add")
 PREFERRED = ("mu", "mu_c", "mu_s", "force", "v_s", "sigma_2", "a", "b", "mu_0")
 
@@ -98,7 +98,7 @@ def linearised(
         amplitude, *_ = np.linalg.lstsq(left, fitted.white_residual, rcond=1e-10)
     else:  # a free shape
         normal, gradient, rough = left.T @ left, left.T @ fitted.white_residual, roughness_of(term)
-        smoothness = reml_smoothness(normal, gradient, rough, len(term.channels))
+        smoothness = reml_smoothness(normal, gradient, rough)
         amplitude, size = penalised(normal, gradient, smoothness * rough)
         term = replace(term, smoothness=smoothness)
     column = left @ amplitude

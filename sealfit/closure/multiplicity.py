@@ -164,7 +164,8 @@ def number_of_contrasts(candidates: Sequence[Candidate]) -> np.ndarray:
 
     The variables of operation and all others have half of the error rate each.
     """
-    family = np.array([set(c.channels) <= OPERATION for c in candidates], dtype=int)
+    own = [c.channels[-1:] if c.category else c.channels for c in candidates]
+    family = np.array([set(names) <= OPERATION for names in own], dtype=int)
     sizes = [c.test_result.slopes[0].slope.size if c.test_result.slopes else 0 for c in candidates]
     counts = np.bincount(family, weights=sizes, minlength=2)
     return (np.count_nonzero(counts) * counts)[family]

@@ -273,6 +273,8 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
         values = term.inputs(rows)[term.effect.reads[term.channels.index(first)]]
         numeric = bool(own["label"].isna().all())
         known = np.isfinite(values) if numeric else np.full(values.size, True)
+        if "category" in term.fixed:
+            known &= rows.values(term.channels[-1]) == term.fixed["category"]
         if numeric:
             low, high = own["x"].min(), own["x"].max()
             values = np.where(values > high, low + (values - low) % ((high - low) or 1.0), values)
@@ -318,7 +320,7 @@ def _along(
         if channel == first:
             inputs[name] = x
         elif others.dtype.kind != "f":
-            inputs[name] = np.full(x.size, str(np.unique(others)[0]))
+            inputs[name] = np.full(x.size, str(term.fixed.get("category", np.unique(others)[0])))
         else:
             far = name == SECOND and term.effect.id != SURFACE
             inputs[name] = np.full(x.size, np.quantile(others, 0.9) if far else np.abs(others).mean())

@@ -78,6 +78,7 @@ class Candidate:
     p_value: float = 1.0  # adjusted over the search
     pair: bool = False  # whether it is an interaction of two channels
     place: bool = False  # whether it is a step or a kink at one of many places along its channel
+    category: str | None = None  # the one category of the first channel in which the last one acts
     temporary: bool = False  # whether it begins at one time and ends at another; searched by themselves
 
     @property

@@ -47,6 +47,7 @@ NOT_TESTED = ScoreTestResult(0.0, 0, 0, 0.0)
 def search(tests: ScoreTests, channels: Sequence[Channel], rng: np.random.Generator) -> list[Candidate]:
     """Return every candidate with its adjusted p-value, strongest evidence first."""
     candidates = [c for channel in channels for c in channel_candidates(tests, channel)]
+    candidates += _speed_in_categories(tests, channels)
     temporary = [c for c in candidates if c.temporary]
     lasting = [c for c in candidates if not c.temporary]
     found = adjust_all(tests, lasting, rng) if lasting else []
@@ -85,6 +86,20 @@ def channel_candidates(tests: ScoreTests, channel: Channel) -> Iterator[Candidat
         yield from _shape_candidates(tests, channel, np.hstack([np.cos(angle), np.sin(angle)]), MAIN_TARGETS)
     if means := run_means(channel, rows):
         yield from channel_candidates(tests, means)
+
+
+def _speed_in_categories(tests: ScoreTests, channels: Sequence[Channel]) -> Iterator[Candidate]:
+    """Yield candidates of any dependence of mu on the speed in one category, such as a rubber of several."""
+    rows, target = tests.fitted.rows, MAIN_TARGETS[0]
+    curves = "full" in tests.fitted.model.declared.stribeck.values()
+    for speed in (c for c in channels if curves and c.name == "speed_mm_s"):
+        level, between = flip_level(speed.unit, rows), scatter_level([speed], rows)
+        for channel in (c for c in _usable(channels) if not c.numeric and c.unit == "specimen"):
+            for category in np.unique(channel.values):
+                shapes = (channel.values == category)[:, None] * main_columns(speed)
+                names = (channel.name, speed.name)
+                whole = Candidate(names, *target, level, shapes, NOT_TESTED, category=str(category))
+                yield from _tested(tests, whole, [slice(None)], speed.unit, between)
 
 
 def _each_column(tests: ScoreTests, channel: Channel, shapes: np.ndarray) -> Iterator[Candidate]:

@@ -14,7 +14,7 @@ import numpy as np
 from sealfit.effects.contract import CHANNEL, SECOND, Effect, amplitude, closed_form, deviation
 from sealfit.errors import ParameterError
 
-LEVELS, SLOPES, SMOOTH, SURFACE = "levels", "slopes", "smooth", "surface"
+LEVELS, SLOPES, SMOOTH, WITHIN, SURFACE = "levels", "slopes", "smooth", "within", "surface"
 # Ratio of the largest to the smallest value of a positive channel from which its logarithm is used.
 WIDE = 20.0
 
@@ -140,6 +140,36 @@ def _spline(places: tuple[float, ...], amplitudes: np.ndarray, inputs: Mapping) 
     return natural(places, inputs[CHANNEL])[..., 1:] @ amplitudes
 
 
+def within_effect(category: str, knots: Sequence[float]) -> Effect:
+    """Return the same spline in one category of a second channel; it is zero in the others.
+
+    Amplitudes and errors are those of `smooth_effect`.
+    """
+    places = _rising(WITHIN, knots)
+    first = f"{places[0]:.6g}"
+    return _free(
+        partial(_within, category, places),
+        None,
+        id=WITHIN,
+        label=f"smooth in {{x}} where {{z}} is {category}",
+        equation=f"h = natural cubic spline through (x_j, c_j), knots {_listed(places)}, zero at {first}, "
+        f"where {{z}} is {category}; 0 elsewhere",
+        reference=f"{{x}} = {first}",
+        reads=(CHANNEL, SECOND),
+        parameters=tuple(
+            amplitude(f"c_{j}", "{y}", 0.0, f"value at {place:.6g} less that at {first}")
+            for j, place in enumerate(places[1:], start=2)
+        ),
+        source="Form: ours. Wood 2017, Generalized Additive Models, 2nd ed., CRC Press: a smooth by factor.",
+    )
+
+
+def _within(category: str, places: tuple[float, ...], amplitudes: np.ndarray, inputs: Mapping) -> np.ndarray:
+    return np.where(
+        np.asarray(inputs[SECOND]).astype(str) == category, _spline(places, amplitudes, inputs), 0.0
+    )
+
+
 def _rising(id: str, knots: Sequence[float]) -> tuple[float, ...]:
     places = tuple(float(k) for k in knots)
     if len(places) < 2 or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
@@ -228,7 +258,10 @@ def _surface(x_knots: tuple[float, ...], z_knots: tuple[float, ...], amplitudes:
 
 
 # Every free shape. Its arguments have the names of the fixed values in model files.
-FREE = {SMOOTH: smooth_effect, LEVELS: levels_effect, SURFACE: surface_effect, SLOPES: slopes_effect}
+FREE = {
+    SMOOTH: smooth_effect, WITHIN: within_effect, LEVELS: levels_effect, SURFACE: surface_effect,
+    SLOPES: slopes_effect,
+}  # fmt: skip
 
 
 def free_effect(id: str, fixed: Mapping[str, object]) -> Effect:

@@ -14,6 +14,7 @@ from sealfit.closure.channels import (
     unit_of,
     without_trends,
 )
+from sealfit.closure.confirm import added_force
 from sealfit.closure.forms import room_along, terms_of
 from sealfit.closure.naming import propose
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of_score
@@ -99,6 +100,17 @@ def test_the_noise_of_one_load_is_no_channel(share, several):
     names = {c.name for c in find_channels(make_rows(bins, has_aging=True))}
     assert ({"load_N", "power"} <= names) == several
     assert several or names.isdisjoint({"load_N", "power"})
+
+
+def test_a_condition_may_be_called_rubber():
+    """Table `bins` has a column of this name in any case, which is no channel of its own."""
+    bins = make_bins(bins=4)
+    bins["compound"] = bins["rubber"] = np.where(bins["temperature_C"] == 60.0, "NBR", "FKM")
+    rows = make_rows(bins, has_aging=True)
+    for column in ("rubber", "compound"):
+        names = {c.name for c in channels_of(rows, Config(name="", rubber=(column,)))}
+        assert column in names
+        assert ("rubber" in names) == (column == "rubber")
 
 
 def test_a_serial_number_is_a_grouping_and_not_a_channel():
@@ -430,6 +442,31 @@ def test_a_stribeck_exponent_is_found_above_and_below_2(exponent, drop):
     named = propose(fitted, [c for c in found if c.p_value < 0.005], channels, EFFECTS)[0]
     assert named.term.effect.id == "stribeck_exponent"
     assert named.fitted.model.values[-1]["n"] == pytest.approx(exponent, rel=0.15)
+
+
+def test_another_curve_of_one_of_two_rubbers_is_found_in_it():
+    """The curves of two rubbers are fitted apart: a common shape of the speed would change both."""
+
+    def softer(table, force):
+        ratio = np.abs(table["speed_mm_s"].to_numpy()) / TRUE["v_s"]
+        change = 0.25 * LOAD_N * (np.exp(-(ratio**0.8)) - np.exp(-(ratio**2)))
+        return force + np.where(table["temperature_C"] == 60.0, change, 0.0)
+
+    bins = make_bins(
+        bins=4, days=(1.0, 2.0, 4.0, 8.0, 16.0), speeds=np.geomspace(0.6, 60, 9), gain=0.002, effect=softer
+    )
+    bins["lot"] = np.where(bins["temperature_C"] == 60.0, "A", "B")
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    channels = {c.name: c for c in find_channels(fitted.rows)}
+    found = search(ScoreTests(fitted), list(channels.values()), np.random.default_rng(0))
+    p_values = {c.category: c.p_value for c in found if c.category}
+    assert p_values["A"] < 0.001 < 0.1 < p_values["B"]
+    named = propose(fitted, [c for c in found if c.category == "A"], channels, EFFECTS)[0]
+    assert named.term.channels == ("speed_mm_s", "lot")
+    added = added_force(named)
+    in_a = channels["lot"].values == "A"
+    assert (added[~in_a] == 0.0).all()
+    assert np.std(named.fitted.residual[in_a]) < 0.6 * np.std(fitted.residual[in_a])
 
 
 def test_a_constant_force_without_noise_gives_no_alarm():

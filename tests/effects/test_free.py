@@ -46,6 +46,13 @@ def test_smooth_against_a_natural_spline_solved_by_hand():
     )
 
 
+def test_a_shape_in_one_category_is_zero_in_the_others():
+    effect = free_effect("within", {"category": "B", "knots": [0.0, 1.0, 2.0]})
+    given = {"x": np.array([1.0, 1.0, 2.0]), "z": np.array(["A", "B", "B"])}
+    npt.assert_allclose(effect.shape(given, c_2=0.3, c_3=0.5), [0.0, 0.3, 0.5])
+    assert effect.label == "smooth in {x} where {z} is B"
+
+
 def test_roughness_is_the_integral_of_the_squared_second_derivative():
     # Knots 0, 1, 2 scaled to 0, 1/2, 1: h'' rises to m and falls to 0, m = -3 * 4 at values 0, 1, 0; m^2/3.
     npt.assert_allclose(np.array([1.0, 0.0]) @ roughness((0.0, 1.0, 2.0)) @ [1.0, 0.0], 12**2 / 3, rtol=1e-12)
@@ -86,7 +93,10 @@ def test_free_shapes_are_rebuilt_from_plain_data(id_, fixed):
         (lambda: smooth_effect([1.0, np.nan]), "two or more rising numbers"),
         (lambda: levels_effect(["A"]), "two or more different categories"),
         (lambda: levels_effect(["A", "A"]), "two or more different categories"),
-        (lambda: free_effect("wavelet", {}), "'wavelet' is no free shape.*smooth, levels, surface, slopes"),
+        (
+            lambda: free_effect("wavelet", {}),
+            "'wavelet' is no free shape.*smooth, within, levels, surface, slopes",
+        ),
         (lambda: free_effect("smooth", {}), "'knots' is missing"),
         (lambda: free_effect("surface", {"x_knots": (0, 1)}), "'z_knots' is missing"),
         (lambda: surface_effect((0, 1), (2, 2)), "two or more rising numbers"),

@@ -31,7 +31,7 @@ def test_a_straight_line_is_worth_one_number():
     for seed in range(20):
         normal, gradient = normal_equations(lambda x: 2.0 * np.asarray(x), 0.3, seed)
         rough = roughness(KNOTS)
-        amplitude, size = penalised(normal, gradient, reml_smoothness(normal, gradient, rough, 1) * rough)
+        amplitude, size = penalised(normal, gradient, reml_smoothness(normal, gradient, rough) * rough)
         sizes.append(size)
         npt.assert_allclose(amplitude, 2.0 * np.array(KNOTS[1:]), atol=0.6)
     assert np.median(sizes) < 1.5
@@ -46,7 +46,7 @@ def test_the_smoothness_of_greatest_likelihood_is_near_the_one_of_least_error(wa
     ratios = []
     for seed in range(20):
         normal, gradient = normal_equations(truth, 0.3, seed)
-        chosen = reml_smoothness(normal, gradient, rough, 1)
+        chosen = reml_smoothness(normal, gradient, rough)
         tried = [*(chosen * 10.0 ** np.linspace(-4, 4, 33)), chosen]
         error = [np.sqrt(np.mean((penalised(normal, gradient, t * rough)[0] - wanted) ** 2)) for t in tried]
         ratios.append(error[-1] / min(error))
@@ -88,7 +88,7 @@ def test_smoothness_of_a_surface_whose_plane_the_model_contains():
     columns = np.random.default_rng(0).normal(size=(40, 8))
     plane = np.linalg.svd(rough)[0][:, -2:]
     normal = 1e-9 * (columns - columns @ plane @ plane.T).T @ (columns - columns @ plane @ plane.T)
-    found = reml_smoothness(normal, np.zeros(8), rough, 2)
+    found = reml_smoothness(normal, np.zeros(8), rough)
     amplitude, size = penalised(normal, np.zeros(8), found * rough)
     assert np.isfinite(found)
     npt.assert_array_equal(amplitude, 0.0)

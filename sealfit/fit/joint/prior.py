@@ -34,13 +34,21 @@ DECADES = np.linspace(-8.0, 6.0, 57)
 # Ridge of the normal matrix, as a share of its diagonal and of the mean of that. It is singular if the
 # declared model contains the straight line, or no row lies near a knot of a surface.
 RIDGE = 1e-10
+# Ridge of a shape of the speed in one category, as a share of the mean penalty: the Stribeck curve of this
+# category explains what it can, and the shape the rest.
+RIDGE_OF_CATEGORY = 0.1
+# Largest eigenvalue, as a share of the largest of all, of a direction in which a free shape is not rough.
+ROUNDING = 1e-10
 
 
 def roughness_of(term: Term) -> np.ndarray:
     """Return the penalty matrix S of a smooth shape or surface, shape (amplitudes, amplitudes)."""
     if "x_knots" in term.fixed:
         return surface_roughness(tuple(term.fixed["x_knots"]), tuple(term.fixed["z_knots"]))
-    return roughness(tuple(term.fixed["knots"]))
+    rough = roughness(tuple(term.fixed["knots"]))
+    if "category" in term.fixed:
+        rough = rough + RIDGE_OF_CATEGORY * np.trace(rough) / len(rough) * np.eye(len(rough))
+    return rough
 
 
 def precision_of(model: Model) -> np.ndarray:
@@ -79,7 +87,7 @@ def covariance_of(normal: np.ndarray, precision: np.ndarray) -> np.ndarray:
     return np.linalg.pinv(normal * scale, rcond=1e-12, hermitian=True) * scale
 
 
-def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray, channels: int) -> float:
+def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray) -> float:
     """Return the smoothness lambda that maximises the restricted likelihood, from G and g at zero amplitudes.
 
     The null space of S, `rough`, shape (p, p), are straight lines of one channel, or planes of two.
@@ -89,8 +97,8 @@ def reml_smoothness(normal: np.ndarray, gradient: np.ndarray, rough: np.ndarray,
         return 1.0
     tried = unit * 10.0**DECADES
     size, axes = np.linalg.eigh(rough)  # along these axes a large penalty does not round small numbers off
-    size[:channels] = 0.0
-    pull, rank = axes.T @ gradient, size.size - channels
+    size[size < ROUNDING * size[-1]] = 0.0
+    pull, rank = axes.T @ gradient, np.count_nonzero(size)
     posterior = _ridged(axes.T @ normal @ axes) + tried[:, None, None] * np.diag(size)
     solved = np.linalg.solve(posterior, pull[:, None])[..., 0]
     cost = -(solved @ pull) + np.linalg.slogdet(posterior)[1] - rank * np.log(tried)
@@ -115,7 +123,7 @@ def smoothed(model: Model, normal: np.ndarray, gradient: np.ndarray) -> Model:
             continue
         place = model.term_slice(number)
         own, pull = free_of_others(model, normal, gradient, place)
-        value = reml_smoothness(own, pull, roughness_of(term), len(term.channels))
+        value = reml_smoothness(own, pull, roughness_of(term))
         terms = tuple(replace(t, smoothness=value) if k == number else t for k, t in enumerate(model.terms))
         model = replace(model, terms=terms)
     return model
