@@ -28,6 +28,11 @@ from sealfit.tables import LEVELS as TABLE_OF_LEVELS
 SHAPES = 3  # Number of shapes along strokes in the lack-of-fit test: Legendre polynomials of degree 1 to 3.
 RANK = 1e-9  # Relative singular value below which a direction of a tangent is zero.
 
+# Least degrees of freedom of a sandwich at a point of a prediction. In 48 worlds drawn at random 98.7 % of
+# 4,802 points that one or two groups determine lay inside without it, with intervals 2.2 times those by the
+# variance components in the median and up to 15 times; 96.0 % with it, and 1.3 times.
+LEAST_SANDWICH_DF = 2.0
+
 # Value and both ends of its 95 % interval.
 Interval = tuple[float, float, float]
 # Phases of waves: the amplitude of each, its period, and the largest value that is written.
@@ -366,8 +371,8 @@ def mean_half_width(
     """Return half the 95 % interval of the model's force, shape (n,): the largest of several.
 
     One uses the covariance by the variance components, shape (p, p), with `df` degrees of freedom. The others
-    are sandwiches, each with Satterthwaite's degrees of freedom at this point, except where one group alone
-    determines the force. The tangent at the points has shape (n, p).
+    are sandwiches, each with Satterthwaite's degrees of freedom at this point, but `LEAST_SANDWICH_DF` at
+    least, except where one group alone determines the force. The tangent at the points has shape (n, p).
     """
     half = t_quantile(df) * mean_se(tangent, covariance)
     for covariance_of_groups, information in others:
@@ -376,7 +381,7 @@ def mean_half_width(
             parts = [tangent.squares(covariance[:, k] @ own @ covariance[k]) for k, own in information]
             share = np.maximum(parts, 0.0)
             share /= np.maximum(share.sum(axis=0), 1e-300)
-            reach = t_quantile(satterthwaite_df(share))
+            reach = t_quantile(np.maximum(satterthwaite_df(share), LEAST_SANDWICH_DF))
             reach[share.max(axis=0) > LARGEST_LEVERAGE] = 0.0
         half = np.maximum(half, reach * mean_se(tangent, covariance_of_groups))
     return half

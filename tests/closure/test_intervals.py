@@ -44,6 +44,12 @@ def test_a_few_groups_have_degrees_of_freedom_of_their_own():
     np.testing.assert_allclose(half, 2 * t_quantile(3) * np.array([1.0, 2.0]))
 
 
+def test_a_point_that_two_groups_determine_has_no_interval_of_one_degree_of_freedom():
+    tangent, groups = Tangent.dense(np.array([[1.0]])), [(np.array([0]), np.array([[1.0]]))] * 2
+    half = mean_half_width(tangent, np.array([[1.0]]), 4, [Sandwich(np.array([[1.0]]), groups)])
+    np.testing.assert_allclose(half, t_quantile(2))  # and not t_quantile(1), three times as much
+
+
 def test_a_group_that_decides_alone_says_nothing_of_its_scatter():
     tangent = Tangent.dense(np.array([[1.0]]))
     groups = [(np.array([0]), np.array([[99.0]])), (np.array([0]), np.array([[1.0]]))]
