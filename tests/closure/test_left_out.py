@@ -54,6 +54,7 @@ def test_too_few_files_predict_no_other():
     assert outlier_files(make_rows(few, has_aging=True))[0] == []
 
 
+@pytest.mark.long
 def test_one_of_ten_files_that_went_wrong_is_found_though_the_curve_follows_it():
     """A curve without a fall, or with another v_s, may fit all ten so that another file is the farthest."""
 

@@ -26,6 +26,7 @@ def fitted_of(**options):
     return fit_declared(make_rows(make_bins(5, repeats=2, bins=6, setup=0.003, **options), has_aging=True))
 
 
+@pytest.mark.long
 def test_a_shape_of_no_catalogue_is_one_effect_and_not_two_bumps():
     def sigmoid(table, force):
         return force * (1 + 0.06 * np.tanh((table["oil_ppm"].to_numpy() - 50) / 3))
@@ -164,6 +165,7 @@ def test_an_offset_and_an_asymmetry_that_are_both_there_stay_two():
     assert [t.effect.id for t in terms] == ["zero_offset", "asymmetry"]
 
 
+@pytest.mark.long
 def test_a_change_with_time_told_by_distance_and_by_displacement_is_one_effect():
     def growing(table, force):
         return force * (1 + 0.004 * table["time_s"].to_numpy())
@@ -235,6 +237,7 @@ def test_what_one_effect_leaves_unexplained_is_not_taken_for_scatter_of_files():
     assert lead < 2 * (rename_effects.deviance_under(two, one.scatter) - one.deviance)
 
 
+@pytest.mark.long
 def test_no_surface_changes_with_the_calendar():
     def changes(table, force):
         oil, hours = (table[name].to_numpy() for name in ("oil_ppm", "elapsed_h"))

@@ -129,6 +129,7 @@ def test_without_repeats_there_is_nothing_to_find():
     assert with_set_ups(bins) is bins
 
 
+@pytest.mark.long
 def test_nothing_is_significant_where_only_set_ups_scatter():
     def least_p(bins, seed):
         rows = make_rows(bins, has_aging=True)
