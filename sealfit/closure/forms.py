@@ -192,10 +192,10 @@ def free_term(channel: Channel, acts_on: str, operation: str, *, knots: int = cr
 
 
 def within_term(term: Term, candidate: Candidate) -> Term:
-    """Return a free shape of a number in the one category of a candidate."""
+    """Return a free shape of a number in the one category of a candidate, with a penalty."""
     fixed = {"category": candidate.category, "knots": term.fixed["knots"]}
     names = (*term.channels, candidate.channels[0])
-    return replace(term, effect=free_effect(WITHIN, fixed), channels=names, fixed=fixed)
+    return Term(free_effect(WITHIN, fixed), names, *term.target, fixed=fixed, smoothness=1.0)
 
 
 def surface_term(one: Channel, other: Channel, acts_on: str, operation: str) -> Term:

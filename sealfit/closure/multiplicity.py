@@ -162,7 +162,7 @@ def adjust_slopes(candidates: Sequence[Candidate]) -> np.ndarray:
 def number_of_contrasts(candidates: Sequence[Candidate]) -> np.ndarray:
     """Return the factor on the p-values of each candidate's contrasts in few units, shape (m,).
 
-    The variables of operation and all others have half of the error rate each.
+    The variables of operation, also in one category, and all others have half of the error rate each.
     """
     own = [c.channels[-1:] if c.category else c.channels for c in candidates]
     family = np.array([set(names) <= OPERATION for names in own], dtype=int)

@@ -121,10 +121,9 @@ def _times_to_lower(fitted: Fitted, effect: np.ndarray, level: str | None) -> tu
     around = dict(zip(FINER, (*LEVELS, None), strict=True)).get(level)
     free = ~fitted.at_limit
     white, tangent = fitted.white_jacobian.columns(free), fitted.jacobian.columns(free)
-    taken, *_ = np.linalg.lstsq(
-        white.gram(), white.against(fitted.whitening(effect[:, None])[:, 0]), rcond=1e-10
-    )
-    own = effect - tangent @ taken
+    score = white.against(fitted.whitening(effect[:, None])[:, 0])
+    taken, *_ = np.linalg.lstsq(white.gram(), score, rcond=1e-10)
+    own = effect - tangent @ taken  # not explained by the model
     squares = [rows.weight @ about_means(x, rows, around) ** 2 for x in (own, fitted.residual)]
     size, left = np.sqrt(squares).tolist()
     if not size > 0:
