@@ -120,6 +120,20 @@ def test_a_displacement_is_integrated_from_a_speed(tmp_path):
     assert trace.columns["speed_column_mm_s"].unit == "mm/min"
 
 
+@pytest.mark.parametrize(
+    ("unit", "factor", "scale", "doubted"),
+    [("mm/min", 60, 1.0, False), ("mm/min", 60, 1e-3, True), ("rpm", 2, 1e-3, True)],
+)
+def test_a_height_beside_a_speed_is_a_doubt(unit, factor, scale, doubted, tmp_path):
+    def columns(one):
+        speed = np.gradient(one.displacement_mm, one.time_s)
+        return [one.time_s, scale * one.displacement_mm, factor * speed, one.force_N]
+
+    made = campaign(tmp_path, columns, f"Zeit [s],Z [mm],Geschwindigkeit [{unit}],Kraft [N]\n", strokes=2)
+    assert slots(made)["displacement_mm"] == "Z [mm]"
+    assert doubted == any("it may be a height" in doubt.reason for doubt in made.doubts)
+
+
 def test_a_time_in_no_unit_that_would_last_for_hours_is_in_ms(tmp_path):
     made = campaign(
         tmp_path, lambda one: [one.time_s * 1000, *exports.slots(one)[1:]], "Time,Position,Force\n"
