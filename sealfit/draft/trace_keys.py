@@ -22,8 +22,9 @@ LONG_S = 3600.0  # longer traces without a unit of time, at a sample per second 
 BAD_ROWS = 2  # with a missing value, that may stand above the first whole row of data
 AS_LONG = 0.5  # share of the rows of a workbook's longest sheet above which another may be a recording
 
-LEAST_SHARE_OF_PATH = 0.1  # least share of the way by a column of speed that a displacement goes
-LEAST_TURN_MM = 10.0  # least way of a turn: a track has a radius of 1.6 mm or more
+# A displacement that covers less than this share of the distance by a column of speed is doubted.
+LEAST_SHARE_OF_DISTANCE = 0.1
+LEAST_TURN_MM = 10.0  # Least circumference of a track, in mm: its radius is 1.6 mm or more.
 
 SLOTS = {"time": "time_s", "displacement": "displacement_mm", "force": "force_N", "load": "load_N"}
 NEGATED = {"force": "with the sign of the motion", "load": "as a load that presses counts above 0"}
@@ -160,7 +161,7 @@ def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], notes: No
         helpers.append("coefficient")
     if roles.displacement is None and roles.speed is not None:
         helpers.append(_integrated(roles.speed, notes))
-    _displacement_against_speed(roles, notes)
+    _displacement_against_speed(roles, units, notes)
     clock = _clock_or_rate(found, notes) if roles.time is None else None
     _missing_slots(roles, clock is not None, notes)
     force = roles.dimension("force")
@@ -176,28 +177,25 @@ def column_keys(found: Found, roles: Roles, units: Mapping[str, Unit], notes: No
     _other_columns(found, roles, clock or "", notes)
 
 
-def _displacement_against_speed(roles: Roles, notes: Notes) -> None:
-    """Add a doubt if the displacement goes far less than a column of speed says: it may be a height."""
+def _displacement_against_speed(roles: Roles, units: Mapping[str, Unit], notes: Notes) -> None:
+    """Add a doubt if the displacement covers far less than a column of speed says: it may be a height."""
     time, place, speed = roles.time, roles.displacement, roles.speed
-    if None in (time, place, speed) or roles.dimension("displacement") == "angle":
+    angle = roles.dimension("displacement") == "angle"
+    if None in (time, place, speed) or angle or not speed.in_unit_of("speed"):
         return
-    ours = "rpm" if speed.dimension == "rotation" else "mm/s"
-    in_s, in_mm, in_ours = (
-        conversion(column.unit.name if column.unit else unit, unit)
-        for column, unit in ((time, "s"), (place, "mm"), (speed, ours))
-    )
+    rotates = speed.dimension == "rotation"
+    in_s = conversion(units["time"].name if "time" in units else "s", "s")
+    in_mm = conversion(units["displacement"].name if "displacement" in units else "mm", "mm")
+    per_s = conversion(speed.unit.name, "rpm" if rotates else "mm/s")
+    mm = LEAST_TURN_MM / 60.0 if rotates else 1.0
     shares = []
     for t, x, v in zip(time.values, place.values, speed.values, strict=True):
-        path_mm = np.abs(in_ours(v) * np.gradient(in_s(t))).sum() * (
-            LEAST_TURN_MM / 60 if ours == "rpm" else 1.0
-        )
-        shares.append(stroke_count(x) * np.ptp(in_mm(x)) / path_mm if path_mm > 0 else np.inf)
-    if np.median(shares) < LEAST_SHARE_OF_PATH:
-        reason = (
-            f"{place.place} goes less than a tenth of the way that {speed.place} says: it may be a height."
-        )
+        distance_mm = mm * np.abs(per_s(v) * np.gradient(in_s(t))).sum()
+        shares.append(stroke_count(x) * np.ptp(in_mm(x)) / max(distance_mm, 1e-300))
+    if np.median(shares) < LEAST_SHARE_OF_DISTANCE:
+        reason = f"{place.place} covers less than a tenth of the distance that {speed.place} gives"
         fix = "If so, delete the line, and set trace.integrate_displacement to a column of speed."
-        notes.doubt("trace.columns.displacement_mm", reason, fix)
+        notes.doubt("trace.columns.displacement_mm", f"{reason}: it may be a height.", fix)
 
 
 def _side_by_side(roles: Roles, notes: Notes) -> None:

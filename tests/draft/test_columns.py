@@ -134,6 +134,21 @@ def test_a_height_beside_a_speed_is_a_doubt(unit, factor, scale, doubted, tmp_pa
     assert doubted == any("it may be a height" in doubt.reason for doubt in made.doubts)
 
 
+@pytest.mark.parametrize(("unit", "ms"), [("V", 1), ("mm/s", 1000)])
+def test_a_speed_in_another_unit_and_a_clock_in_ms_are_no_doubt_of_the_displacement(unit, ms, tmp_path):
+    def columns(one):
+        return [
+            ms * one.time_s,
+            one.displacement_mm,
+            np.gradient(one.displacement_mm, one.time_s),
+            one.force_N,
+        ]
+
+    made = campaign(tmp_path, columns, f"Zeit,Weg [mm],Geschwindigkeit [{unit}],Kraft [N]\n", strokes=2)
+    assert slots(made)["displacement_mm"] == "Weg [mm]"
+    assert not any("it may be a height" in doubt.reason for doubt in made.doubts)
+
+
 def test_a_time_in_no_unit_that_would_last_for_hours_is_in_ms(tmp_path):
     made = campaign(
         tmp_path, lambda one: [one.time_s * 1000, *exports.slots(one)[1:]], "Time,Position,Force\n"
