@@ -68,19 +68,20 @@ def close_loop(
     effects = EFFECTS | load_user_effects(config.loop.effects_folder)
     context = Context(config, effects, say, workers=workers)
     columns, counted = list(bins.columns), with_straight_loads(numbered(bins.reset_index(drop=True)))
-    del bins
-    rows = make_rows(with_set_ups(counted), has_aging=config.aging, speed_factor=config.units.speed_factor)
+    bins = with_set_ups(counted)
+    rows = make_rows(bins, has_aging=config.aging, speed_factor=config.units.speed_factor)
     outliers, fitted = outlier_files(rows)
     left_out = [one.file for one in outliers if not one.instead]
     if left_out:
         say("left out, far off all others: " + ", ".join(left_out))
-        counted = counted[~records(counted).isin(left_out).to_numpy()]
-    # Set-ups are looked for again: one wrong file hides that they scatter.
-    counted = with_both_directions(with_set_ups(counted), fitted)
-    rows = make_rows(counted, has_aging=config.aging, campaign=rows)
+        # Set-ups are looked for again: one wrong file hides that they scatter.
+        bins = with_set_ups(counted[~records(counted).isin(left_out).to_numpy()])
+    grouped = with_both_directions(bins, fitted)
+    if left_out or grouped is not bins:
+        rows = make_rows(grouped, has_aging=config.aging, campaign=rows)
     if SET_UP in rows.table:
         say("files of a specimen with the same repeat, or of both directions, scatter alike: one set-up")
-    del counted  # it takes much memory, and `rows` contains it
+    del bins, counted, grouped  # they take much memory, and `rows` contains them
     start = None
     for part in subsamples(rows, config.loop.seed):
         if not part.whole and start is None:  # a start from all strokes is better than from those searched
