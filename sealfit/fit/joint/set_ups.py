@@ -125,8 +125,9 @@ def _runs_both_ways(bins: pd.DataFrame) -> pd.DataFrame:
         order=("order", "min"),
     )
     runs["specimen"] = runs["specimen"].astype(str)
-    runs["number"] = runs.sort_values("order").groupby([*names, "forward"]).cumcount()
-    return runs.assign(set_up=runs.groupby([*names, "number"]).ngroup().map("set-up {}".format))
+    runs["number"] = runs.sort_values("order").groupby([*names, "forward"], dropna=False).cumcount()
+    number = runs.groupby([*names, "number"], dropna=False).ngroup()
+    return runs.assign(set_up=number.map("set-up {}".format))
 
 
 # ---------------------------------------------------------------- measured loads
