@@ -6,6 +6,7 @@ constant already. `free_effect` builds them from plain values, which is the form
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from inspect import signature
 
@@ -145,29 +146,20 @@ def within_effect(category: str, knots: Sequence[float]) -> Effect:
 
     Amplitudes and errors are those of `smooth_effect`.
     """
-    places = _rising(WITHIN, knots)
-    first = f"{places[0]:.6g}"
-    return _free(
-        partial(_within, category, places),
-        None,
+    spline = smooth_effect(knots)
+    return replace(
+        spline,
         id=WITHIN,
         label=f"smooth in {{x}} where {{z}} is {category}",
-        equation=f"h = natural cubic spline through (x_j, c_j), knots {_listed(places)}, zero at {first}, "
-        f"where {{z}} is {category}; 0 elsewhere",
-        reference=f"{{x}} = {first}",
+        equation=f"{spline.equation}, where {{z}} is {category}; 0 elsewhere",
         reads=(CHANNEL, SECOND),
-        parameters=tuple(
-            amplitude(f"c_{j}", "{y}", 0.0, f"value at {place:.6g} less that at {first}")
-            for j, place in enumerate(places[1:], start=2)
-        ),
+        shape=partial(_within, category, spline.shape),
         source="Form: ours. Wood 2017, Generalized Additive Models, 2nd ed., CRC Press: a smooth by factor.",
     )
 
 
-def _within(category: str, places: tuple[float, ...], amplitudes: np.ndarray, inputs: Mapping) -> np.ndarray:
-    return np.where(
-        np.asarray(inputs[SECOND]).astype(str) == category, _spline(places, amplitudes, inputs), 0.0
-    )
+def _within(category: str, shape: Callable, inputs: Mapping, **values) -> np.ndarray:
+    return np.where(np.asarray(inputs[SECOND]).astype(str) == category, shape(inputs, **values), 0.0)
 
 
 def _rising(id: str, knots: Sequence[float]) -> tuple[float, ...]:
