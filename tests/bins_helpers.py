@@ -140,6 +140,21 @@ def mounted_anew(seed: int, sd: float = 0.01, **options) -> pd.DataFrame:
     return bins.assign(force_N=bins["force_N"] * gains[number], mount=number + 1.0)
 
 
+def with_another_curve() -> pd.DataFrame:
+    """Return bins of two lots, A (aged at 60 degC) and B, of which A has a Stribeck exponent of 0.8."""
+
+    def softer(table, force):
+        ratio = np.abs(table["speed_mm_s"].to_numpy()) / TRUE["v_s"]
+        change = 0.25 * LOAD_N * (np.exp(-(ratio**0.8)) - np.exp(-(ratio**2)))
+        return force + np.where(table["temperature_C"] == 60.0, change, 0.0)
+
+    bins = make_bins(
+        bins=4, days=(1.0, 2.0, 4.0, 8.0, 16.0), speeds=np.geomspace(0.6, 60, 9), gain=0.002, effect=softer
+    )
+    bins["lot"] = np.where(bins["temperature_C"] == 60.0, "A", "B")
+    return bins
+
+
 def make_traces(bins: pd.DataFrame) -> pd.DataFrame:
     """Return the bins themselves as steady samples: what the ripple search sees."""
     return bins[["file", "stroke", "time_s", "displacement_mm", "force_N"]].assign(

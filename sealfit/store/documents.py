@@ -114,7 +114,9 @@ CLOSURE = record(
 
 def _is_fixed(name: str, value: object) -> bool:
     """Return whether what is fixed in an effect is of the kind that its name says."""
-    kind = str if name in ("categories", "category") else float | int
+    if name == "category":
+        return isinstance(value, str)
+    kind = str if name == "categories" else float | int
     if name in ("categories", "means") or name.endswith("knots"):
         return isinstance(value, list) and all(isinstance(own, kind) for own in value)
     if name.endswith("_ref"):

@@ -1,9 +1,12 @@
+import json
+
 import numpy as np
 import pytest
-from bins_helpers import TWO_FOLDS, make_bins, make_traces
+from bins_helpers import TWO_FOLDS, make_bins, make_traces, with_another_curve
 
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
+from sealfit.store.documents import read_document
 
 
 @pytest.fixture(scope="module")
@@ -108,3 +111,18 @@ def test_a_point_in_the_gap_in_which_a_change_happened_may_lie_before_or_after_i
     assert gap[low] == pytest.approx(first[low], rel=0.01)
     assert gap[high] == pytest.approx(last[high], rel=0.01)
     assert gap[high] / gap[low] > 1.15 > last[high] / last[low]
+
+
+def test_a_curve_of_one_lot_is_read_back_and_changes_only_its_forces():
+    bins = with_another_curve()
+    closed = close_loop(bins, make_traces(bins), TWO_FOLDS)
+    assert [effect["id"] for effect in closed.document["effects"]] == ["within"]
+    read_document("closure", json.dumps(closed.document))
+    model = read_document("model", json.dumps({**closed.model, "first_started_at": None}))
+    points = bins[bins["repeat"] == 1].groupby(["condition", "speed_set_mm_s"]).head(1)
+    own = (points["lot"] == "A").to_numpy()
+    answer = predict(model, points)
+    error = (answer["force_after_N"] - points["force_N"].to_numpy()).to_numpy()
+    assert np.std(error[own]) < 1.2 * np.std(error[~own])
+    swapped = predict(model, points.assign(lot=np.where(own, "B", "A")))["force_after_N"]
+    assert (np.abs(swapped - answer["force_after_N"]) > 0).any()

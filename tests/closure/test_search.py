@@ -1,7 +1,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from bins_helpers import LOAD_N, TRUE, make_bins
+from bins_helpers import LOAD_N, TRUE, make_bins, with_another_curve
 
 from sealfit.closure.channels import (
     channels_of,
@@ -447,15 +447,7 @@ def test_a_stribeck_exponent_is_found_above_and_below_2(exponent, drop):
 def test_another_curve_of_one_of_two_rubbers_is_found_in_it():
     """The curves of two rubbers are fitted apart: a common shape of the speed would change both."""
 
-    def softer(table, force):
-        ratio = np.abs(table["speed_mm_s"].to_numpy()) / TRUE["v_s"]
-        change = 0.25 * LOAD_N * (np.exp(-(ratio**0.8)) - np.exp(-(ratio**2)))
-        return force + np.where(table["temperature_C"] == 60.0, change, 0.0)
-
-    bins = make_bins(
-        bins=4, days=(1.0, 2.0, 4.0, 8.0, 16.0), speeds=np.geomspace(0.6, 60, 9), gain=0.002, effect=softer
-    )
-    bins["lot"] = np.where(bins["temperature_C"] == 60.0, "A", "B")
+    bins = with_another_curve()
     fitted = fit_declared(make_rows(bins, has_aging=True))
     channels = {c.name: c for c in find_channels(fitted.rows)}
     found = search(ScoreTests(fitted), list(channels.values()), np.random.default_rng(0))
