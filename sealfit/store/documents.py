@@ -173,7 +173,7 @@ INFORMATION = list[tuple[list[Annotated[int, Field(strict=True, ge=0)]], Matrix]
 GROUPED = record(covariance=Matrix, information=INFORMATION)  # from whole groups: numbers of its parameters
 COMPONENT = record(
     level=Literal["stroke", "file", "run", "specimen"],
-    kind=Literal["offset", "gain", "v_s", "sigma_2"],
+    kind=Literal["offset", "gain", "mu_s", "v_s", "sigma_2"],
     variance=Annotated[Number, Field(ge=0)],
 )
 COMPONENT.__pydantic_config__ = ConfigDict(extra="forbid")

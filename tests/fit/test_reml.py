@@ -1,12 +1,13 @@
 import numpy as np
 import numpy.testing as npt
 import pytest
-from bins_helpers import make_bins
+from bins_helpers import LOAD_N, TRUE, make_bins
 
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import Groups, make_rows
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import (
+    SPEEDS_OF_A_SPECIMEN,
     GroupMeans,
     RestrictedLikelihood,
     estimate_components,
@@ -37,9 +38,9 @@ def test_the_likelihood_is_that_of_the_dense_covariance_and_its_gradient_is_exac
     force, tangent = rng.normal(40, 10, 72) * rng.choice([-1, 1], 72), orthonormal(rng.normal(size=(72, 8)))
     residual, variance = rng.normal(size=72), rng.uniform(0.1, 0.3, 72)
     kinds = [(level, kind) for level in codes for kind in ("offset", "gain")]
-    kinds += [("specimen", "v_s"), ("specimen", "sigma_2")]
-    sizes = rng.uniform(0.5, 2.0, 10) * np.r_[np.tile([0.1, 1e-4], 4), 0.1, 0.1]
-    loads = np.column_stack([loads_of(force), rng.normal(size=(72, 2))])
+    kinds += [("specimen", kind) for kind in SPEEDS_OF_A_SPECIMEN]
+    sizes = rng.uniform(0.5, 2.0, len(kinds)) * np.r_[np.tile([0.1, 1e-4], 4), 0.1, 0.1, 0.1]
+    loads = np.column_stack([loads_of(force), rng.normal(size=(72, 3))])
     likelihood = RestrictedLikelihood(
         GroupMeans(residual, variance, loads, Groups.of(codes)), Tangent.dense(tangent), kinds
     )
@@ -218,3 +219,17 @@ def test_components_that_differ_by_orders_of_magnitude_are_all_found():
     assert 0.008 < size["file", "gain"] < 0.012
     assert 0.014 < size["run", "gain"] < 0.026
     assert size["stroke", "gain"] < 1e-4
+
+
+def test_specimens_that_differ_in_static_friction_alone_have_that_component():
+    rng, own = np.random.default_rng(3), {}
+
+    def another_mu_s(table, force):
+        change = own.setdefault(table["specimen_id"].iloc[0], rng.normal(0.0, 0.03))
+        return force + LOAD_N * change * np.exp(-((table["speed_mm_s"].to_numpy() / TRUE["v_s"]) ** 2))
+
+    bins = make_bins(5, bins=4, repeats=2, gain=0.002, noise_N=0.02, setup=0.002, effect=another_mu_s)
+    found = fit_declared(make_rows(bins, has_aging=True)).scatter.components
+    size = {part.kind: np.sqrt(part.variance) for part in found if part.level == "specimen"}
+    assert 0.4 * np.std(list(own.values())) < size["mu_s"] < 1.5 * np.std(list(own.values()))
+    assert size["gain"] < 0.5 * size["mu_s"]

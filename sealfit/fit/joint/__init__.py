@@ -170,6 +170,8 @@ def fit(
     found = _alternately(model, rows, None, centre, turns)
     if scatter := with_curves(rows, found.residual, found.loads, found.free_jacobian, found.scatter):
         other = _alternately(found.model, rows, scatter, centre, 1)
+        if other.deviance > found.deviance:  # the loads of v_s depend on v_s
+            other = _alternately(other.model, rows, other.scatter, centre, 1)
         found = min(found, other, key=lambda f: f.deviance)
     if _misses_levels(found):
         within = tuple(part for part in found.scatter.components if part.level != "specimen")

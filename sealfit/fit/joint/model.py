@@ -295,9 +295,9 @@ def loads_of(model: Model, rows: Rows, friction: np.ndarray | None = None) -> np
     """
     state = _ForceParts(model, rows)
     slopes, friction = state.slopes(), state.friction if friction is None else friction
-    has = {name: (model.declared.index[name] >= 0)[rows.condition] for name in ("v_s", "sigma_2")}
-    v_s, sigma_2 = slopes["v_s"] * state.now["v_s"] * has["v_s"], slopes["sigma_2"] * has["sigma_2"]
-    return np.column_stack([np.ones_like(friction), friction, v_s, sigma_2])
+    curved, viscous = ((model.declared.index[name] >= 0)[rows.condition] for name in ("v_s", "sigma_2"))
+    mu_s, v_s = slopes["mu_s"] * curved, slopes["v_s"] * state.now["v_s"] * curved
+    return np.column_stack([np.ones_like(friction), friction, mu_s, v_s, slopes["sigma_2"] * viscous])
 
 
 def term_slope(model: Model, rows: Rows, acts_on: str, operation: str) -> np.ndarray:

@@ -5,13 +5,13 @@ A residual is noise of its row plus random offsets and gains of its stroke, file
 .. math:: r_i = \epsilon_i + \sum_l (o_{l,g(i)} + k_{l,g(i)} F_i), \quad
           \mathrm{Var}\, o_l = \sigma_{o,l}^2, \ \mathrm{Var}\, k_l = \sigma_{k,l}^2
 
-where F is the model's friction, its force without added forces. Specimens may also differ in v_s and sigma_2,
-with the derivatives of the force in place of F. Neighbouring rows are correlated, which multiplies the noise
-variance of all patterns in a stroke by the design effect. Files differ in shape along their strokes, which
-multiplies that of all patterns other than the mean by a further factor, `shape`.
+where F is the model's friction, its force without added forces. Specimens may also differ in mu_s, v_s and
+sigma_2, with the derivatives of the force in place of F. Neighbouring rows are correlated, which multiplies
+the noise variance of all patterns in a stroke by the design effect. Files differ in shape along their
+strokes, which multiplies that of all patterns other than the mean by a further factor, `shape`.
 
 Within a stroke the components change only two numbers: its mean, and its projection on the variation of F
-about its mean (zero if F is constant); what else v_s and sigma_2 change there is left out. For these a root
+about its mean (zero if F is constant); what else these three change there is left out. For these a root
 of the inverse covariance is a product of rank-one updates, as groups are nested; all other patterns are
 divided by their noise. Time is linear in the number of rows.
 """
@@ -30,7 +30,7 @@ from sealfit.fit.joint.tangent import Tangent
 
 # Kinds of random effects, in the order of the columns of `loads`: the change of a row's force per unit of
 # each. An offset adds to the force, a gain multiplies friction, and v_s stands for its logarithm.
-KINDS = ("offset", "gain", "v_s", "sigma_2")
+KINDS = ("offset", "gain", "mu_s", "v_s", "sigma_2")
 GAIN = KINDS.index("gain")
 # Kinds that change all speeds alike.
 LEVELS_OF_FORCE = ("offset", "gain")
