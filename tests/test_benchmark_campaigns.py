@@ -35,6 +35,7 @@ def test_sizes_are_about_200_and_600_files(name, size, low, high):
     assert low <= len(files_of(campaigns.campaign(name, size=size))) <= high
 
 
+@pytest.mark.long
 def test_a_campaign_of_the_loop_is_scored():
     scored = run_campaign(Task("null_white", "-", 1, "small", rivals=False))
     assert scored["verdict"] == "nothing_missing"

@@ -193,6 +193,7 @@ def campaign(tmp_path_factory):
 OPENSSL = shutil.which("openssl")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(OPENSSL is None, reason="no openssl on PATH to make a certificate")
 def test_over_tls_only_who_has_the_certificate_connects(campaign, tmp_path, monkeypatch, capsys):
     key, cert = tmp_path / "key.pem", tmp_path / "cert.pem"

@@ -42,6 +42,7 @@ def test_kidney_friction_does_not_hang_on_the_piston_area(tmp_path, part):
     assert (found["se"] > 0).all()
 
 
+@pytest.mark.long
 def test_emps_plateaus_go_through(tmp_path):
     config = emps_plateaus(measured(), tmp_path / "campaign")
     config.write_text(config.read_text() + FOLDS)

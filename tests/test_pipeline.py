@@ -215,7 +215,7 @@ def test_a_changed_file_is_found_and_everything_after_it_redone(first, campaign,
     assert sealfit("check", copy, code=1).stdout.endswith("2 faults found.\n")
 
 
-@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("moved", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_damaged_part_of_a_table_is_made_again(first, campaign, tmp_path, moved):
     out, copy = tmp_path / "out", tmp_path / "campaign"
     if moved:  # then state.json is written before anything is read

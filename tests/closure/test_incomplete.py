@@ -1,14 +1,12 @@
 """A column that a few files have no value of: searched, and said so."""
 
 import json
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from campaigns import RIG, SPEEDS
-from effect_kinds import COLUMN, GRADES
+from effect_kinds import COLUMN, OTHER
 
 from sealfit.fit.joint.rows import make_rows
 from sealfit.ingest.quality import NO_VALUE, incomplete_columns
@@ -20,7 +18,7 @@ from sealfit.store import Store
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    """72 files of an oil content that moves mu by some 20 %, and of an idle category."""
+    """72 files of an oil content that moves mu by some 20 %, and of an idle dust content."""
     folder = tmp_path_factory.mktemp("incomplete") / "c"
     oil = {"id": "linear", "channels": ("oil_ppm",), "parameters": {"A": 0.01}, "acts_on": "mu"}
     oil |= {"operation": "multiply", "reference": {"x_ref": 50.0}}
@@ -36,7 +34,7 @@ def campaign(tmp_path_factory):
             physics={"growth": {}},
             design=design,
             effects=(oil,),
-            channels=(COLUMN, GRADES),
+            channels=(COLUMN, OTHER),
             noise=RIG,
         ),
         folder,
@@ -44,50 +42,40 @@ def campaign(tmp_path_factory):
     return folder
 
 
-def ingested(campaign, tmp_path, blank):
-    """Ingest the campaign with some cells of runs.csv empty; `blank` tells which files, by column."""
-    made = Path(shutil.copytree(campaign, tmp_path / "c"))
-    runs = pd.read_csv(made / "runs.csv", dtype=str)
-    for name, rows in blank.items():
-        runs.loc[rows(runs), name] = ""
-    runs.to_csv(made / "runs.csv", index=False)
-    return made
-
-
-def closed(campaign, out):
+@pytest.fixture(scope="module")
+def closed(campaign):
+    """The campaign after the loop: four files have no oil content, half have no dust content."""
+    runs = pd.read_csv(campaign / "runs.csv", dtype=str)
+    few = (runs["run_id"] == runs["run_id"][0]) | (runs.index == 40)  # one whole run and one file of another
+    runs.loc[few, "oil_ppm"] = ""
+    runs.loc[runs.index % 2 == 0, "dust_mg"] = ""
+    runs.to_csv(campaign / "runs.csv", index=False)
     (campaign / "rig.toml").write_text("[loop]\nfolds = 2\n")
+    out = campaign.parent / "out"
     made = run(campaign, out, campaign / "rig.toml", steps=STEPS[:-1], workers=1)
-    return made, json.loads((out / "closure.json").read_text())
+    return made, Store.open(out), json.loads((out / "closure.json").read_text())
 
 
-def test_a_column_that_a_few_files_lack_is_searched_and_said(campaign, tmp_path):
-    def few(runs):  # one whole run and one file of another
-        return (runs["run_id"] == runs["run_id"][0]) | (runs.index == 40)
-
-    made, closure = closed(ingested(campaign, tmp_path, {"oil_ppm": few}), tmp_path / "out")
+def test_a_column_that_a_few_files_lack_is_searched_and_said(closed):
+    made, store, closure = closed
     assert [effect["channels"] for effect in closure["effects"]] == [["oil_ppm"]]
     slope = next(p for p in closure["effects"][0]["parameters"] if p["name"] == "A")
     assert slope["ci95"][0] < 0.01 < slope["ci95"][1]
-    files = Store.open(tmp_path / "out").read("inputs")["file"].size
-    assert closure["incomplete_channels"] == [
-        {"channel": "oil_ppm", "files_without": 4, "files": files, "searched": True}
+    files = store.read("inputs")["file"].size
+    assert {"channel": "oil_ppm", "files_without": 4, "files": files, "searched": True} in closure[
+        "incomplete_channels"
     ]
     said = f"4 of {files} files have no value: the search for effects takes them at the mean of their run"
-    quality = Store.open(tmp_path / "out").read("quality")
-    assert quality.loc[quality["check"] == "incomplete_column", "reason"].str.startswith(said).tolist() == [
-        True
-    ]
+    quality = store.read("quality")
+    found = quality.loc[quality["check"] == "incomplete_column", "reason"]
+    assert found.str.startswith(said).sum() == 1
     assert any(line.startswith(f"column      oil_ppm: {said}") for line in lines(made))
 
 
-def test_a_column_that_many_files_lack_is_left_out_and_said(campaign, tmp_path):
-    def half(runs):
-        return runs.index % 2 == 0
-
-    made, closure = closed(ingested(campaign, tmp_path, {"oil_ppm": half}), tmp_path / "out")
-    (told,) = closure["incomplete_channels"]
-    assert (told["channel"], told["searched"]) == ("oil_ppm", False)
-    assert not any("oil_ppm" in effect["channels"] for effect in closure["effects"])
+def test_a_column_that_many_files_lack_is_left_out_and_said(closed):
+    made, _, closure = closed
+    (told,) = (one for one in closure["incomplete_channels"] if one["channel"] == "dust_mg")
+    assert not told["searched"]
     assert any("the search for effects leaves the column out" in line for line in lines(made))
 
 

@@ -41,7 +41,7 @@ def close(bins, config=TWO_FOLDS):
 
 @pytest.fixture(scope="module")
 def null():
-    bins = make_bins(3, bins=8, **SCATTER)
+    bins = make_bins(3, bins=4, **SCATTER)
     return bins, close(bins)
 
 
@@ -76,9 +76,9 @@ def test_an_outlying_file_is_left_out_and_changes_nothing(null):
 
 def test_an_effect_too_small_to_matter_is_refused_and_leaves_nothing_missing():
     def climb(table, force):
-        return force + 0.001 * table["bin"]
+        return force + 0.002 * table["bin"]
 
-    bins = make_bins(3, temperatures=(60.0,), bins=8, noise_N=0.003, gain=1e-6, effect=climb)
+    bins = make_bins(3, temperatures=(60.0,), bins=4, noise_N=0.003, gain=1e-6, effect=climb)
     document = close(bins).document
     assert document["refused"][0]["id"] == "linear"
     assert document["refused"][0]["reason"] == TOO_SMALL
@@ -307,6 +307,7 @@ def test_friction_by_a_power_of_the_speed_alone_is_told_from_that_of_the_load():
     assert values["n"] == pytest.approx(2.0, abs=0.3)
 
 
+@pytest.mark.long
 def test_an_effect_between_set_ups_is_found_beside_a_wrong_file_and_its_level_is_theirs():
     bins = mounted_anew(3)
     oil = 2.0 * (bins["mount"].to_numpy() % 4)

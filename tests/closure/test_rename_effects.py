@@ -145,7 +145,9 @@ def test_an_asymmetry_of_mu_told_as_two_of_its_ends_is_one_effect():
     def asymmetric(table, force):
         return force * (1 + 0.02 * table["direction"].to_numpy())
 
-    bins = make_bins(3, directions=(1, -1), repeats=2, bins=4, noise_N=0.1, effect=asymmetric)
+    bins = make_bins(
+        3, temperatures=(60.0,), directions=(1, -1), repeats=2, bins=4, noise_N=0.1, effect=asymmetric
+    )
     ends = [
         (Term(EFFECTS["asymmetry"], ("direction",), q, "multiply"), {"A": 0.04}) for q in ("mu_s", "mu_c")
     ]
@@ -183,7 +185,9 @@ def test_a_product_told_as_a_sum_of_two_is_one_effect():
     def product(table, force):
         return force * (1 + 0.002 * table["oil_ppm"].to_numpy() * table["humidity_pct"].to_numpy())
 
-    bins = make_bins(3, repeats=2, bins=3, noise_N=0.1, effect=product, run_channels=channels)
+    bins = make_bins(
+        3, temperatures=(60.0,), repeats=2, bins=3, noise_N=0.1, effect=product, run_channels=channels
+    )
     two = [(Term(EFFECTS["linear"], (n,), "mu", "multiply", {"x_ref": 5.0}), {"A": 0.01}) for n in channels]
     (term,) = in_place_of(bins, *two)
     assert set(term.channels) == set(channels)
@@ -212,7 +216,7 @@ def sum_of_waves(table, force):
     ("effect", "found"), [(waves_of_the_sum, ["surface"]), (sum_of_waves, ["smooth", "smooth"])]
 )
 def test_a_surface_takes_the_place_of_two_curves_unless_they_add_up(effect, found):
-    bins = make_bins(4, repeats=3, bins=3, noise_N=0.1, effect=effect, run_channels=TWO)
+    bins = make_bins(4, repeats=2, bins=3, noise_N=0.1, effect=effect, run_channels=TWO)
     terms = in_place_of(bins, *map(curve, TWO))
     assert [term.effect.id for term in terms] == found
     assert {name for term in terms for name in term.channels} == set(TWO)

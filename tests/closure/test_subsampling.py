@@ -103,7 +103,9 @@ def test_few_runs_of_very_many_strokes_are_all_searched(few, monkeypatch):
     assert part.whole
 
 
-@pytest.mark.parametrize(("acts_on", "other", "seed"), [("mu", "force", 2), ("force", "mu", 6)])
+@pytest.mark.parametrize(
+    ("acts_on", "other", "seed"), [pytest.param("mu", "force", 2, marks=pytest.mark.long), ("force", "mu", 6)]
+)
 def test_an_effect_acts_on_what_all_strokes_say(acts_on, other, seed, monkeypatch):
     """Of the whole force sigma_2 |v| is a part, which a factor on mu leaves as it is."""
     monkeypatch.setattr("sealfit.closure.subsampling.STROKES", 60)

@@ -134,7 +134,9 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize("make", [aging_campaign, after_campaign, torque_campaign])
+@pytest.mark.parametrize(
+    "make", [pytest.param(aging_campaign, marks=pytest.mark.long), after_campaign, torque_campaign]
+)
 def test_nothing_overflows_and_every_image_is_large_enough_to_be_read(make, tmp_path):
     found = measured(html_of(make), [1400, 800, 400], tmp_path)
     for width, (client, scroll, right, shown, images, cut) in found.items():

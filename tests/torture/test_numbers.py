@@ -19,7 +19,7 @@ def as_it_is():
     return results(campaign("short"), Change())
 
 
-@pytest.mark.parametrize("change", ["force_1e+06", "slots_mN_m_ms"])
+@pytest.mark.parametrize("change", [pytest.param("force_1e+06", marks=pytest.mark.long), "slots_mN_m_ms"])
 def test_size_and_unit_change_no_digits(change, as_it_is):
     assert as_it_is.closure["verdict"] == "closed"
     found = compared(as_it_is, results(campaign("short"), CHANGES[change]))
