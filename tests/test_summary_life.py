@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sealfit.fit.aging.joint_law import Aged, fit_laws, rivals_of
-from sealfit.fit.aging.lifetime import Goal, answer, finite_ends, over_laws
+from sealfit.fit.aging.lifetime import Goal, answer, excluded, finite_ends, over_laws
 from sealfit.report.summary_lines import lifetime_lines
 
 DAYS = np.array([0.0, *[1.0, 2.0, 4.0, 8.0, 12.0, 16.0] * 3])
@@ -65,3 +65,10 @@ def test_the_temperature_for_years_has_an_interval_and_is_marked_beyond_the_test
 def test_a_remark_on_the_values_stands_above_the_life(laws):
     text = said(laws, Goal(0.75), notes=["the mean coefficient over these speeds."], temperature_C=50.0)
     assert "\nnote        mu_s is the mean coefficient over these speeds.\nlife " in text
+
+
+def test_a_law_with_as_many_parameters_as_days_excludes_the_scatter_of_specimens(laws):
+    few = fit_laws(Aged(np.array([0.0, 2.0, 8.0]), np.array([0.93, 0.85, 0.8])))
+    text = said(few, Goal(0.82), notes=excluded(few[0]))
+    assert "mu_s is known without the scatter between specimens" in text
+    assert excluded(laws[0]) == []

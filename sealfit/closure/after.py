@@ -9,7 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from sealfit.closure.errors_and_intervals import degrees_of_freedom, t_quantile
+from sealfit.closure.errors_and_intervals import (
+    covariance_with_specimens,
+    degrees_of_freedom,
+    t_quantile,
+)
 from sealfit.config import Config
 from sealfit.fit.aging import CURVE_POINTS, LawRows, aging_curves, fit_series, law_fit
 from sealfit.fit.aging.all_series import joint_laws
@@ -192,7 +196,7 @@ class _LawAfter:
         self.curve_of = SeriesCurve(series, quantity, 0, np.unique(days[conditions]), unaged, unit)
         number = [int(declared.index[name][conditions[0]]) for name in (f"mu_0{end}", f"a_{end}", f"b_{end}")]
         self.place = number if min(number) >= 0 else None
-        self.df = law_df(after)
+        self.df, self.covariance = law_df(after), covariance_with_specimens(after)
 
     def rows(self, steady_fit: pd.DataFrame) -> LawRows:
         """Return the rows of tables `aging_fit` and `aging_covariance`."""
@@ -201,7 +205,7 @@ class _LawAfter:
         after, at, config = self.after, self.place, self.config
         sensor = after.whitening((np.sign(after.rows.speed) * config.sensor.u)[:, None])[:, 0]
         shift = after.covariance[at] @ after.white_jacobian.against(sensor)
-        found = Estimate(after.model.theta[at], after.covariance[np.ix_(at, at)], shift)
+        found = Estimate(after.model.theta[at], self.covariance[np.ix_(at, at)], shift)
         changed = {"force", "mu", f"mu_{self.end}", "mu_0", "a", "b"}
         kept = [t for t in after.model.terms if is_kept(t, config) and t.acts_on in changed]
         effects = [f"The effect {t.effect.id} of {' and '.join(t.channels)} acts on top of it." for t in kept]
@@ -235,9 +239,9 @@ class _LawAfter:
         gap = (law - measured)[np.isfinite(measured)]
         share = (law / measured - 1)[np.isfinite(measured)]
         variance = self.after.scatter.level_variance("specimen", self.after.loads)
-        specimen = variance.mean() / np.mean(self.after.friction**2)
+        specimen = 100 * np.sqrt(variance.mean() / np.mean(self.after.friction**2))
         for name, value, unit in (
-            ("specimen_sd_pct", 100 * np.sqrt(specimen), "%"),
+            ("specimen_sd_pct", specimen if self.after.scatter.estimates("specimen") else None, "%"),
             ("error_df", self.df, ""),
             ("max_error_pct", 100 * np.abs(share).max() if share.size else None, "%"),
             ("rmse", np.sqrt(np.mean(gap**2)) if gap.size else None, curve.unit),
@@ -281,7 +285,7 @@ class _LawAfter:
         slope[:, np.concatenate([np.arange(theta.size), *places])] = tangent.toarray()
         slope[:, list(index.values())] = 0.0
         scale = load if rows.has_load else 1.0
-        return force / scale, np.sqrt(np.einsum("ni,ij,nj->n", slope, after.covariance, slope)) / scale
+        return force / scale, np.sqrt(np.einsum("ni,ij,nj->n", slope, self.covariance, slope)) / scale
 
 
 # ---------------------------------------------------------------- after fits

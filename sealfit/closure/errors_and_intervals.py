@@ -32,6 +32,9 @@ RANK = 1e-9  # Relative singular value below which a direction of a tangent is z
 # 4,802 points that one or two groups determine lay inside without it, with intervals 2.2 times those by the
 # variance components in the median and up to 15 times; 96.0 % with it, and 1.3 times.
 LEAST_SANDWICH_DF = 2.0
+# Largest ratio of a sandwich's half width to that by the variance components. In 55 of these worlds 93.2 % of
+# 8,620 points lay inside without a limit, 93.0 % with it; the widest intervals were 6 times as wide, now 3.
+MOST_SANDWICH = 3.0
 
 # Value and both ends of its 95 % interval.
 Interval = tuple[float, float, float]
@@ -248,23 +251,32 @@ class Sandwich(NamedTuple):
 
 
 def degrees_of_freedom(fitted: Fitted) -> float:
-    """Return the degrees of freedom of the coarsest level that scatters.
+    """Return the degrees of freedom of a mean force, by Satterthwaite's approximation over the levels.
 
-    This is the number of its units less what the model takes from their mean forces; for specimens the levels
-    and aging laws are counted. It is 0 if the model takes those of nearly all runs: their scatter is not
+    A level that scatters contributes its variance over the number of its units. It has as many degrees of
+    freedom as units, less what the model takes from their mean forces; for specimens the levels and aging
+    laws are counted. The result is 0 if the model takes those of nearly all runs: their scatter is not
     estimable then.
     """
-    starts = fitted.rows.groups.starts
+    rows, starts = fitted.rows, fitted.rows.groups.starts
     if starts["run"].size - _taken(fitted, "run") < LEAST_SPARE_RUNS:
         return 0.0
     active = [c.level for c in fitted.scatter.components if c.variance > 0 and c.kind in LEVELS_OF_FORCE]
-    level = active[-1] if active and active[-1] != "stroke" else "file"
+    levels = [level for level in dict.fromkeys(active) if level != "stroke"] or ["file"]
+    variance = [rows.weight @ fitted.scatter.level_variance(level, fitted.loads) for level in levels]
+    share = np.array(variance) / [starts[level].size for level in levels]
+    share = np.where(share.any(), share / max(share.sum(), 1e-300), 1.0)
+    df = np.array([_df_of_level(fitted, level) for level in levels])
+    return float(1 / (share**2 / df).sum())
+
+
+def _df_of_level(fitted: Fitted, level: str) -> float:
     if level == "specimen":
         parameters = fitted.model.declared.parameters
         taken = len({(p.quantity, p.owner) for p in parameters if p.quantity in ("mu_0c", "a_c")})
     else:
         taken = round(_taken(fitted, level))
-    return float(max(starts[level].size - taken, 1))
+    return float(max(fitted.rows.groups.starts[level].size - taken, 1))
 
 
 def _taken(fitted: Fitted, level: str) -> float:
@@ -279,6 +291,20 @@ def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
     """Return the sandwich covariance from whole groups of a level (CR2), shape (p, p)."""
     scores = fitted.white_jacobian.sums(fitted.rows.groups, level, fitted.unit_residual(level))
     return fitted.covariance @ scores.gram() @ fitted.covariance
+
+
+def covariance_with_specimens(fitted: Fitted) -> np.ndarray:
+    """Return the covariance by the variance components, (p, p), with those of a sandwich where larger.
+
+    The standard errors are at least those of the sandwich of specimens, up to `MOST_SANDWICH` times: it holds
+    their scatter where no variance component does.
+    """
+    own, units = fitted.covariance, fitted.rows.groups.starts["specimen"].size
+    if units < 2:
+        return own
+    robust = np.diag(robust_covariance(fitted, "specimen"))
+    factor = np.sqrt(np.clip(robust / np.maximum(np.diag(own), 1e-300), 1.0, MOST_SANDWICH**2))
+    return own * np.outer(factor, factor)
 
 
 def sandwiches(fitted: Fitted) -> list[Sandwich]:
@@ -372,9 +398,11 @@ def mean_half_width(
 
     One uses the covariance by the variance components, shape (p, p), with `df` degrees of freedom. The others
     are sandwiches, each with Satterthwaite's degrees of freedom at this point, but `LEAST_SANDWICH_DF` at
-    least, except where one group alone determines the force. The tangent at the points has shape (n, p).
+    least, except where one group alone determines the force. They make it at most `MOST_SANDWICH` times as
+    wide: beside a model that nearly interpolates its groups they are much too large. The tangent at the
+    points has shape (n, p).
     """
-    half = t_quantile(df) * mean_se(tangent, covariance)
+    half = own_half = t_quantile(df) * mean_se(tangent, covariance)
     for covariance_of_groups, information in others:
         reach = np.full(half.shape, t_quantile(df))
         if len(information):
@@ -384,4 +412,4 @@ def mean_half_width(
             reach = t_quantile(np.maximum(satterthwaite_df(share), LEAST_SANDWICH_DF))
             reach[share.max(axis=0) > LARGEST_LEVERAGE] = 0.0
         half = np.maximum(half, reach * mean_se(tangent, covariance_of_groups))
-    return half
+    return np.minimum(half, MOST_SANDWICH * own_half)

@@ -119,8 +119,9 @@ def parameter_tables(
         identified = before[before["identified"].astype(bool)]
         earlier = identified.set_index([key, "quantity", "parameter"])["value"].to_dict()
     of_statistics = fit["quantity"] == "statistics"
-    told = of_statistics & fit["parameter"].str.split(":").str[-1].isin(STATISTICS)
-    told &= fit["value"].notna() | (fit["parameter"] != "specimen_sd_pct")
+    statistic = fit["parameter"].str.split(":").str[-1]
+    told = of_statistics & statistic.isin(STATISTICS)
+    told &= fit["value"].notna() | (statistic != "specimen_sd_pct")
     tables, joint = [], ", from the joint fit" if name == "aging_fit" and before is not None else ""
     for own, title, statistics in (
         (fit[~of_statistics], TITLES[name] + joint, False),

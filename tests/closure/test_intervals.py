@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bins_helpers import TWO_FOLDS, make_bins, make_traces
@@ -5,6 +7,7 @@ from bins_helpers import TWO_FOLDS, make_bins, make_traces
 from sealfit.closure.criteria import FEW_UNITS
 from sealfit.closure.errors_and_intervals import (
     Sandwich,
+    covariance_with_specimens,
     degrees_of_freedom,
     effect_intervals,
     mean_half_width,
@@ -15,10 +18,11 @@ from sealfit.closure.errors_and_intervals import (
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
 from sealfit.effects import EFFECTS
-from sealfit.fit.joint import fit, fit_declared
+from sealfit.fit.joint import fit, fit_declared, fitted_at
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import make_rows
 from sealfit.fit.joint.tangent import Tangent
+from sealfit.fit.joint.whitening import Component
 
 
 def width(model: dict, points) -> np.ndarray:
@@ -39,9 +43,15 @@ def test_the_interval_of_the_mean_is_the_widest_of_several():
 def test_a_few_groups_have_degrees_of_freedom_of_their_own():
     tangent = Tangent.dense(np.array([[1.0], [2.0]]))
     groups = [(np.array([0]), np.array([[1.0]]))] * 4  # four groups that count the same: 3 degrees of freedom
-    few = Sandwich(np.array([[4.0]]), groups)
-    half = mean_half_width(tangent, np.array([[0.25]]), 1e6, [few])
-    np.testing.assert_allclose(half, 2 * t_quantile(3) * np.array([1.0, 2.0]))
+    few = Sandwich(np.array([[1.0]]), groups)
+    half = mean_half_width(tangent, np.array([[0.81]]), 1e6, [few])
+    np.testing.assert_allclose(half, t_quantile(3) * np.array([1.0, 2.0]))
+
+
+def test_a_sandwich_widens_an_interval_by_a_factor_of_three_at_most():
+    tangent, groups = Tangent.dense(np.array([[1.0]])), [(np.array([0]), np.array([[1.0]]))] * 4
+    half = mean_half_width(tangent, np.array([[0.01]]), 1e6, [Sandwich(np.array([[4.0]]), groups)])
+    np.testing.assert_allclose(half, 3 * t_quantile(1e6) * 0.1)
 
 
 def test_a_point_that_two_groups_determine_has_no_interval_of_one_degree_of_freedom():
@@ -70,8 +80,8 @@ def test_a_point_without_information_from_groups_has_no_interval_from_them():
     groups = [(np.array([0]), np.array([[1.0]]))] * 4
     tangent = Tangent.dense(np.array([[0.0], [1.0]]))
     with np.errstate(all="raise", under="ignore"):
-        half = mean_half_width(tangent, np.array([[0.25]]), 1e6, [Sandwich(np.array([[4.0]]), groups)])
-    np.testing.assert_allclose(half, [0.0, 2 * t_quantile(3)])
+        half = mean_half_width(tangent, np.array([[0.81]]), 1e6, [Sandwich(np.array([[1.0]]), groups)])
+    np.testing.assert_allclose(half, [0.0, t_quantile(3)])
 
 
 def test_files_runs_and_specimens_are_asked_down_to_the_first_of_which_there_are_many():
@@ -81,6 +91,27 @@ def test_files_runs_and_specimens_are_asked_down_to_the_first_of_which_there_are
     assert counts[1] >= FEW_UNITS
     found = sandwiches(fit_declared(rows))
     assert [len(own.information) for own in found] == [9, 0]
+
+
+@pytest.mark.parametrize(("run_sd", "least", "most"), [(0.0, 25.0, 31.0), (0.05, 4.0, 4.5)])
+def test_a_level_that_scatters_little_does_not_decide_the_degrees_of_freedom(run_sd, least, most):
+    """Eight runs of four files: with the scatter of runs alone there are four degrees of freedom."""
+    bins = make_bins(4, days=(), temperatures=(), repeats=4, bins=4, gain=0.01)
+    fitted = fit_declared(make_rows(bins, has_aging=False))
+    parts = [Component("file", "gain", 1e-4), Component("run", "gain", max(run_sd, 1e-3) ** 2)]
+    known = fitted_at(fitted.model, fitted.rows, replace(fitted.scatter, components=tuple(parts)))
+    assert least <= degrees_of_freedom(known) <= most
+
+
+def test_the_scatter_of_specimens_is_in_the_covariance_of_laws_though_no_component_has_it():
+    fitted = fit_declared(make_rows(make_bins(2, bins=4, repeats=2, specimen=0.03), has_aging=True))
+    within = tuple(part for part in fitted.scatter.components if part.level != "specimen")
+    alone = fitted_at(fitted.model, fitted.rows, replace(fitted.scatter, components=within))
+    number = [parameter.quantity for parameter in fitted.model.declared.parameters].index("a_s")
+    known, missing = (np.sqrt(own.covariance[number, number]) for own in (fitted, alone))
+    found = np.sqrt(covariance_with_specimens(alone)[number, number])
+    assert missing < 0.4 * known
+    assert 0.5 * known < found <= 3.001 * missing
 
 
 def test_an_effect_within_strokes_takes_no_degree_of_freedom_of_the_runs():

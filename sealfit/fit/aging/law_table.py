@@ -351,11 +351,14 @@ def statistics_rows(curve: SeriesCurve, joint: LawFit, quantity: OneQuantity) ->
             "distinguish the two."
         )
     name, known = curve.quantity, "replicates" if values.size is not None else "steady fits"
+    spread, whose = 100 * tau, f"scatter beyond that of the {known}, all series together"
+    if not quantity.level_df > 0:
+        spread, whose = None, NO_SCATTER
     for statistic, value, its_unit, why in (
         ("chi2", chi2, "", f"against the covariance of the {known} alone"),
         ("df", own_df, "", "this series' share, mu_0 being shared"),
         ("lack_of_fit_p", p, "", reason),
-        ("specimen_sd_pct", 100 * tau, "%", f"scatter beyond that of the {known}, all series together"),
+        ("specimen_sd_pct", spread, "%", whose),
         ("error_df", quantity.level_df, "", ERROR_DF),
         ("max_error_pct", 100 * np.abs(error).max(), "%", "largest error of the law over the days tested"),
         ("rmse", np.sqrt(np.mean((joint.model - values.value)[shown] ** 2)), curve.unit, ""),

@@ -266,6 +266,15 @@ def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
     return Goal(threshold) if loss_pct is None else Goal(loss=loss_pct / 100)
 
 
+def excluded(law: JointLaw) -> list[str]:
+    """Return a note on what the intervals of a law exclude; none if they include the scatter of specimens."""
+    return (
+        []
+        if law.df > 0
+        else ["known without the scatter between specimens: the law has as many parameters as days"]
+    )
+
+
 def answer(
     law: JointLaw,
     goal: Goal,
