@@ -206,8 +206,8 @@ def orthonormal(columns: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
 LEAST_NOISE = 1e-6
 # Fall of half the restricted deviance from which specimens differ in mu_s, v_s or sigma_2. Without v_s and
 # sigma_2 the number of the run was significant in 34 of 40 campaigns in which specimens scatter by 3 % in dry
-# friction alone; with them in none. Of 120 fits to specimens that differ in their whole friction alone 3 % have
-# a fall above 2, none above 3.
+# friction alone; with them in none. Of 120 fits to specimens that differ in their whole friction alone 3 %
+# have a fall above 2, none above 3.
 CURVES_DIFFER = 3.0
 # Number of speeds at which a specimen shows that.
 SPEEDS_OF_A_SPECIMEN = {"mu_s": 3, "v_s": 3, "sigma_2": 2}
