@@ -97,6 +97,26 @@ def test_repeats_of_one_specimen_may_be_set_ups_only_where_they_were_recorded_on
     assert SET_UP not in with_set_ups(in_turn)
 
 
+@pytest.mark.parametrize(("by_repeat", "mounts"), [((0.0, 0.02, -0.01), True), ((0.0, 0.02, 0.0201), False)])
+def test_repeats_of_one_specimen_in_an_unknown_order_may_be_set_ups_unless_friction_rises_or_falls(
+    by_repeat, mounts
+):
+    bins = mounted_anew(1, sd=0.0, days=(8.0,), gain=0.001)
+    bins = bins[bins["aging_days"] == 8.0].drop(columns=["run_order", "elapsed_h"])
+    bins["force_N"] *= 1 + bins["repeat"].map(dict(enumerate(by_repeat, 1)))
+    assert (SET_UP in with_set_ups(bins)) == mounts
+
+
+def test_set_ups_show_their_scatter_though_they_are_fewer_than_the_numbers_of_the_curves():
+    bins = mounted_anew(2, sd=0.03, days=(1.0, 4.0), repeats=2, gain=0.001)
+    rows = make_rows(with_set_ups(bins), has_aging=True)
+    assert rows.groups.starts["run"].size == 6
+    fitted = fit_declared(rows)
+    assert 0.01 < max(np.sqrt(c.variance) for c in fitted.scatter.components if c.level == "run") < 0.06
+    found = search(ScoreTests(fitted), find_channels(rows), np.random.default_rng(0))
+    assert min(c.p_value for c in found if c.channels[0] in ("repeat", "elapsed_h", "run_order")) > 0.005
+
+
 def test_nothing_is_claimed_between_two_set_ups_of_one_specimen():
     rng = np.random.default_rng(0)
     for seed in range(4):

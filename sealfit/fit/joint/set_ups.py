@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+from scipy.optimize import isotonic_regression
 from scipy.sparse import csr_array, hstack
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import lsmr
@@ -35,8 +36,8 @@ def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
     The logarithms of the files' mean forces are fitted by an effect of each run and one of each repeat. If
     set-ups, of a specimen and a repeat, explain more by F, they scatter. A change with the repeat that all
     specimens have in common is none of set-ups, unless each repeat is another specimen, or there is one
-    specimen whose repeats were recorded one after the other: it may have been mounted anew between them. Nor
-    is what a few specimens show: an effect that begins or ends while they are measured.
+    specimen that may have been mounted anew between its repeats. Nor is what a few specimens show: an effect
+    that begins or ends while they are measured.
     """
     record = records(bins)
     strokes = pd.DataFrame({"run": nesting_run(bins, record), "specimen": bins["specimen_id"].astype(str)})
@@ -58,9 +59,9 @@ def _p_value(files: pd.DataFrame) -> tuple[float, pd.Series]:
     """Return the p-value of set-ups, 1 for a negligible scatter, and what they explain in each specimen."""
     known = [files["run"]]
     alike = files.groupby("run")["specimen"].nunique().max() == 1
-    if alike and not (files["specimen"].nunique() == 1 and _one_after_the_other(files)):
-        known.append(files["repeat"])
     force = np.log(np.maximum(files["force"].to_numpy(), 1e-300))
+    if alike and not (files["specimen"].nunique() == 1 and _may_be_mounts(files, force)):
+        known.append(files["repeat"])
     (before, few), (after, many) = _fitted(force, known), _fitted(force, [files["run"], files["set_up"]])
     shown = pd.Series(before**2 - after**2, files.index).groupby(files["specimen"]).sum()
     added = few - many
@@ -72,10 +73,25 @@ def _p_value(files: pd.DataFrame) -> tuple[float, pd.Series]:
     return float(fdtrc(added, many, explained / max(noise, 1e-300))), shown
 
 
-def _one_after_the_other(files: pd.DataFrame) -> bool:
-    """Return whether all files of a repeat were recorded before those of the next."""
-    in_order = files.sort_values("order")["repeat"]
-    return bool(files["order"].nunique() > 1 and (in_order != in_order.shift()).sum() == in_order.nunique())
+def _may_be_mounts(files: pd.DataFrame, force: np.ndarray) -> bool:
+    """Return whether the repeats of one specimen may be mounts.
+
+    All files of a repeat were recorded before those of the next then. If the order is not known, the `force`,
+    shape (n,), neither rises nor falls with the repeat: its means differ from the nearest such curve by F.
+    """
+    if files["order"].nunique() > 1:
+        in_order = files.sort_values("order")["repeat"]
+        return (in_order != in_order.shift()).sum() == in_order.nunique()
+    left, df = _fitted(force, [files["run"], files["repeat"]])
+    about = pd.Series(force, files.index)
+    about = about - about.groupby(files["run"]).transform("mean")
+    means = about.groupby(pd.to_numeric(files["repeat"])).agg(["mean", "size"])
+    apart = min(
+        means["size"] @ (means["mean"] - isotonic_regression(means["mean"], increasing=up).x) ** 2
+        for up in (True, False)
+    )
+    noise, added = max(float(left @ left), 1e-300) / max(df, 1), len(means) - 1
+    return bool(df > 0 and added > 0 and fdtrc(added, df, apart / added / noise) < SET_UP_P)
 
 
 def _fitted(values: np.ndarray, factors: Sequence[pd.Series]) -> tuple[np.ndarray, int]:

@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import OptimizeResult, minimize
 
 from sealfit.fit.joint.declared import declare, tested_speeds
-from sealfit.fit.joint.rows import LEVELS, Groups, Rows, cached
+from sealfit.fit.joint.rows import LEVELS, SET_UP, Groups, Rows, cached
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.whitening import GAIN, KINDS, LEVELS_OF_FORCE, Component, Scatter
 from sealfit.ingest.scatter import two_nonnegative
@@ -281,7 +281,7 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     counts = {level: rows.groups.starts[level].size for level in LEVELS}
     used = ["stroke"] if counts["stroke"] > counts["file"] else []
     # The model goes through every run if it has as many numbers: runs show no scatter then.
-    known = counts["run"] > len(declare(rows).parameters)
+    known = counts["run"] > _parameters_of_runs(rows)
     for level in LEVELS[1:]:
         if not used or (2 < counts[level] < counts[used[-1]] and (known or level != "run")):
             used.append(level)
@@ -294,6 +294,17 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     # Specimens differ in friction, not in the sensor's zero.
     pairs = [(level, kind) for level in used for kind in LEVELS_OF_FORCE]
     return [pair for pair in pairs if pair != ("specimen", "offset")]
+
+
+def _parameters_of_runs(rows: Rows) -> int:
+    """Return the number of declared parameters that the mean forces of runs, or of set-ups, can determine.
+
+    A set-up with several speeds determines the level of friction, but not its dependence on the speed.
+    """
+    declared = declare(rows)
+    if SET_UP in rows.table and rows.table.groupby(rows.codes("run"))["speed_set_mm_s"].nunique().max() > 1:
+        return declared.mu_parameter_count
+    return len(declared.parameters)
 
 
 @cached
