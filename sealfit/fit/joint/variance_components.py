@@ -296,6 +296,7 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     return [pair for pair in pairs if pair != ("specimen", "offset")]
 
 
+@cached
 def _parameters_of_runs(rows: Rows) -> int:
     """Return the number of declared parameters that the mean forces of runs, or of set-ups, can determine.
 
