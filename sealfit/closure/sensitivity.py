@@ -18,6 +18,7 @@ from scipy.special import betaincinv, chdtri, fdtri, ncfdtrinc, ndtri, stdtrit
 from sealfit.closure import criteria
 from sealfit.closure.channels import FINER, Channel, scatter_level, too_short
 from sealfit.closure.confirm import about_means, error_of_rise_N
+from sealfit.closure.errors_and_intervals import degrees_of_freedom
 from sealfit.closure.multiplicity import critical_many, critical_small_sample, number_of_contrasts
 from sealfit.closure.score_test import Candidate, ScoreTests, project
 from sealfit.closure.selection import Selection
@@ -354,20 +355,20 @@ def undetectable_variables(
 ) -> dict[str, bool]:
     """Return the variables whose effects are not detectable in this campaign.
 
-    The value is whether specimens scatter that strongly. An error within the scatter of repeats does not
-    exclude an effect then, as repeats are of one specimen.
+    The value is whether an error within the scatter of repeats does not exclude an effect: if specimens
+    scatter that strongly, as repeats are of one specimen, or if the model goes through the means of all runs.
 
     An effect is not detectable if it cannot reach the required p-value, and the variable varies along
     strokes, is the direction, or varies between fewer than five specimens; or if the units between which it
     varies, or the rows of a stroke, scatter strongly, and an effect that explains all of that scatter would
-    not have been found.
+    not have been found. Between runs none is if the model has as many numbers as there are runs.
     """
     fitted = selection.after
     rows, starts = fitted.rows, fitted.rows.groups.starts
     sizes = {rows.level_name(level): start.size for level, start in starts.items()}
     sd_N = float(np.sqrt(rows.weight @ about_means(fitted.residual, rows, "stroke") ** 2))
     within_strokes = {"sd_N": sd_N, "sd_rel": sd_N / float(np.sqrt(rows.weight @ fitted.force**2))}
-    in_model = _channels_in_model(selection)
+    in_model, through_runs = _channels_in_model(selection), degrees_of_freedom(fitted) == 0
     undetectable = {}
     for entry in entries:
         if entry["variable"] == SPECIMEN:
@@ -384,6 +385,7 @@ def undetectable_variables(
         much = any(s["sd_rel"] > criteria.MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
         few_specimens = channel.unit == "specimen" and count < criteria.LEAST_UNITS_OF_SLOPES
         decisive = along or channel.name == "direction" or few_specimens
-        if much or (decisive and not np.isfinite(smallest)):
-            undetectable[channel.name] = much and channel.unit == "specimen"
+        hidden = through_runs and channel.unit in ("run", "specimen")
+        if hidden or much or (decisive and not np.isfinite(smallest)):
+            undetectable[channel.name] = hidden or (much and channel.unit == "specimen")
     return undetectable

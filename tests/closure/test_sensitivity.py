@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from bins_helpers import TWO_FOLDS, make_bins, make_traces
+from bins_helpers import SPEEDS, TWO_FOLDS, make_bins, make_traces
 
 from sealfit.closure.channels import channels_of
 from sealfit.closure.criteria import WEAK_P
@@ -148,3 +148,11 @@ def test_a_test_that_leaves_nothing_but_rounding_has_a_margin():
     )
     margin = _by_numbers((units, units), np.ones((4, 1)), ("mu", "multiply"), 1e-8)
     assert 0.0 <= margin < np.inf
+
+
+@pytest.mark.parametrize(("speeds", "known"), [(SPEEDS[1:8:2], False), (SPEEDS, True)])
+def test_where_the_model_goes_through_all_runs_nothing_between_them_can_be_told(speeds, known):
+    few = {"temperatures": (), "days": (), "speeds": speeds, "run_channels": OIL}
+    selection = searched(make_bins(3, repeats=3, bins=4, **few))
+    undetectable = undetectable_variables(selection, sensitivity(selection, 0.005), [])
+    assert undetectable.get("oil_ppm") == (None if known else True)
