@@ -21,6 +21,7 @@ from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.model import Term
 from sealfit.fit.joint.rows import LEVELS, Rows
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
+from sealfit.fit.joint.variance_components import runs_show_scatter
 from sealfit.fit.joint.whitening import KINDS, LEVELS_OF_FORCE
 from sealfit.fit.least_squares import t_quantile
 from sealfit.tables import LEVELS as TABLE_OF_LEVELS
@@ -255,10 +256,13 @@ def degrees_of_freedom(fitted: Fitted) -> float:
 
     A level that scatters contributes its variance over the number of its units. It has as many degrees of
     freedom as units, less what the model takes from their mean forces; for specimens the levels and aging
-    laws are counted. The result is 0 if the model takes those of nearly all runs: their scatter is not
-    estimable then.
+    laws are counted. The result is 0 if the scatter of runs is not estimable: the model takes the means of
+    nearly all, or it has as many parameters as there are runs, and only their repeats scatter.
     """
     rows, starts = fitted.rows, fitted.rows.groups.starts
+    repeats = starts["run"].size < starts["file"].size
+    if repeats and not runs_show_scatter(rows):
+        return 0.0
     if starts["run"].size - _taken(fitted, "run") < LEAST_SPARE_RUNS:
         return 0.0
     active = [c.level for c in fitted.scatter.components if c.variance > 0 and c.kind in LEVELS_OF_FORCE]

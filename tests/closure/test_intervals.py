@@ -103,6 +103,17 @@ def test_a_level_that_scatters_little_does_not_decide_the_degrees_of_freedom(run
     assert least <= degrees_of_freedom(known) <= most
 
 
+def test_a_sigma_2_at_its_limit_leaves_no_scatter_of_runs_to_be_seen():
+    def falls(table, force):
+        return force - 0.05 * table["speed_mm_s"].to_numpy()
+
+    few = {"days": (), "temperatures": (), "speeds": (1.0, 8.0, 32.0, 100.0), "bins": 4}
+    fitted = fit_declared(make_rows(make_bins(1, effect=falls, **few), has_aging=False))
+    assert fitted.model.theta[-1] == 0.0
+    assert not fitted.scatter.estimates("run")
+    assert degrees_of_freedom(fitted) == 0.0
+
+
 def test_the_scatter_of_specimens_is_in_the_covariance_of_laws_though_no_component_has_it():
     fitted = fit_declared(make_rows(make_bins(2, bins=4, repeats=2, specimen=0.03), has_aging=True))
     within = tuple(part for part in fitted.scatter.components if part.level != "specimen")

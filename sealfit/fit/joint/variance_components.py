@@ -280,8 +280,7 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
     """Return (level, kind) of the random effects that these groups distinguish, finest level first."""
     counts = {level: rows.groups.starts[level].size for level in LEVELS}
     used = ["stroke"] if counts["stroke"] > counts["file"] else []
-    # The model goes through every run if it has as many numbers: runs show no scatter then.
-    known = counts["run"] > _parameters_of_runs(rows)
+    known = runs_show_scatter(rows)
     for level in LEVELS[1:]:
         if not used or (2 < counts[level] < counts[used[-1]] and (known or level != "run")):
             used.append(level)
@@ -297,15 +296,17 @@ def usable_components(rows: Rows) -> list[tuple[str, str]]:
 
 
 @cached
-def _parameters_of_runs(rows: Rows) -> int:
-    """Return the number of declared parameters that the mean forces of runs, or of set-ups, can determine.
+def runs_show_scatter(rows: Rows) -> bool:
+    """Return whether there are more runs, or set-ups, than declared parameters that their means determine.
 
-    A set-up with several speeds determines the level of friction, but not its dependence on the speed.
+    Else the model goes through every run, but for a sigma_2 at its limit 0. A set-up with several speeds
+    determines the level of friction, but not its dependence on the speed.
     """
     declared = declare(rows)
+    count = len(declared.parameters)
     if SET_UP in rows.table and rows.table.groupby(rows.codes("run"))["speed_set_mm_s"].nunique().max() > 1:
-        return declared.mu_parameter_count
-    return len(declared.parameters)
+        count = declared.mu_parameter_count
+    return rows.groups.starts["run"].size > count
 
 
 @cached
