@@ -34,7 +34,7 @@ RANK = 1e-9  # Relative singular value below which a direction of a tangent is z
 # variance components in the median and up to 15 times; 96.0 % with it, and 1.3 times.
 LEAST_SANDWICH_DF = 2.0
 # Largest ratio of a sandwich's half width to that by the variance components. In 55 of these worlds 93.2 % of
-# 8,620 points lay inside without a limit, 93.0 % with it; the widest intervals were 6 times as wide, now 3.
+# 8,620 points lay inside without a limit, 93.0 % with it; the ratio was above 6 for 1 % of the points.
 MOST_SANDWICH = 3.0
 
 # Value and both ends of its 95 % interval.

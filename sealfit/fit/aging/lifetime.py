@@ -268,11 +268,9 @@ def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
 
 def excluded(law: JointLaw) -> list[str]:
     """Return a note on what the intervals of a law exclude; none if they include the scatter of specimens."""
-    return (
-        []
-        if law.df > 0
-        else ["known without the scatter between specimens: the law has as many parameters as days"]
-    )
+    if law.df > 0:
+        return []
+    return ["known without the scatter between specimens: the law has as many parameters as days"]
 
 
 def answer(
