@@ -261,9 +261,8 @@ def degrees_of_freedom(fitted: Fitted) -> float:
     """
     rows, starts = fitted.rows, fitted.rows.groups.starts
     repeats = starts["run"].size < starts["file"].size
-    if repeats and not runs_show_scatter(rows):
-        return 0.0
-    if starts["run"].size - _taken(fitted, "run") < LEAST_SPARE_RUNS:
+    spare = starts["run"].size - _taken(fitted, "run")
+    if spare < LEAST_SPARE_RUNS or (repeats and not runs_show_scatter(rows)):
         return 0.0
     active = [c.level for c in fitted.scatter.components if c.variance > 0 and c.kind in LEVELS_OF_FORCE]
     levels = [level for level in dict.fromkeys(active) if level != "stroke"] or ["file"]

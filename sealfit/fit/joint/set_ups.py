@@ -85,12 +85,11 @@ def _may_be_mounts(files: pd.DataFrame, force: np.ndarray) -> bool:
     left, df = _fitted(force, [files["run"], files["repeat"]])
     about = pd.Series(force, files.index)
     about = about - about.groupby(files["run"]).transform("mean")
-    means = about.groupby(pd.to_numeric(files["repeat"])).agg(["mean", "size"])
-    apart = min(
-        means["size"] @ (means["mean"] - isotonic_regression(means["mean"], increasing=up).x) ** 2
-        for up in (True, False)
-    )
-    noise, added = max(float(left @ left), 1e-300) / max(df, 1), len(means) - 1
+    repeats = about.groupby(pd.to_numeric(files["repeat"]))
+    mean, count = repeats.mean().to_numpy(), repeats.size().to_numpy()
+    curves = [isotonic_regression(mean, weights=count, increasing=up).x for up in (True, False)]
+    apart = min(count @ (mean - curve) ** 2 for curve in curves)
+    noise, added = max(float(left @ left), 1e-300) / max(df, 1), mean.size - 1
     return bool(df > 0 and added > 0 and fdtrc(added, df, apart / added / noise) < SET_UP_P)
 
 
