@@ -297,10 +297,10 @@ def robust_covariance(fitted: Fitted, level: str) -> np.ndarray:
 
 
 def covariance_with_specimens(fitted: Fitted) -> np.ndarray:
-    """Return the covariance by the variance components, (p, p), with those of a sandwich where larger.
+    """Return the covariance by the variance components, (p, p), widened to the sandwich of specimens.
 
-    The standard errors are at least those of the sandwich of specimens, up to `MOST_SANDWICH` times: it holds
-    their scatter where no variance component does.
+    Each standard error is at least that of the sandwich, but at most `MOST_SANDWICH` times its own. The
+    sandwich contains the scatter of specimens where no variance component does.
     """
     own, units = fitted.covariance, fitted.rows.groups.starts["specimen"].size
     if units < 2:

@@ -361,7 +361,7 @@ def undetectable_variables(
     An effect is not detectable if it cannot reach the required p-value, and the variable varies along
     strokes, is the direction, or varies between fewer than five specimens; or if the units between which it
     varies, or the rows of a stroke, scatter strongly, and an effect that explains all of that scatter would
-    not have been found. Between runs none is if the model has as many numbers as there are runs.
+    not have been found. No effect between runs is detectable if the model goes through their means.
     """
     fitted = selection.after
     rows, starts = fitted.rows, fitted.rows.groups.starts
