@@ -238,7 +238,7 @@ def channels_of(term: Term, rows: Rows) -> list[str]:
     """Return an effect's channels; an unsigned force along a channel of whole files has direction too."""
     names = list(term.channels)
     both_ways = rows.speed.min() < 0 < rows.speed.max()
-    coarse = all(FINER[unit_of(rows.values(name), rows)] > FINER["stroke"] for name in names)
+    coarse = all(FINER[unit_of(rows.unsigned(name), rows)] > FINER["stroke"] for name in names)
     if both_ways and coarse and term.target == ("force", "add") and "direction" not in names:
         names.insert(0, "direction")
     return names
@@ -246,7 +246,7 @@ def channels_of(term: Term, rows: Rows) -> list[str]:
 
 def effect_level(term: Term, rows: Rows) -> str:
     """Return the finest level at which one of the effect's channels varies, in closure.json's words."""
-    units = [unit_of(rows.values(name), rows) for name in channels_of(term, rows)]
+    units = [unit_of(rows.unsigned(name), rows) for name in channels_of(term, rows)]
     return LEVEL_NAMES[rows.level_name(min(units, key=FINER.get))]
 
 

@@ -270,3 +270,12 @@ def test_an_equation_is_written_with_its_reference():
     fixed = {"speed_mm_s_ref": 6.82, "distance_mm_ref": 39.4}
     warming = Term(EFFECTS["warming_conduction"], ("distance_mm", "speed_mm_s"), "mu", "multiply", fixed)
     assert form_of(warming) == "-A sqrt(|v| s / (6.82 39.4))"
+
+
+def test_the_speed_of_strokes_both_ways_in_one_file_varies_between_runs():
+    bins = make_bins(directions=(1, -1), repeats=1, bins=8, speeds=(10.0, 30.0, 100.0))
+    speed = bins["speed_set_mm_s"].abs().map("{:g}".format)
+    together = {"file": bins["condition"] + speed, "run_id": bins["condition"] + speed}
+    rows = make_rows(bins.assign(**together, stroke=1 + (bins["speed_mm_s"] < 0)), has_aging=True)
+    slower = Term(EFFECTS["log_rate"], ("speed_mm_s",), "mu", "multiply", {"v_ref": 30.0})
+    assert effect_level(slower, rows) == "run"
