@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,16 +12,16 @@ import numpy as np
 from sealfit.closure import small_sample_test
 from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES, UNEQUAL_RUNS
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of_score, to_orthonormal
-from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, slope_log_p
+from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, effective_number, slope_log_p
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import POWER
 
 # The signs of whole units are flipped at random many times. The largest T over all candidates gives the
 # p-value adjusted for the search (Westfall & Young 1993; sign flips of score contributions: Hemerik, Goeman &
 # Finos 2020, doi:10.1111/rssb.12369). P-values by the jackknife are adjusted for the number of candidates
-# (Bonferroni). Tests on few specimens are adjusted by random draws, contrasts in few units by their number.
-# Draws continue until the smallest p-value is known well enough (sequential Monte Carlo p-values: Besag &
-# Clifford 1991, Biometrika 78(2), 301-304, doi:10.1093/biomet/78.2.301).
+# (Bonferroni). Tests on few specimens are adjusted by random draws, contrasts in few units by their effective
+# number. Draws continue until the smallest p-value is known well enough (sequential Monte Carlo p-values:
+# Besag & Clifford 1991, Biometrika 78(2), 301-304, doi:10.1093/biomet/78.2.301).
 
 FLIPS = 1999  # Number of random sign flips, or draws, that are made at a time.
 # Their largest number: a p-value of 0.00125, four times which is 0.005, has an error of 13 %.
@@ -146,7 +147,7 @@ def _least_small_sample(
 
 
 def adjust_slopes(candidates: Sequence[Candidate]) -> np.ndarray:
-    """Return the p-values of the contrasts in few units, times their number, shape (m,); 1 if not tested.
+    """Return the p-values of contrasts in few units, adjusted for their number, shape (m,); 1 if not tested.
 
     A candidate has the p-value of its strongest contrast in its weakest variant.
     """
@@ -162,10 +163,16 @@ def adjust_slopes(candidates: Sequence[Candidate]) -> np.ndarray:
 def number_of_contrasts(candidates: Sequence[Candidate]) -> np.ndarray:
     """Return the factor on the p-values of each candidate's contrasts in few units, shape (m,).
 
-    The variables of operation, also in one category, and all others have half of the error rate each.
+    The variables of operation, also in one category, and all others have half of the error rate each. Places
+    of a step or a change count one by one, all other contrasts by their effective number.
     """
     own = [c.channels[-1:] if c.category else c.channels for c in candidates]
     family = np.array([set(names) <= OPERATION for names in own], dtype=int)
-    sizes = [c.test_result.slopes[0].slope.size if c.test_result.slopes else 0 for c in candidates]
-    counts = np.bincount(family, weights=sizes, minlength=2)
+    place = np.array([c.place for c in candidates], dtype=bool)
+    tests = [c.test_result.slopes[:1] for c in candidates]
+    counts = np.zeros(2)
+    for k in set(family):
+        shapes = list(itertools.chain(*itertools.compress(tests, (family == k) & ~place)))
+        places = list(itertools.chain(*itertools.compress(tests, (family == k) & place)))
+        counts[k] = sum(test.slope.size for test in places) + (effective_number(shapes) if shapes else 0)
     return (np.count_nonzero(counts) * counts)[family]

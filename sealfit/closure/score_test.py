@@ -13,6 +13,7 @@ from scipy.special import betainc, chdtrc, fdtrc
 from sealfit.closure import criteria
 from sealfit.closure.channels import FINER
 from sealfit.closure.small_sample_test import (
+    NOISE_DRAWS,
     ClusterTests,
     ContrastTest,
     SmallSampleTest,
@@ -162,6 +163,11 @@ class ScoreTests:
         return left, *(_distinct(basis.project_out(c.project_out(left)), left) for c, basis in own)
 
     @cached_property
+    def _noise(self) -> np.ndarray:
+        """Draws of whitened noise, shape (n, draws)."""
+        return np.random.default_rng(0).standard_normal((self.fitted.rows.force.size, NOISE_DRAWS))
+
+    @cached_property
     def _of_unknown_scatter(self) -> list[str]:
         """The levels whose groups scatter by an unknown amount."""
         starts = self.fitted.rows.groups.starts
@@ -202,7 +208,7 @@ class ScoreTests:
             if test is None:
                 return weakest
             return weakest._replace(chi2=test.chi2, df=test.basis.shape[1], small_sample=test)
-        tests = tuple(contrast_test(self.fitted, left, between) for left in variants)
+        tests = tuple(contrast_test(self.fitted, left, between, self._noise) for left in variants)
         if any(test is None for test in tests):
             return None
         constant = self._test_of_constants(variants, target, between) if between in ("file", "run") else None

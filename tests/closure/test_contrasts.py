@@ -123,7 +123,7 @@ def test_moderated_p_values_are_uniform_where_every_unit_has_its_own_slope():
         deviations = (scores - slope / units) / np.sqrt(1 - 1 / units)
         test = ContrastTest(
             "run", slope, (deviations**2).sum(axis=0), np.full(contrasts, units - 1.0),
-            np.ones(contrasts, bool), deviations, np.ones(contrasts, bool),
+            np.ones(contrasts, bool), deviations, np.empty((contrasts, 0)), np.ones(contrasts, bool),
         )  # fmt: skip
         found.append(slope_log_p([test])[0][0])
     assert np.mean(np.array(found) < np.log(0.01)) < 0.025

@@ -1,5 +1,6 @@
 """P-values adjusted for the whole search, on scores made by hand."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +16,7 @@ from sealfit.closure.multiplicity import (
     adjust_slopes,
     adjust_small_sample,
     critical_many,
+    number_of_contrasts,
 )
 from sealfit.closure.score_test import Candidate, ScoreTestResult, log_p_of_score, to_orthonormal
 from sealfit.closure.small_sample_test import ContrastTest, SmallSampleTest, slope_log_p
@@ -164,16 +166,19 @@ def candidate(name, result):
     return Candidate((name,), "mu", "multiply", "run", np.ones((4, 1)), result)
 
 
-def slopes_of(*sizes):
-    """Contrasts of some sizes, in standard errors, from eight units that differ by noise."""
+def slopes_of(*sizes, seed=3):
+    """Independent contrasts of some sizes, in standard errors, from eight units that differ by noise."""
     deviations = np.random.default_rng(2).normal(size=(8, len(sizes)))
+    drawn = np.random.default_rng(seed).normal(size=(len(sizes), 300))
     own = np.full(len(sizes), 1.0)
     along = np.ones(len(sizes), dtype=bool)
-    return ContrastTest("run", np.array(sizes), own, np.full(len(sizes), 7.0), along, deviations, along)
+    return ContrastTest(
+        "run", np.array(sizes), own, np.full(len(sizes), 7.0), along, deviations, drawn, along
+    )
 
 
 def test_contrasts_are_adjusted_by_how_many_there_are():
-    first, second = slopes_of(6.0, 0.5), slopes_of(1.0)
+    first, second = slopes_of(6.0, 0.5), slopes_of(1.0, seed=4)
     results = [ScoreTestResult(1.0, 1, 8, NOWHERE, slopes=(test,)) for test in (first, second)]
     results.append(ScoreTestResult(1.0, 1, 8, NOWHERE))
     found = adjust_slopes([candidate("oil", result) for result in results])
@@ -183,15 +188,25 @@ def test_contrasts_are_adjusted_by_how_many_there_are():
     assert found[1:].tolist() == [1.0, 1.0]
 
 
+def test_contrasts_that_are_nearly_the_same_count_once():
+    first = slopes_of(6.0)
+    rest = [slopes_of(0.5)._replace(drawn=(1 + 0.01 * k) * first.drawn) for k in range(30)]
+    results = [ScoreTestResult(1.0, 1, 8, NOWHERE, slopes=(test,)) for test in (first, *rest)]
+    shapes = [candidate("oil", result) for result in results]
+    assert number_of_contrasts(shapes).tolist() == [1.0] * 31
+    places = [replace(shape, place=True) for shape in shapes[1:]]
+    assert number_of_contrasts([shapes[0], *places]).tolist() == [31.0] * 31
+
+
 def test_the_variables_of_operation_have_half_of_the_error_rate():
-    first, second = slopes_of(6.0), slopes_of(*[0.5] * 40)
+    first, second = slopes_of(6.0), slopes_of(*[0.5] * 20, seed=4)
     results = [ScoreTestResult(1.0, 1, 8, NOWHERE, slopes=(test,)) for test in (first, second)]
     of_speed, of_column = (
         adjust_slopes([candidate(name, results[0]), candidate("oil", results[1])])[0]
         for name in ("speed_mm_s", "humidity")
     )
     assert of_speed == pytest.approx(2 * np.exp(slope_log_p([first, second])[0][0]))
-    assert of_column == pytest.approx(41 / 2 * of_speed)
+    assert of_column == pytest.approx(21 / 2 * of_speed)
 
 
 def test_of_the_variants_of_a_contrast_that_counts_which_says_least():
