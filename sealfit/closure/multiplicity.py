@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -168,11 +167,9 @@ def number_of_contrasts(candidates: Sequence[Candidate]) -> np.ndarray:
     """
     own = [c.channels[-1:] if c.category else c.channels for c in candidates]
     family = np.array([set(names) <= OPERATION for names in own], dtype=int)
-    place = np.array([c.place for c in candidates], dtype=bool)
-    tests = [c.test_result.slopes[:1] for c in candidates]
-    counts = np.zeros(2)
-    for k in set(family):
-        shapes = list(itertools.chain(*itertools.compress(tests, (family == k) & ~place)))
-        places = list(itertools.chain(*itertools.compress(tests, (family == k) & place)))
-        counts[k] = sum(test.slope.size for test in places) + (effective_number(shapes) if shapes else 0)
+    shapes, places = ([], []), ([], [])
+    for candidate, k in zip(candidates, family, strict=True):
+        (places if candidate.place else shapes)[k].extend(candidate.test_result.slopes[:1])
+    counts = np.array([effective_number(own) for own in shapes])
+    counts += [sum(test.slope.size for test in own) for own in places]
     return (np.count_nonzero(counts) * counts)[family]

@@ -209,6 +209,8 @@ def effective_number(tests: Sequence[ContrastTest]) -> int:
     Contrasts of one channel on several quantities are nearly the same. Source: Gao, Starmer & Martin (2008),
     doi:10.1002/gepi.20310.
     """
+    if not tests:
+        return 0
     size = np.linalg.svd(np.concatenate([test.drawn for test in tests]), compute_uv=False) ** 2
     return int(np.searchsorted(np.cumsum(size), SHOWN_VARIANCE * size.sum()) + 1)
 
