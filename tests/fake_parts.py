@@ -94,7 +94,7 @@ MODEL = {
     "covariance": [],
     "sandwiches": [],
     "jumps": [],
-    "candidate": None,
+    "unconfirmed": [],
     "df": 3.0,
     "scatter": {"s0": 0.1, "g": 0.0, "of_specimens": False, "components": []},
     "ranges": {"load_N": [49.0, 49.0]},

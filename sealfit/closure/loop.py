@@ -123,8 +123,18 @@ def close_loop(
         "residuals_after": _residual_table(bins, after, models.held_after),
         **drawn,
     }
-    candidate = next((e["label"] for e in document["effects"] if e["candidate"]), None)
-    return Closure(document, to_record(before, after, config, candidate), tables, after)
+    return Closure(document, to_record(before, after, config, _unconfirmed(selection, after)), tables, after)
+
+
+def _unconfirmed(selection: Selection, after: Fitted) -> dict[str, Model]:
+    """Return the model after the loop with each significant effect that is in no model, by its label."""
+    items = [item for item in (selection.inconclusive,) if item is not None]
+    items += [item for item in selection.refused if not item.negligible]
+    found = {}
+    for proposal in (item.proposal for item in items):
+        model = after.model.with_term(proposal.term, proposal.fitted.model.values[-1])
+        found[describe(proposal.term, after.rows)] = fit(model, after.rows, after.scatter, turns=1).model
+    return found
 
 
 def _drawn_tables(

@@ -38,10 +38,10 @@ from sealfit.tables import CHANNELS, CURVES, SHAPE_POINTS, SHAPES
 # ---------------------------------------------------------------- model record
 
 
-def to_record(before: Fitted, after: Fitted, config: Config, candidate: str | None) -> dict:
+def to_record(before: Fitted, after: Fitted, config: Config, unconfirmed: Mapping[str, Model]) -> dict:
     """Return OUT/model.json: both fitted models with covariance, scatter and tested ranges.
 
-    `candidate` is the label of an effect that too few specimens show: it is not in the models.
+    `unconfirmed` are models after the loop with one more effect, by its label.
     """
     rows, declared, scatter = after.rows, after.model.declared, after.scatter
     series = rows.conditions["series"].to_numpy(dtype=object)[rows.condition]
@@ -73,7 +73,7 @@ def to_record(before: Fitted, after: Fitted, config: Config, candidate: str | No
             }
             for own in sandwiches(after)
         ],
-        "candidate": candidate,
+        "unconfirmed": [{"label": label, **_model(model)} for label, model in unconfirmed.items()],
         "jumps": [
             {"effect": number, "parameter": name, "low": low, "high": high}
             for number, (term, values) in enumerate(zip(after.model.terms, after.model.values, strict=True))
@@ -127,8 +127,10 @@ def _ranges(rows: Rows) -> dict:
     return ranges
 
 
-def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[Model, Model, pd.DataFrame]:
-    """Return the models before and after and the table of conditions from a record as of `to_record`.
+def from_record(
+    record: dict, own: Mapping[str, Effect] | None = None
+) -> tuple[Model, Model, list[Model], pd.DataFrame]:
+    """Return a record's models before, after, and with an unconfirmed effect, and the table of conditions.
 
     None of the record is executed. `own` are the user's own effects, by id. RequestError if the model has an
     effect that is not known; ParameterError if the values of an effect are not those that it has.
@@ -138,13 +140,14 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
     index = {q: np.array(v, dtype=int) for q, v in raw["index"].items()}
     declared = Declared(parameters, index, raw["stribeck"], raw["law"], {})  # it is not fitted again
     effects = {**EFFECTS, **(own or {})}
-    ids = {term["id"] for stage in ("before", "after") for term in record[stage]["terms"]}
+    stages = [record["before"], record["after"], *record["unconfirmed"]]
+    ids = {term["id"] for stage in stages for term in stage["terms"]}
     if unknown := sorted(ids - effects.keys() - FREE.keys()):
         raise needed("the model holds", unknown)
     models = []
-    for stage in ("before", "after"):
-        model = Model(declared, np.array(record[stage]["theta"], dtype=float))
-        for raw_term in record[stage]["terms"]:
+    for stage in stages:
+        model = Model(declared, np.array(stage["theta"], dtype=float))
+        for raw_term in stage["terms"]:
             fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in raw_term["fixed"].items()}
             effect = free_effect(raw_term["id"], fixed) if raw_term["id"] in FREE else effects[raw_term["id"]]
             own = (raw_term["acts_on"], raw_term["operation"], fixed, raw_term.get("smoothness"))
@@ -153,7 +156,8 @@ def from_record(record: dict, own: Mapping[str, Effect] | None = None) -> tuple[
                 raise ParameterError(f"effect {effect.id}: its channels or parameters are others.")
             model = model.with_term(Term(effect, channels, *own), values)
         models.append(model)
-    return models[0], models[1], pd.DataFrame(record["conditions"])
+    before, after, *unconfirmed = models
+    return before, after, unconfirmed, pd.DataFrame(record["conditions"])
 
 
 # ---------------------------------------------------------------- plot tables

@@ -7,6 +7,7 @@ sensor's accuracy is not included (GUM, type B).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -32,7 +33,7 @@ from sealfit.ingest.quality import NO_VALUE
 BEYOND = 0.005  # Share of the largest tested value by which a point may exceed the range: rounded units.
 FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 NO_INTERVAL = "no interval: as many parameters in the model as runs; test more speeds"
-NOT_IN_MODEL = "without the candidate {}, which too few specimens show"
+NOT_CONFIRMED = "not confirmed: {}; the interval holds the force with it and without"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
 
@@ -55,7 +56,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         If a condition column, the speed or a channel of the after-model is missing, or the model has a user
         effect that is not in `own`.
     """
-    before, after, conditions = from_record(model, own)
+    before, after, unconfirmed, conditions = from_record(model, own)
     config = Config.model_validate(model["config"])
     table = _complete(points.reset_index(drop=True), model, after, config)
     notes = [[] for _ in range(len(table))]
@@ -66,8 +67,8 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     answer = np.full((len(table), len(FORCE_COLUMNS)), np.nan)
     if not model["scatter"]["of_specimens"]:
         _note(notes, good, TESTED_ONLY)
-    if model["candidate"]:
-        _note(notes, good, NOT_IN_MODEL.format(model["candidate"]))
+    if unconfirmed:
+        _note(notes, good, NOT_CONFIRMED.format(", ".join(one["label"] for one in model["unconfirmed"])))
     if model["df"] == 0:
         _note(notes, good, NO_INTERVAL)
     for jump, inside in _in_gaps(model["jumps"], after, table):
@@ -83,6 +84,9 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         at = replace(at, force=before_N)  # its lag
         mean, tangent = evaluate(after, at)
         least, most = _across_jumps(model["jumps"], after, at, mean)
+        for one in unconfirmed:
+            others = _with_unconfirmed(replace(one, declared=after.declared), at, model["ranges"])
+            least, most = np.minimum(least, np.min(others, axis=0)), np.maximum(most, np.max(others, axis=0))
         reach = t_quantile(model["df"])
         others = []
         for own in model["sandwiches"]:
@@ -279,6 +283,28 @@ def _across_jumps(
             other, _ = evaluate(replace(after, values=tuple(values)), at, jacobian=False)
             least, most = np.where(inside, [np.minimum(least, other), np.maximum(most, other)], [least, most])
     return least, most
+
+
+def _with_unconfirmed(model: Model, at: Rows, ranges: dict) -> list[np.ndarray]:
+    """Return the forces with an effect that is not confirmed, shape (n,) each.
+
+    Its channels are limited to what was tested. For one that some points lack, both ends of its range are
+    tried, or all its categories.
+    """
+    given, tried = {}, {}
+    for name in (own for own in model.terms[-1].channels if own not in ("direction", "speed_mm_s")):
+        values = at.table.get(name, pd.Series(np.nan, at.table.index))
+        if _is_range(ranges[name]):
+            values = pd.to_numeric(values, errors="coerce").clip(*ranges[name])
+        else:
+            values = values.astype(str).where(values.isin(ranges[name]))
+        if values.isna().any():
+            tried[name] = ranges[name]
+        else:
+            given[name] = values
+    places = itertools.product(*tried.values())
+    tables = [at.table.assign(**given, **dict(zip(tried, place, strict=True))) for place in places]
+    return [evaluate(model, replace(at, table=table), jacobian=False)[0] for table in tables]
 
 
 def _of_unknown_phase(after: Model, at: Rows, force: np.ndarray) -> np.ndarray:

@@ -135,7 +135,7 @@ def _sizes_agree(model) -> bool:
     blocks = [block for own in model.sandwiches for block in own.information]
     return (
         model.has_aging == model.config.aging
-        and len(model.before.theta) == len(model.after.theta) == declared
+        and all(len(own.theta) == declared for own in (model.before, model.after, *model.unconfirmed))
         and all(len(own) == conditions and _are_below(own, declared, -1) for own in index)
         and set(model.conditions.series) <= model.speeds_mm_s.keys()
         and all(_is_square(own, fitted) for own in covariances)
@@ -169,6 +169,7 @@ TERM = record(
     smoothness=Maybe,
 )
 FITTED = record(theta=list[Number], terms=list[TERM])
+UNCONFIRMED = record(label=Text, theta=list[Number], terms=Annotated[list[TERM], Field(min_length=1)])
 INFORMATION = list[tuple[list[Annotated[int, Field(strict=True, ge=0)]], Matrix]]
 GROUPED = record(covariance=Matrix, information=INFORMATION)  # from whole groups: numbers of its parameters
 COMPONENT = record(
@@ -191,7 +192,7 @@ MODEL = record(
     covariance=Matrix,
     sandwiches=list[GROUPED],
     jumps=list[JUMP],
-    candidate=Text | None,
+    unconfirmed=list[UNCONFIRMED],
     df=Annotated[Number, Field(ge=0)],
     scatter=record(s0=Number, g=Number, of_specimens=StrictBool, components=list[COMPONENT]),
     ranges=dict[Text, Names | tuple[Number, Number]],

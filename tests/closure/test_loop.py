@@ -216,8 +216,17 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     line = np.polyfit(points["x"].astype(float), points["value"], 1)
     assert line[0] == pytest.approx(0.04, rel=0.2)
     assert any("second specimen" in run["why"] for run in document["next_runs"])
-    answer = predict(made.model, bins.head(2))
-    assert answer["note"].str.contains(f"without the candidate {effect['label']}", regex=False).all()
+    points = bins[bins["speed_set_mm_s"] == 16.0].drop_duplicates("specimen_id")
+    alone = predict(made.model | {"unconfirmed": []}, points)
+    answer = predict(made.model, points)
+    anyone = predict(made.model, points.drop(columns="hardness_ShA"))
+    assert answer["note"].str.contains(f"not confirmed: {effect['label']}", regex=False).all()
+    assert (answer["force_after_N"] == alone["force_after_N"]).all()
+    widths = [made["force_after_hi95_N"] - made["force_after_lo95_N"] for made in (alone, answer, anyone)]
+    assert (widths[0] <= widths[1]).all()
+    assert (widths[1] <= widths[2]).all()
+    assert widths[1].max() > widths[0].max() + 0.1
+    assert widths[2].min() > widths[0].min() + 0.1
 
 
 @pytest.mark.long
