@@ -17,7 +17,7 @@ from sealfit.config import Config
 from sealfit.effects.free import WIDE
 from sealfit.fit.joint.rows import ALONG, LEVELS, POWER, Rows, one_load, open_columns
 from sealfit.ingest.columns import condition_columns, force_inputs
-from sealfit.ingest.quality import STILL_RISING
+from sealfit.ingest.quality import STILL_RISING, forms_of_force, shared_variance
 from sealfit.ingest.strokes import SPEEDS_APART
 from sealfit.tables import CALENDAR
 
@@ -92,6 +92,8 @@ def find_channels(
         if values.dtype.kind == "f":
             if not (np.isfinite(values).all() and varies(values)) or _one_setting(name, values):
                 continue
+            if _repeats_force(values, rows):
+                continue
             values = settings(level_values(values, rows))
         elif not 2 <= np.unique(values).size <= criteria.MOST_LEVELS:
             continue
@@ -102,6 +104,19 @@ def find_channels(
         if not channel.grouping or name in conditions:
             found.append(channel)
     return found
+
+
+def _repeats_force(values: np.ndarray, rows: Rows) -> bool:
+    """Whether numbers, shape (n,), are the force: in other units, over the load, or filtered.
+
+    They follow it, and within strokes its noise, which no cause of friction does.
+    """
+    inside = np.diff(rows.codes("stroke")) == 0
+    for form in forms_of_force(rows.force, rows.load):
+        noise = shared_variance(np.diff(values)[inside], np.diff(form)[inside]) if inside.any() else 0.0
+        if noise > criteria.SAME_NOISE and shared_variance(values, form) > criteria.SAME_AS_FORCE:
+            return True
+    return False
 
 
 def _one_setting(name: str, values: np.ndarray) -> bool:

@@ -19,6 +19,10 @@ SHORT_STROKES = 0.5
 # A channel is constant within groups if less than this share of its variance (1 % of its SD) lies in them.
 # Measured speeds of one setting differ by 1e-5 to 1e-3 of their value; settings differ by 10 % and more.
 CONSTANT_SHARE = 1e-4
+# Least squared correlations with the force, and of differences between successive rows of a stroke, from
+# which a channel is the force itself. A force in other units and a coefficient of friction have 1 and 1, a
+# mean over nine samples has 0.9997 and 0.68.
+SAME_AS_FORCE, SAME_NOISE = 0.999, 0.5
 MOST_WITHIN_RUNS = 0.1  # Largest share of a channel's variance within runs with which run means are tested.
 SAME_VALUE = 1e-3  # Values closer than this, of a channel scaled to -1..1, are one setting measured twice.
 MOST_SET_VALUES = 50  # A channel with more groups of values than this is used as measured, not as settings.

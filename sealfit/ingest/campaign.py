@@ -14,7 +14,13 @@ from sealfit.engine.run_map import run_map
 from sealfit.errors import CampaignError, Fault, grouped
 from sealfit.ingest.columns import condition_columns, force_inputs
 from sealfit.ingest.partitions import INNER, SAMPLED, Asked, PartitionResult, plan_parts, shaped
-from sealfit.ingest.quality import computed_force, improbable_loads, incomplete_columns, quality_table
+from sealfit.ingest.quality import (
+    computed_force,
+    improbable_loads,
+    incomplete_columns,
+    quality_table,
+    repeats_of_force,
+)
 from sealfit.ingest.repeat_checks import judged, outlying_files, settings_within_runs, turned_sign
 from sealfit.ingest.runs import FIX, list_traces
 from sealfit.ingest.stored_parts import asked_again, load_parts, make_part, stored_strokes
@@ -146,6 +152,7 @@ def ingest_campaign(
     seen = steady.drop(columns=[*INNER, *config.loop.ignore_channels, *inputs], errors="ignore")
     faults += incomplete_columns(seen, config.series_columns if config.aging else ())
     faults += improbable_loads(steady, config) + computed_force(inputs & {*steady.columns})
+    faults += repeats_of_force(seen)
     faults += settings_within_runs(seen, {*STEADY.names(), *condition_columns(config)})
     used = strokes["used"].to_numpy(bool).copy()
     used[used] = steady["used"].to_numpy(bool)

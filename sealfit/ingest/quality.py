@@ -296,6 +296,41 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
     return pd.DataFrame({name: pd.array([row[name] for row in cells], kind) for name, kind in kinds.items()})
 
 
+# Least squared correlation of means over strokes with the force from which a column seems to repeat it.
+SAME_AS_FORCE = 0.9999
+LEAST_STROKES = 8  # Number of strokes from which that is said.
+
+
+def forms_of_force(force: np.ndarray, load: np.ndarray) -> list[np.ndarray]:
+    """Return the force, its size, and both over the load, shape (n,) each."""
+    return [own / by for by in (1.0, load) for own in (force, np.abs(force))]
+
+
+def shared_variance(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the squared correlation of two columns, shape (n,); 0 if one is constant."""
+    if np.ptp(one) == 0 or np.ptp(other) == 0:
+        return 0.0
+    return float(np.corrcoef(one, other)[0, 1] ** 2)
+
+
+def repeats_of_force(steady: pd.DataFrame) -> list[Fault]:
+    """Return the columns of numbers that follow the force in all strokes; unused rows are left out."""
+    used = steady[steady["used"].to_numpy(bool)]
+    load = used["load_N"].to_numpy(float) if "load_N" in used and used["load_N"].all() else np.ones(len(used))
+    forms, faults = forms_of_force(used["force_N"].to_numpy(float), load), []
+    for name in used.columns.difference([*STEADY.names()]):
+        if not pd.api.types.is_numeric_dtype(used[name]) or len(used) < LEAST_STROKES:
+            continue
+        values = used[name].to_numpy(float)
+        share = max(shared_variance(values, form) for form in forms) if np.isfinite(values).all() else 0.0
+        if share > SAME_AS_FORCE:
+            reason = f"it follows the force in all strokes (r = {np.sqrt(share):.6f}). "
+            reason += "Where it follows its noise too, the search for effects leaves it out."
+            fix = "If it is computed from the force, list it under loop.ignore_channels."
+            faults.append(Fault("repeats_force", reason, column=name, fix=fix, **KEPT))
+    return faults
+
+
 LEAST_KNOWN = 0.8  # share of files with a value from which the search for effects still looks at a column
 NO_VALUE = "(no value)"  # level of a category in files without one
 

@@ -68,6 +68,7 @@ def of_ingest(tables: Mapping[str, pd.DataFrame]) -> dict:
             {"column": row.column, "files_without": int(float(row.value)), "reason": row.reason}
             for row in quality[quality["check"] == "incomplete_column"].itertuples()
         ],
+        "repeats_of_force": quality.loc[quality["check"] == "repeats_force", "column"].tolist(),
         "runs": int(runs.loc[runs["used"].astype(bool), "run_id"].nunique()),
         "conditions": int(tables["steady"]["condition"].nunique()),
     }

@@ -52,6 +52,8 @@ def ingest_lines(part: Mapping) -> list[str]:
         more = f"; left out: {', '.join(left_out)}" if left_out else ""
         found.append(line("faults", f"{text}{more} (table quality)"))
     found += [line("column", f"{one['column']}: {one['reason']}") for one in part["incomplete_columns"]]
+    repeated = "it follows the force in all strokes (table quality)"
+    found += [line("column", f"{name}: {repeated}") for name in part["repeats_of_force"]]
     found.append(line("conditions", f"{part['conditions']} in {_count(part['runs'], 'run')}"))
     return found
 

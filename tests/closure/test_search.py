@@ -102,6 +102,18 @@ def test_the_noise_of_one_load_is_no_channel(share, several):
     assert several or names.isdisjoint({"load_N", "power"})
 
 
+def test_a_column_that_is_the_force_is_no_channel_and_a_pressure_that_it_follows_is():
+    bins = make_bins(repeats=1, directions=(1, -1))
+    force, load = bins["force_N"].to_numpy(), bins["load_N"].to_numpy()
+    mean = bins.groupby(["file", "stroke"])["force_N"].transform("mean").abs()
+    bins["force_kN"], bins["cof"] = force / 1000, np.abs(force) / load
+    bins["filtered"] = np.convolve(np.pad(np.abs(force), 1, mode="edge"), [0.1, 0.8, 0.1], "valid")
+    bins["pressure_bar"] = mean / 10 * (1 + 0.001 * np.random.default_rng(0).normal(size=len(bins)))
+    names = {c.name for c in find_channels(make_rows(bins, has_aging=True))}
+    assert "pressure_bar" in names
+    assert names.isdisjoint({"force_kN", "cof", "filtered"})
+
+
 def test_a_condition_may_be_called_rubber():
     """Table `bins` has a column of this name in any case, which is no channel of its own."""
     bins = make_bins(bins=4)

@@ -12,6 +12,7 @@ from sealfit.ingest.quality import (
     incomplete_columns,
     load_faults,
     quality_table,
+    repeats_of_force,
     speed_column_faults,
     stroke_faults,
     stuck_samples,
@@ -424,3 +425,11 @@ def test_of_a_column_of_remarks_it_is_said_how_to_leave_it_out():
     remarks, numbers = incomplete_columns(pd.DataFrame(rows))
     assert remarks.fix.endswith("too. If it holds remarks, list it under loop.ignore_channels.")
     assert "ignore_channels" not in numbers.fix
+
+
+def test_columns_that_follow_the_force_in_all_strokes_are_named():
+    force = np.array([30.0, -31.0, 40.0, -42.0, 55.0, -53.0, 61.0, -64.0, 70.0])
+    steady = pd.DataFrame({"file": "a", "used": True, "force_N": force, "load_N": 50.0, "remark": "x"})
+    steady = steady.assign(force_kN=np.round(np.abs(force) / 1000, 4), cof=force / 50, current_A=force**2)
+    assert [fault.column for fault in repeats_of_force(steady)] == ["cof", "force_kN"]
+    assert repeats_of_force(steady.head(5)) == []
