@@ -25,6 +25,7 @@ DIMENSION = {
     "speed": ("speed", "rotation"),
 }
 MOST = 0.75  # share of the files in which a column called time must rise
+FOLLOWS = 0.95  # correlation with the force from which a column is no load
 COPY = 0.9999  # correlation of two columns that are the same signal in two units
 BY_BEHAVIOUR = 0.5  # how well a column must behave to be taken without a name or a unit
 
@@ -204,6 +205,12 @@ def _same_signal(one: TraceColumn, other: TraceColumn) -> bool:
     return abs(float(np.corrcoef(a, b)[0, 1])) > COPY
 
 
+def _follows(column: TraceColumn, force: TraceColumn) -> bool:
+    """Whether a column is the force in another unit or filtered: no load sensor follows it so closely."""
+    both = zip(column.values, force.values, strict=True)
+    return all(np.ptp(a) > 0 and np.ptp(b) > 0 and abs(np.corrcoef(a, b)[0, 1]) > FOLLOWS for a, b in both)
+
+
 def find_roles(columns: Sequence[TraceColumn]) -> Roles:
     """Return which column is what."""
     time = _best(columns, "time", _as_time)
@@ -218,7 +225,7 @@ def find_roles(columns: Sequence[TraceColumn]) -> Roles:
     force = _best(rest, "force", lambda column: _as_force(column, velocities)) if velocities else None
     rest = [column for column in rest if column is not force]
     coefficient = next((c for c in rest if c.role == "coefficient"), None) if force is None else None
-    load = _load(rest) if force is not None or coefficient is not None else None
+    load = _load(rest, force) if force is not None or coefficient is not None else None
     coefficient = coefficient if load is not None else None
     taken = (time, displacement, force, load, speed)
     others = tuple(column for column in columns if column not in (*taken, coefficient))
@@ -282,12 +289,13 @@ def _velocities(
     return [smoothed(values) for values in speed.values] if speed is not None else []
 
 
-def _load(rest: Sequence[TraceColumn]) -> TraceColumn | None:
+def _load(rest: Sequence[TraceColumn], force: TraceColumn | None) -> TraceColumn | None:
     """Return the column of the normal load: one that is called so, or a second force that hardly varies."""
     named = [c for c in rest if c.role == "load" and c.may_be("load")]
     if named:
         return named[0]
     forces = [c for c in rest if c.in_unit_of("load") and c.role in ("force", "")]
+    forces = [c for c in forces if force is None or not _follows(c, force)]
     steady = [c for c in forces if all(abs(np.mean(v)) > 5.0 * np.std(v) > 0.0 for v in c.values)]
     return steady[0] if len(steady) == 1 else None
 

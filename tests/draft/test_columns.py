@@ -90,6 +90,14 @@ def test_load_and_friction_are_told_apart(tmp_path):
     assert slots(made)["force_N"] == "Friction Force [N]"
 
 
+def test_the_force_in_another_unit_is_no_load(tmp_path):
+    def columns(one):
+        return [one.time_s, one.displacement_mm, one.force_N, one.force_N / 1000]
+
+    made = campaign(tmp_path, columns, "time_s,displacement_mm,force_N,force_kN\n")
+    assert "load_N" not in slots(made)
+
+
 def test_a_load_cell_along_the_motion_is_the_force_though_it_is_called_load(tmp_path):
     made = campaign(tmp_path, exports.slots, "Time,Extension,Load\n")
     assert slots(made)["force_N"] == "Load"
