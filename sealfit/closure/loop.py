@@ -36,7 +36,12 @@ from sealfit.engine.run_map import run_map
 from sealfit.fit.joint import Fitted, fit, fit_declared
 from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, SET_UP, Rows, make_rows, records
-from sealfit.fit.joint.set_ups import with_both_directions, with_set_ups, with_straight_loads
+from sealfit.fit.joint.set_ups import (
+    with_both_directions,
+    with_own_specimens,
+    with_set_ups,
+    with_straight_loads,
+)
 from sealfit.ingest.stored_parts import StoredTraces
 from sealfit.progress import Silent, timed
 
@@ -67,7 +72,10 @@ def close_loop(
     say = on_progress or Silent().say
     effects = EFFECTS | load_user_effects(config.loop.effects_folder)
     context = Context(config, effects, say, workers=workers)
-    columns, counted = list(bins.columns), with_straight_loads(numbered(bins.reset_index(drop=True)))
+    columns, named = list(bins.columns), with_straight_loads(numbered(bins.reset_index(drop=True)))
+    counted = with_own_specimens(named)
+    if counted is not named:
+        say("specimens of one name differ by condition: they count as other ones in each")
     bins = with_set_ups(counted)
     rows = make_rows(bins, has_aging=config.aging, speed_factor=config.units.speed_factor)
     outliers, fitted = outlier_files(rows)
@@ -81,7 +89,7 @@ def close_loop(
         rows = make_rows(grouped, has_aging=config.aging, campaign=rows)
     if SET_UP in rows.table:
         say("files of a specimen with the same repeat, or of both directions, scatter alike: one set-up")
-    del bins, counted, grouped  # they take much memory, and `rows` contains them
+    del bins, named, counted, grouped  # they take much memory, and `rows` contains them
     start = None
     for part in subsamples(rows, config.loop.seed):
         if not part.whole and start is None:  # a start from all strokes is better than from those searched

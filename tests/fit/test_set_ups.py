@@ -10,7 +10,7 @@ from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import SET_UP, make_rows
-from sealfit.fit.joint.set_ups import with_both_directions, with_set_ups
+from sealfit.fit.joint.set_ups import with_both_directions, with_own_specimens, with_set_ups
 
 SMALL = {"temperatures": (60.0,), "bins": 4}
 
@@ -163,3 +163,29 @@ def test_nothing_is_significant_where_only_set_ups_scatter():
     )
     assert sum(p < 0.005 for p in by_runs) >= 2  # by files, taken for independent
     assert min(by_set_ups) > 0.005
+
+
+# ---------------------------------------------------------------- specimens of one name in several conditions
+def two_of_each_condition(scatter: float, persistent: float) -> pd.DataFrame:
+    """Specimens 1 and 2 in every condition: other pieces with a `scatter`, or the same ones that differ."""
+    made = []
+    for number in (1, 2):
+        bins = make_bins(number, repeats=1, bins=4, gain=0.002, specimen=scatter)
+        bins["force_N"] *= 1 + persistent * number
+        own = {name: bins[name] + f" {number}" for name in ("file", "run_id")}
+        made.append(bins.assign(**own, specimen_id=str(number)))
+    return pd.concat(made, ignore_index=True)
+
+
+def test_specimens_numbered_anew_in_each_condition_are_other_ones():
+    bins = two_of_each_condition(0.02, 0.0)
+    found = with_own_specimens(bins)
+    assert found["specimen_id"].nunique() == 2 * bins["condition"].nunique()
+    assert found["specimen_id"].iloc[0] == f"1 in {bins['condition'].iloc[0]}"
+
+
+def test_specimens_that_differ_alike_in_all_conditions_are_the_same_ones():
+    bins = two_of_each_condition(0.0, 0.03)
+    assert with_own_specimens(bins) is bins
+    one = bins[bins["specimen_id"] == "1"]
+    assert with_own_specimens(one) is one

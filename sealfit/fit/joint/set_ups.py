@@ -1,4 +1,4 @@
-"""What is found in `bins` before the search: set-ups that several runs share, and loads without noise.
+"""What is found in `bins` before the search: specimens, set-ups that runs share, and loads without noise.
 
 Set-ups are the files of a specimen with the same repeat, if these scatter alike. A run is one set-up at one
 speed, and its repeats are recorded without a new one. If the specimen is mounted anew for every repeat
@@ -28,6 +28,30 @@ OF_THE_OTHERS_P = 0.05
 # Smallest scatter of set-ups, as a share of the force, that matters; below lies the rounding of equal files.
 LEAST_SET_UP = 1e-4
 ROUNDING = 1e-9  # Relative deviation of a load from its mean along a stroke that is rounding.
+
+
+def with_own_specimens(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return table `bins` with other specimens in each condition if those of one name differ by condition.
+
+    Their numbers may begin anew in each condition, or pieces are mounted anew after further aging. The
+    logarithms of the runs' mean forces are fitted by an effect of each setting (a condition, speed and
+    direction) and one of each specimen. The specimens are other ones if effects of each specimen in each
+    condition explain more by F.
+    """
+    name, condition = bins["specimen_id"].astype(str), bins["condition"].astype(str)
+    if name.nunique() < 2 or not (condition.groupby(name).nunique() > 1).any():
+        return bins
+    speed = np.sign(bins["speed_mm_s"]) * bins["speed_set_mm_s"].abs()
+    load = bins["load_N"].to_numpy(float) if "load_N" in bins and bins["load_N"].all() else 1.0
+    strokes = pd.DataFrame({"specimen": name, "own": name + " in " + condition})
+    strokes = strokes.assign(
+        setting=condition + speed.map(" at {:g}".format), force=bins["force_N"].abs() / load
+    )
+    runs = strokes.groupby([strokes["own"], bins["run_id"]])
+    runs = runs.agg({"specimen": "first", "own": "first", "setting": "first", "force": "mean"})
+    force = np.log(np.maximum(runs["force"].to_numpy(), 1e-300))
+    p_value, _ = _compared(force, [runs["setting"], runs["specimen"]], [runs["setting"], runs["own"]])
+    return bins if p_value >= SET_UP_P else bins.assign(specimen_id=strokes["own"])
 
 
 def with_set_ups(bins: pd.DataFrame) -> pd.DataFrame:
@@ -62,15 +86,22 @@ def _p_value(files: pd.DataFrame) -> tuple[float, pd.Series]:
     force = np.log(np.maximum(files["force"].to_numpy(), 1e-300))
     if alike and not (files["specimen"].nunique() == 1 and _may_be_mounts(files, force)):
         known.append(files["repeat"])
-    (before, few), (after, many) = _fitted(force, known), _fitted(force, [files["run"], files["set_up"]])
-    shown = pd.Series(before**2 - after**2, files.index).groupby(files["specimen"]).sum()
-    added = few - many
-    if added <= 0 or many <= 0:
+    p_value, explained = _compared(force, known, [files["run"], files["set_up"]])
+    return p_value, pd.Series(explained, files.index).groupby(files["specimen"]).sum()
+
+
+def _compared(
+    force: np.ndarray, few: Sequence[pd.Series], many: Sequence[pd.Series]
+) -> tuple[float, np.ndarray]:
+    """Return the p-value of `many` factors beside `few` by F, and what they explain of each force.
+
+    Forces have the shape (n,). The p-value is 1 for a negligible scatter.
+    """
+    (before, df), (after, left) = _fitted(force, few), _fitted(force, many)
+    shown, added = before**2 - after**2, df - left
+    if added <= 0 or left <= 0 or shown.sum() <= LEAST_SET_UP**2 * added:
         return 1.0, shown
-    explained, noise = shown.sum() / added, after @ after / many
-    if explained <= LEAST_SET_UP**2:
-        return 1.0, shown
-    return float(fdtrc(added, many, explained / max(noise, 1e-300))), shown
+    return float(fdtrc(added, left, shown.sum() / added / max(after @ after / left, 1e-300))), shown
 
 
 def _may_be_mounts(files: pd.DataFrame, force: np.ndarray) -> bool:
