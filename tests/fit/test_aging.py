@@ -298,16 +298,21 @@ def test_rubber_that_does_not_age_has_no_b(campaign):
 
 
 @pytest.mark.parametrize(
-    ("error", "says", "identified"), [(1e-3, "may come before 1 d", False), (0.2, "no aging is seen", True)]
+    ("error", "t", "says", "identified"),
+    [
+        (1e-3, 2.0, "may come before 1 d", False),
+        (0.2, 2.0, "no aging is seen", True),
+        (0.007, 12.7, "the loss is 0.148 up to 16 d, but with so few days a may be 0", True),
+    ],
 )
-def test_no_aging_is_said_only_where_no_loss_is_seen(error, says, identified):
+def test_no_aging_is_said_only_where_no_loss_is_seen(error, t, says, identified):
     """An interval of a that contains 0 may also be that of a loss before the first day tested."""
     found = Estimate(np.array([0.9, 0.02, np.log(0.01)]), np.diag([0.0, error**2, 0.0]), np.zeros(3))
     assert found.loss(16.0) == pytest.approx((0.02 * np.log1p(1600.0), error * np.log1p(1600.0)))
     curve = SimpleNamespace(days=[1.0, 16.0], unaged=True)
     ends = {"a": (-0.01, 0.05), "b": (0.0, 1.0), "c": (0.0, 1.0)}
-    assert says in _judge(curve, found, ends, 2.0)["a"][1]
-    assert _judge(curve, found, ends, 2.0)["a"][0] == identified
+    assert says in _judge(curve, found, ends, t)["a"][1]
+    assert _judge(curve, found, ends, t)["a"][0] == identified
 
 
 def test_a_loss_in_proportion_to_time_leaves_only_its_slope(campaign):

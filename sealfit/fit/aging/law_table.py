@@ -288,6 +288,8 @@ def _judge(curve: SeriesCurve, found: Estimate, ends: CurveInterval, t: float) -
         verdict["a"] = (False, why)
     elif ends["a"][0] <= 0.0 <= ends["a"][1]:
         why = f"no aging is seen up to {last:g} d: a may be 0, and b then has no meaning."
+        if abs(loss) > t_quantile(np.inf) * error:  # only few degrees of freedom hide it
+            why = f"the loss is {loss:.3g} up to {last:g} d, but with so few days a may be 0: test more days."
         verdict["a"] = (bool(np.all(np.isfinite(ends["a"]))), why)
     elif np.isinf(high):
         why = f"the loss may be linear up to {last:g} d: only its mean, {loss / last:.3g} per day, is "
