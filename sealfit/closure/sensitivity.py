@@ -355,13 +355,15 @@ def undetectable_variables(
 ) -> dict[str, bool]:
     """Return the variables whose effects are not detectable in this campaign.
 
-    The value is whether an error within the scatter of repeats does not exclude an effect: if specimens
-    scatter that strongly, as repeats are of one specimen, or if the model goes through the means of all runs.
+    The value is whether an error within the scatter of repeats does not exclude an effect: if repeats scatter
+    strongly, or specimens do, as repeats are of one specimen, or if the model goes through the means of all
+    runs.
 
     An effect is not detectable if it cannot reach the required p-value, and the variable varies along
     strokes, is the direction, or varies between fewer than five specimens; or if the units between which it
-    varies, or the rows of a stroke, scatter strongly, and an effect that explains all of that scatter would
-    not have been found. No effect between runs is detectable if the model goes through their means.
+    varies, their repeats, or the rows of a stroke, scatter strongly, and an effect that explains all of that
+    scatter would not have been found. No effect between runs is detectable if the model goes through their
+    means.
     """
     fitted = selection.after
     rows, starts = fitted.rows, fitted.rows.groups.starts
@@ -369,7 +371,7 @@ def undetectable_variables(
     sd_N = float(np.sqrt(rows.weight @ about_means(fitted.residual, rows, "stroke") ** 2))
     within_strokes = {"sd_N": sd_N, "sd_rel": sd_N / float(np.sqrt(rows.weight @ fitted.force**2))}
     in_model, through_runs = _channels_in_model(selection), degrees_of_freedom(fitted) == 0
-    undetectable = {}
+    undetectable, file = {}, rows.level_name("file")
     for entry in entries:
         if entry["variable"] == SPECIMEN:
             undetectable[SPECIMEN] = False
@@ -382,10 +384,16 @@ def undetectable_variables(
         along = channel.unit == "sample"
         count = None if along else starts[channel.unit].size
         own = [within_strokes] if along else [s for s in scatter if sizes[s["level"]] == count]
-        much = any(s["sd_rel"] > criteria.MATERIAL_SCATTER and s["sd_N"] < smallest for s in own)
+        repeats = [s for s in scatter if not along and s["level"] == file and sizes[file] > count]
+        much, of_repeats = _may_hide(smallest, own), _may_hide(smallest, repeats)
         few_specimens = channel.unit == "specimen" and count < criteria.LEAST_UNITS_OF_SLOPES
         decisive = along or channel.name == "direction" or few_specimens
         hidden = through_runs and channel.unit in ("run", "specimen")
-        if hidden or much or (decisive and not np.isfinite(smallest)):
-            undetectable[channel.name] = hidden or (much and channel.unit == "specimen")
+        if hidden or much or of_repeats or (decisive and not np.isfinite(smallest)):
+            undetectable[channel.name] = hidden or of_repeats or (much and channel.unit == "specimen")
     return undetectable
+
+
+def _may_hide(smallest_N: float, scatter: Sequence[dict]) -> bool:
+    """Return whether a scatter of some levels is strong, and its size would not be found as an effect."""
+    return any(s["sd_rel"] > criteria.MATERIAL_SCATTER and s["sd_N"] < smallest_N for s in scatter)

@@ -117,6 +117,14 @@ def test_specimens_that_scatter_much_hide_an_effect_between_them_from_repeats(sp
     assert any(undetectable.values()) == hidden
 
 
+@pytest.mark.parametrize(("gain", "hidden"), [(0.005, False), (0.1, True)])
+def test_repeats_that_scatter_much_hide_an_effect_between_runs_from_themselves(gain, hidden):
+    selection = searched(make_bins(3, repeats=2, bins=6, gain=gain))
+    scatter = scatter_list(selection.after)
+    undetectable = undetectable_variables(selection, sensitivity(selection, 0.005), scatter)
+    assert undetectable.get("speed_mm_s", False) == hidden
+
+
 @pytest.mark.parametrize("slope", [0.01, 0.2])
 def test_strokes_that_differ_much_hide_an_effect_along_them(slope):
     bins = make_bins(1, temperatures=(), speeds=(1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0), repeats=1, bins=6)
