@@ -366,7 +366,8 @@ def disagreements(entries: list[Entry], columns: Columns, conditions: list[str])
         other = first.setdefault((run[i], repeat[i], stroke[i]), i)
         if other != i:
             reason = f"repeat {repeat[i]} of run '{run[i]}' is there already: {_place(entries[other])}."
-            fix = "Give every file of a run its own repeat number, files of other runs a run_id each, and "
+            fix = "" if specimen[i] == specimen[other] else "Give each specimen a run_id of its own. "
+            fix += "Give every file of a run its own repeat number, files of other runs a run_id each, and "
             fix += "files with the strokes forward and back of one repeat the numbers 1 and 2 in a column "
             fix += "stroke. Is the speed of one of the two right?"
             if conditions[i].startswith(UNAGED):

@@ -343,7 +343,10 @@ def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) ->
     used = steady[steady["used"].to_numpy(bool)]
     aged = used["aging_days"] != 0 if aged_only else True
     files = used["file"].nunique()
-    fixed, faults = set(STEADY.names()) - set(HISTORY) - {"load_N"}, []
+    fixed, faults = (
+        {*STEADY.names(), "started_at"} - set(HISTORY) - {"load_N"},
+        [],
+    )  # HISTORY is of started_at
     for name in used.columns:
         if name in fixed:
             continue

@@ -112,7 +112,10 @@ def test_each_column_that_some_files_lack_is_said_once():
         oil=[1.0, np.nan, 7.0, 7.0, 7.0, 7.0], grade=["K", None, None, "L", "K", "K"], idle=[1.0] * 6
     )
     steady = steady.assign(
-        used=True, load_N=np.where(steady["file"] == "f3", np.nan, 2.0), run_order=[np.nan] + [1.0] * 11
+        used=True,
+        load_N=np.where(steady["file"] == "f3", np.nan, 2.0),
+        run_order=[np.nan] + [1.0] * 11,
+        started_at=[None] + ["2024-03-01T09:00:00"] * 11,
     )
     told = {fault.column: fault.reason for fault in incomplete_columns(steady)}
     assert set(told) == {"oil", "grade", "load_N", "run_order"}

@@ -49,6 +49,12 @@ def test_the_files_of_each_named_specimen_are_counted(tmp_path):
     assert "specimen_use" not in refs[0].channels
 
 
+def test_of_two_specimens_of_one_run_it_is_said_that_each_needs_its_own(tmp_path):
+    (fault,) = faults(campaign(tmp_path, FULL.replace("b.csv,r1,2,S1", "b.csv,r1,1,S3")))
+    assert fault.check == "duplicate_repeat"
+    assert fault.fix.startswith("Give each specimen a run_id of its own.")
+
+
 @pytest.mark.parametrize("change", [("a.csv", '"a.csv"'), ("B,42.5", "B,42.5,"), ("b.csv", " b.csv")])
 def test_a_table_that_must_be_read_line_by_line_says_what_a_plain_one_does(tmp_path, change):
     (tmp_path / "d").mkdir()
