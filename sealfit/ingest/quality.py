@@ -343,10 +343,9 @@ def incomplete_columns(steady: pd.DataFrame, aged_only: Collection[str] = ()) ->
     used = steady[steady["used"].to_numpy(bool)]
     aged = used["aging_days"] != 0 if aged_only else True
     files = used["file"].nunique()
-    fixed, faults = (
-        {*STEADY.names(), "started_at"} - set(HISTORY) - {"load_N"},
-        [],
-    )  # HISTORY is of started_at
+    # Of missing start times it is said what that does to `HISTORY`.
+    fixed = {*STEADY.names(), "started_at"} - set(HISTORY) - {"load_N"}
+    faults = []
     for name in used.columns:
         if name in fixed:
             continue
