@@ -135,13 +135,17 @@ def close_loop(
 
 
 def _unconfirmed(selection: Selection, after: Fitted) -> dict[str, Model]:
-    """Return the model after the loop with each significant effect that is in no model, by its label."""
+    """Return the model after the loop with each significant effect that is in no model, by its label.
+
+    An effect that is not finite at every bin, as a logarithm at 0, is left out.
+    """
     items = [item for item in (selection.inconclusive,) if item is not None]
     items += [item for item in selection.refused if not item.negligible]
-    found = {}
+    found, rows = {}, after.rows
     for proposal in (item.proposal for item in items):
         model = after.model.with_term(proposal.term, proposal.fitted.model.values[-1])
-        found[describe(proposal.term, after.rows)] = fit(model, after.rows, after.scatter, turns=1).model
+        if np.isfinite(evaluate(model, rows, jacobian=False)[0]).all():
+            found[describe(proposal.term, rows)] = fit(model, rows, after.scatter, turns=1).model
     return found
 
 
