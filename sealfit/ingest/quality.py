@@ -316,7 +316,8 @@ def shared_variance(one: np.ndarray, other: np.ndarray) -> float:
 def repeats_of_force(steady: pd.DataFrame) -> list[Fault]:
     """Return the columns of numbers that follow the force in all strokes; unused rows are left out."""
     used = steady[steady["used"].to_numpy(bool)]
-    load = used["load_N"].to_numpy(float) if "load_N" in used and used["load_N"].all() else np.ones(len(used))
+    load = used.get("load_N", pd.Series(1.0, used.index)).to_numpy(float)
+    load = load if np.isfinite(load).all() and load.all() else np.ones(len(used))
     forms, faults = forms_of_force(used["force_N"].to_numpy(float), load), []
     for name in used.columns.difference([*STEADY.names()]):
         if not pd.api.types.is_numeric_dtype(used[name]) or len(used) < LEAST_STROKES:

@@ -182,6 +182,7 @@ def test_specimens_numbered_anew_in_each_condition_are_other_ones():
     found = with_own_specimens(bins)
     assert found["specimen_id"].nunique() == 2 * bins["condition"].nunique()
     assert found["specimen_id"].iloc[0] == f"1 in {bins['condition'].iloc[0]}"
+    assert with_own_specimens(bins.assign(load_N=np.nan))["specimen_id"].equals(found["specimen_id"])
 
 
 def test_specimens_that_differ_alike_in_all_conditions_are_the_same_ones():

@@ -433,3 +433,5 @@ def test_columns_that_follow_the_force_in_all_strokes_are_named():
     steady = steady.assign(force_kN=np.round(np.abs(force) / 1000, 4), cof=force / 50, current_A=force**2)
     assert [fault.column for fault in repeats_of_force(steady)] == ["cof", "force_kN"]
     assert repeats_of_force(steady.head(5)) == []
+    unknown = steady.assign(load_N=np.nan)
+    assert [fault.column for fault in repeats_of_force(unknown)] == ["cof", "force_kN"]

@@ -42,11 +42,11 @@ def with_own_specimens(bins: pd.DataFrame) -> pd.DataFrame:
     if name.nunique() < 2 or not (condition.groupby(name).nunique() > 1).any():
         return bins
     speed = np.sign(bins["speed_mm_s"]) * bins["speed_set_mm_s"].abs()
-    load = bins["load_N"].to_numpy(float) if "load_N" in bins and bins["load_N"].all() else 1.0
-    strokes = pd.DataFrame({"specimen": name, "own": name + " in " + condition})
-    strokes = strokes.assign(
-        setting=condition + speed.map(" at {:g}".format), force=bins["force_N"].abs() / load
-    )
+    force = bins["force_N"].abs()
+    if "load_N" in bins and (bins["load_N"] != 0).all() and bins["load_N"].notna().all():
+        force = force / bins["load_N"].abs()
+    strokes = pd.DataFrame({"specimen": name, "own": name + " in " + condition, "force": force})
+    strokes["setting"] = condition + speed.map(" at {:g}".format)
     runs = strokes.groupby([strokes["own"], bins["run_id"]])
     runs = runs.agg({"specimen": "first", "own": "first", "setting": "first", "force": "mean"})
     force = np.log(np.maximum(runs["force"].to_numpy(), 1e-300))
