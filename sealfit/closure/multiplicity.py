@@ -11,7 +11,7 @@ import numpy as np
 from sealfit.closure import small_sample_test
 from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES, UNEQUAL_RUNS
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of_score, to_orthonormal
-from sealfit.closure.small_sample_test import ClusterTests, SmallSampleTest, effective_number, slope_log_p
+from sealfit.closure.small_sample_test import ClusterTests, ContrastTest, SmallSampleTest, slope_log_p
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import POWER
 
@@ -26,6 +26,10 @@ FLIPS = 1999  # Number of random sign flips, or draws, that are made at a time.
 # Their largest number: a p-value of 0.00125, four times which is 0.005, has an error of 13 %.
 MOST_FLIPS = 25 * FLIPS
 ENOUGH = 50  # Number of draws below the smallest p-value that determine it well enough.
+# Share of the variance of contrasts that their effective number of principal components has. In 99,000 draws
+# of noise (white, heavy-tailed, each unit with a slope of its own) in 22 designs, the smallest p-value of 90
+# to 500 contrasts, adjusted by this number and that of the places, was below 0.0023 in 0.1, 0.1 and 0.25 %.
+SHOWN_VARIANCE = 0.995
 # Variables of operation: a rig is built to show how friction depends on them. They are few, and an effect of
 # t = 10 between seven specimens was not significant among the contrasts of all columns. In 447 worlds without
 # an effect, drawn at random, two of their p-values were below 0.1: 7e-5 (0.001 among all contrasts), 0.013.
@@ -173,3 +177,15 @@ def number_of_contrasts(candidates: Sequence[Candidate]) -> np.ndarray:
     counts = np.array([effective_number(own) for own in shapes])
     counts += [sum(test.slope.size for test in own) for own in places]
     return (np.count_nonzero(counts) * counts)[family]
+
+
+def effective_number(tests: Sequence[ContrastTest]) -> int:
+    """Return the effective number of contrasts: principal components with `SHOWN_VARIANCE` of their variance.
+
+    Contrasts of one channel on several quantities are nearly the same. Source: Gao, Starmer & Martin (2008),
+    doi:10.1002/gepi.20310.
+    """
+    if not tests:
+        return 0
+    size = np.linalg.svd(np.concatenate([test.drawn for test in tests]), compute_uv=False) ** 2
+    return int(np.searchsorted(np.cumsum(size), SHOWN_VARIANCE * size.sum()) + 1)

@@ -13,7 +13,6 @@ from scipy.special import betainc, chdtrc, fdtrc
 from sealfit.closure import criteria
 from sealfit.closure.channels import FINER
 from sealfit.closure.small_sample_test import (
-    NOISE_DRAWS,
     ClusterTests,
     ContrastTest,
     SmallSampleTest,
@@ -44,6 +43,7 @@ from sealfit.fit.joint.variance_components import orthonormal
 # what is constant in them is tested against their own scatter (`small_sample`), and what varies within them
 # against the scatter of their slopes (`slopes`).
 
+NOISE_DRAWS = 300  # Number of draws of noise from which the effective number of contrasts follows, to 5 %.
 # A unit alone determines a direction if the eigenvalue of what is left without the unit is smaller.
 OWN = 1e-6
 # A direction of the tangent space with a smaller singular value lies in the specimens' own columns.
