@@ -33,7 +33,7 @@ from sealfit.ingest.quality import NO_VALUE
 BEYOND = 0.005  # Share of the largest tested value by which a point may exceed the range: rounded units.
 FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 NO_INTERVAL = "no interval: as many parameters in the model as runs; test more speeds"
-NOT_CONFIRMED = "not confirmed: {}; the interval holds the force with it and without"
+NOT_CONFIRMED = "not confirmed: {}; the interval holds the force with and without it"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
 
@@ -68,7 +68,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     if not model["scatter"]["of_specimens"]:
         _note(notes, good, TESTED_ONLY)
     if unconfirmed:
-        _note(notes, good, NOT_CONFIRMED.format(", ".join(one["label"] for one in model["unconfirmed"])))
+        _note(notes, good, NOT_CONFIRMED.format(" and ".join(one["label"] for one in model["unconfirmed"])))
     if model["df"] == 0:
         _note(notes, good, NO_INTERVAL)
     for jump, inside in _in_gaps(model["jumps"], after, table):
