@@ -85,14 +85,14 @@ def find_channels(
     Groupings are kept among `conditions`: an offset between directions may differ between these. One of them
     may be called `rubber`, as the column of table `bins` that has the names of rubbers.
     """
-    found = []
+    found, measured = [], open_columns(rows.table)
     own = [name for name in conditions if name == "rubber" and name in rows.table]
     for name in (name for name in [*rows.channels, *own] if name not in ignore):
         values = np.abs(rows.speed) if name == "speed_mm_s" else rows.values(name)
         if values.dtype.kind == "f":
             if not (np.isfinite(values).all() and varies(values)) or _one_setting(name, values):
                 continue
-            if _repeats_force(values, rows):
+            if name in measured and _repeats_force(values, rows):
                 continue
             values = settings(level_values(values, rows))
         elif not 2 <= np.unique(values).size <= criteria.MOST_LEVELS:
@@ -112,11 +112,11 @@ def _repeats_force(values: np.ndarray, rows: Rows) -> bool:
     They follow it, and within strokes its noise, which no cause of friction does.
     """
     inside = np.diff(rows.codes("stroke")) == 0
-    for form in forms_of_force(rows.force, rows.load):
-        noise = shared_variance(np.diff(values)[inside], np.diff(form)[inside]) if inside.any() else 0.0
-        if noise > criteria.SAME_NOISE and shared_variance(values, form) > criteria.SAME_AS_FORCE:
-            return True
-    return False
+    return inside.any() and any(
+        shared_variance(values, form) > criteria.SAME_AS_FORCE
+        and shared_variance(np.diff(values)[inside], np.diff(form)[inside]) > criteria.SAME_NOISE
+        for form in forms_of_force(rows.force, rows.load)
+    )
 
 
 def _one_setting(name: str, values: np.ndarray) -> bool:
