@@ -33,7 +33,7 @@ from sealfit.ingest.quality import NO_VALUE
 BEYOND = 0.005  # Share of the largest tested value by which a point may exceed the range: rounded units.
 FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 NO_INTERVAL = "no interval: as many parameters in the model as runs; test more speeds"
-NOT_CONFIRMED = "not confirmed: {}; the interval holds the force with and without it"
+NOT_CONFIRMED = "not confirmed: {}; the interval holds the force with and without each"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
 
 
@@ -292,7 +292,7 @@ def _with_unconfirmed(model: Model, at: Rows, ranges: dict) -> list[np.ndarray]:
     tried, or all its categories.
     """
     given, tried = {}, {}
-    for name in (own for own in model.terms[-1].channels if own not in ("direction", "speed_mm_s")):
+    for name in ranges.keys() & set(model.terms[-1].channels) - {"direction", "speed_mm_s"}:
         values = at.table.get(name, pd.Series(np.nan, at.table.index))
         if _is_range(ranges[name]):
             values = pd.to_numeric(values, errors="coerce").clip(*ranges[name])

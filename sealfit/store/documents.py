@@ -142,7 +142,15 @@ def _sizes_agree(model) -> bool:
         and all(_are_below(own, fitted) and _is_square(block, len(own)) for own, block in blocks)
         and all(own.effect < len(model.after.terms) for own in model.jumps)
         and all(own.parameter in model.after.terms[own.effect].values for own in model.jumps)
+        and all(_adds_one_term(own, model) for own in model.unconfirmed)
     )
+
+
+def _adds_one_term(own, model) -> bool:
+    """Return whether a model has the terms of that after the loop, and one more of known channels."""
+    *terms, last = [term.channels for term in own.terms]
+    known = {*model.ranges, "direction", "speed_mm_s", *model.config.condition, *model.config.rubber}
+    return terms == [term.channels for term in model.after.terms] and known.issuperset(last)
 
 
 CONDITIONS = record(

@@ -1,6 +1,7 @@
 import json
 
 import numpy as np
+import numpy.testing as npt
 import pytest
 from bins_helpers import TWO_FOLDS, make_bins, make_traces, with_another_curve
 
@@ -14,6 +15,20 @@ def of_three_speeds():
     """Bins at three speeds, and the model of them."""
     bins = make_bins(temperatures=(60.0,), speeds=(1.0, 8.0, 64.0), bins=4)
     return bins, close_loop(bins, make_traces(bins), TWO_FOLDS).model
+
+
+def test_an_effect_that_is_not_confirmed_is_of_a_column_that_was_tested(of_three_speeds):
+    bins, model = of_three_speeds
+    term = {"id": "linear", "acts_on": "mu", "operation": "multiply", "smoothness": None}
+    term |= {"channels": ["displacement_mm"], "fixed": {"x_ref": 0.0}, "values": {"A": 0.01}}
+    one = {"label": "linear in displacement_mm", "theta": model["after"]["theta"], "terms": [term]}
+    model = model | {"unconfirmed": [one], "first_started_at": None}
+    wider = predict(read_document("model", json.dumps(model)), bins.head(3))
+    lost = wider["force_after_N"] * 0.01 * bins["displacement_mm"].head(3)
+    npt.assert_array_less(lost, (wider["force_after_hi95_N"] - wider["force_after_N"]).abs())
+    for unknown in ({"channels": ["oil_ppm"]}, {"channels": []}):
+        with pytest.raises(ValueError, match="validation error"):
+            read_document("model", json.dumps(model | {"unconfirmed": [one | {"terms": [term | unknown]}]}))
 
 
 def test_between_three_speeds_the_force_is_not_known(of_three_speeds):
