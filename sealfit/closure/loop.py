@@ -38,8 +38,8 @@ from sealfit.fit.joint.model import Model, evaluate, shape_of
 from sealfit.fit.joint.rows import LEVELS, SET_UP, Rows, make_rows, records
 from sealfit.fit.joint.set_ups import (
     with_both_directions,
-    with_own_specimens,
     with_set_ups,
+    with_specimens_by_condition,
     with_straight_loads,
 )
 from sealfit.ingest.stored_parts import StoredTraces
@@ -73,9 +73,9 @@ def close_loop(
     effects = EFFECTS | load_user_effects(config.loop.effects_folder)
     context = Context(config, effects, say, workers=workers)
     columns, named = list(bins.columns), with_straight_loads(numbered(bins.reset_index(drop=True)))
-    counted = with_own_specimens(named)
+    counted = with_specimens_by_condition(named)
     if counted is not named:
-        say("specimens of one name differ by condition: they count as other ones in each")
+        say("specimens of the same name differ between conditions: they count as different ones in each")
     bins = with_set_ups(counted)
     rows = make_rows(bins, has_aging=config.aging, speed_factor=config.units.speed_factor)
     outliers, fitted = outlier_files(rows)
@@ -142,10 +142,11 @@ def _unconfirmed(selection: Selection, after: Fitted) -> dict[str, Model]:
     items = [item for item in (selection.inconclusive,) if item is not None]
     items += [item for item in selection.refused if not item.negligible]
     found, rows = {}, after.rows
-    for proposal in (item.proposal for item in items):
+    proposals = {describe(item.proposal.term, rows): item.proposal for item in items}  # refused in two rounds
+    for label, proposal in proposals.items():
         model = after.model.with_term(proposal.term, proposal.fitted.model.values[-1])
         if np.isfinite(evaluate(model, rows, jacobian=False)[0]).all():
-            found[describe(proposal.term, rows)] = fit(model, rows, after.scatter, turns=1).model
+            found[label] = fit(model, rows, after.scatter, turns=1).model
     return found
 
 

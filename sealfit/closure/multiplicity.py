@@ -174,8 +174,8 @@ def number_of_contrasts(candidates: Sequence[Candidate]) -> np.ndarray:
     shapes, places = ([], []), ([], [])
     for candidate, k in zip(candidates, family, strict=True):
         (places if candidate.place else shapes)[k].extend(candidate.test_result.slopes[:1])
-    counts = np.array([effective_number(own) for own in shapes])
-    counts += [sum(test.slope.size for test in own) for own in places]
+    counts = np.array([effective_number(tests) for tests in shapes])
+    counts += [sum(test.slope.size for test in tests) for tests in places]
     return (np.count_nonzero(counts) * counts)[family]
 
 

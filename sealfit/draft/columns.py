@@ -10,6 +10,7 @@ import numpy as np
 from sealfit.config import Strokes
 from sealfit.draft.dialect import Dialect
 from sealfit.draft.vocabulary import column_role, name_and_unit
+from sealfit.ingest.quality import shared_variance
 from sealfit.ingest.strokes import Stroke, find_strokes, several_speeds, turning_rows
 from sealfit.units import Unit, conversion, unit_of
 
@@ -200,15 +201,13 @@ def columns_of(dialect: Dialect, tables: Sequence[np.ndarray]) -> list[TraceColu
 
 def _same_signal(one: TraceColumn, other: TraceColumn) -> bool:
     a, b = one.values[0], other.values[0]
-    if rises(a) or rises(b) or np.ptp(a) == 0 or np.ptp(b) == 0:
-        return False
-    return abs(float(np.corrcoef(a, b)[0, 1])) > COPY
+    return not rises(a) and not rises(b) and shared_variance(a, b) > COPY**2
 
 
 def _follows(column: TraceColumn, force: TraceColumn) -> bool:
     """Whether a column is the force in another unit or filtered: no load sensor follows it so closely."""
     both = zip(column.values, force.values, strict=True)
-    return all(np.ptp(a) > 0 and np.ptp(b) > 0 and abs(np.corrcoef(a, b)[0, 1]) > FOLLOWS for a, b in both)
+    return all(shared_variance(a, b) > FOLLOWS**2 for a, b in both)
 
 
 def find_roles(columns: Sequence[TraceColumn]) -> Roles:

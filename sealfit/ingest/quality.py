@@ -297,7 +297,7 @@ def quality_table(faults: Sequence[Fault], files: Sequence[str]) -> pd.DataFrame
 
 
 # Least squared correlation of means over strokes with the force from which a column seems to repeat it.
-SAME_AS_FORCE = 0.9999
+FOLLOWS_FORCE = 0.9999
 LEAST_STROKES = 8  # Number of strokes from which that is said.
 
 
@@ -324,9 +324,9 @@ def repeats_of_force(steady: pd.DataFrame) -> list[Fault]:
             continue
         values = used[name].to_numpy(float)
         share = max(shared_variance(values, form) for form in forms) if np.isfinite(values).all() else 0.0
-        if share > SAME_AS_FORCE:
+        if share > FOLLOWS_FORCE:
             reason = f"it follows the force in all strokes (r = {np.sqrt(share):.6f}). "
-            reason += "Where it follows its noise too, the search for effects leaves it out."
+            reason += "If it also follows the noise of the force, the search for effects leaves it out."
             fix = "If it is computed from the force, list it under loop.ignore_channels."
             faults.append(Fault("repeats_force", reason, column=name, fix=fix, **KEPT))
     return faults

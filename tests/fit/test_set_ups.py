@@ -10,7 +10,7 @@ from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import SET_UP, make_rows
-from sealfit.fit.joint.set_ups import with_both_directions, with_own_specimens, with_set_ups
+from sealfit.fit.joint.set_ups import with_both_directions, with_set_ups, with_specimens_by_condition
 
 SMALL = {"temperatures": (60.0,), "bins": 4}
 
@@ -179,14 +179,14 @@ def two_of_each_condition(scatter: float, persistent: float) -> pd.DataFrame:
 
 def test_specimens_numbered_anew_in_each_condition_are_other_ones():
     bins = two_of_each_condition(0.02, 0.0)
-    found = with_own_specimens(bins)
+    found = with_specimens_by_condition(bins)
     assert found["specimen_id"].nunique() == 2 * bins["condition"].nunique()
     assert found["specimen_id"].iloc[0] == f"1 in {bins['condition'].iloc[0]}"
-    assert with_own_specimens(bins.assign(load_N=np.nan))["specimen_id"].equals(found["specimen_id"])
+    assert with_specimens_by_condition(bins.assign(load_N=np.nan))["specimen_id"].equals(found["specimen_id"])
 
 
 def test_specimens_that_differ_alike_in_all_conditions_are_the_same_ones():
     bins = two_of_each_condition(0.0, 0.03)
-    assert with_own_specimens(bins) is bins
+    assert with_specimens_by_condition(bins) is bins
     one = bins[bins["specimen_id"] == "1"]
-    assert with_own_specimens(one) is one
+    assert with_specimens_by_condition(one) is one

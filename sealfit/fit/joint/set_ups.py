@@ -30,13 +30,13 @@ LEAST_SET_UP = 1e-4
 ROUNDING = 1e-9  # Relative deviation of a load from its mean along a stroke that is rounding.
 
 
-def with_own_specimens(bins: pd.DataFrame) -> pd.DataFrame:
-    """Return table `bins` with other specimens in each condition if those of one name differ by condition.
+def with_specimens_by_condition(bins: pd.DataFrame) -> pd.DataFrame:
+    """Return table `bins` with different specimens in each condition if those of the same name differ there.
 
-    Their numbers may begin anew in each condition, or pieces are mounted anew after further aging. The
-    logarithms of the runs' mean forces are fitted by an effect of each setting (a condition, speed and
-    direction) and one of each specimen. The specimens are other ones if effects of each specimen in each
-    condition explain more by F.
+    Specimens may be numbered anew in each condition, or mounted anew after further aging. The logarithms of
+    the runs' mean forces are fitted by an effect of each setting (a condition, speed and direction) and one
+    of each specimen. The specimens are different ones if effects of each specimen in each condition explain
+    more by F.
     """
     name, condition = bins["specimen_id"].astype(str), bins["condition"].astype(str)
     if name.nunique() < 2 or not (condition.groupby(name).nunique() > 1).any():
