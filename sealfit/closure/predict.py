@@ -29,6 +29,7 @@ from sealfit.ingest.cells import OVERLOAD
 from sealfit.ingest.columns import add_keys, condition_columns
 from sealfit.ingest.derived_columns import with_day_0
 from sealfit.ingest.quality import NO_VALUE
+from sealfit.units import other_unit
 
 BEYOND = 0.005  # Share of the largest tested value by which a point may exceed the range: rounded units.
 FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
@@ -123,16 +124,25 @@ def _complete(points: pd.DataFrame, model: dict, after: Model, config: Config) -
             continue
         tested = ranges.get(name)
         one_value = tested is not None and len(tested) == 2 and tested[0] == tested[1]
-        if one_value and name not in config.condition:
+        unit = config.units.of(name)
+        others = _in_other_units(points, name, unit)
+        if one_value and name not in config.condition and not others:
             table[name] = tested[0]
             continue
-        unit = config.units.of(name)
-        fix = f"Add the column{f' in {unit}' if unit else ''}"
+        fix = f"Convert {others[0]}" if others else "Add the column"
+        fix += f" {'to' if others else 'in'} {unit}" if unit else ""
         fix += f"; tested from {tested[0]:g} to {tested[1]:g}." if _is_range(tested) else "."
         raise RequestError("is missing, and the model needs it.", column=name, fix=fix)
     if "speed_mm_s" not in table:
         table["speed_mm_s"] = ranges["speed_mm_s"][0]
     return table
+
+
+def _in_other_units(points: pd.DataFrame, name: str, unit: str) -> list[str]:
+    """Return the columns that hold the quantity of a column in another unit, such as load_kN for load_N."""
+    words = {str(column): str(column).partition("_") for column in points}
+    alike = [column for column, word in words.items() if word[0] == name.partition("_")[0]]
+    return [column for column in alike if unit and other_unit(words[column][2].replace("_", "/"), unit)]
 
 
 def _with_derived(table: pd.DataFrame, model: dict) -> pd.DataFrame:

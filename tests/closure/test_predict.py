@@ -7,6 +7,7 @@ from bins_helpers import TWO_FOLDS, make_bins, make_traces, with_another_curve
 
 from sealfit.closure.loop import close_loop
 from sealfit.closure.predict import predict
+from sealfit.errors import RequestError
 from sealfit.store.documents import read_document
 
 
@@ -52,6 +53,17 @@ def test_a_point_with_an_infinite_number_has_no_answer(of_three_speeds):
             answer = predict(model, points.assign(**{name: value}))
             assert answer["force_after_N"].isna().all()
             assert answer["note"].str.contains(f"{name} must be a").all()
+
+
+@pytest.mark.parametrize(("column", "refused"), [("load_kN", True), ("load_cell", False), ("load_V", False)])
+def test_a_load_in_another_unit_is_not_taken_for_the_tested_one(of_three_speeds, column, refused):
+    bins, model = of_three_speeds
+    points = bins.head(2).drop(columns="load_N").assign(**{column: 0.05})
+    if refused:
+        with pytest.raises(RequestError, match=f"load_N.*Convert {column} to N; tested from"):
+            predict(model, points)
+    else:
+        assert np.isfinite(predict(model, points)["force_after_N"]).all()
 
 
 def test_unaged_rubber_may_be_named_as_in_a_runs_table():
