@@ -24,10 +24,12 @@ from page_helpers import (
     ran,
     run,
 )
+from pydantic import TypeAdapter
 
 from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.effects.user import load_user_effects
 from sealfit.report.summary import verdict_sentence
+from sealfit.store.documents import CLOSURE
 from sealfit.units import Units
 
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.parent.name != "paper")
@@ -156,6 +158,17 @@ def test_the_verdicts_that_a_page_quotes_are_said_so():
 def test_every_column_of_predictions_is_explained():
     page = (DOCS / "reference/results.md").read_text("utf-8")
     assert {name for name in ANSWERS if f"`{name}`" not in page} == set()
+
+
+def test_every_key_of_closure_json_is_explained():
+    page = (DOCS / "reference" / "closure.md").read_text("utf-8")
+    rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| `")]
+    listed = {key for row in rows for key in re.findall(r"`(\w+)`", row[0])}
+    shape = TypeAdapter(CLOSURE).json_schema()
+    records = [shape, *shape["$defs"].values()]
+    keys = {key for record in records for key in record["properties"]}
+    assert listed <= keys
+    assert keys <= set(re.findall(r"`(\w+)`", page))
 
 
 def test_generated_pages_are_up_to_date():
