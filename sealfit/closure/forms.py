@@ -263,7 +263,7 @@ def periodic_terms(
         yield Term(effect, (peak.axis,), *target, fixed=fixed), names, candidate
         for name in CHANGES_A_WAVE:
             if name in channels:
-                own = {**fixed, "z_ref": reference(rows.unsigned(name))}
+                own = {**fixed, "z_ref": 0.0 if name == "direction" else reference(rows.unsigned(name))}
                 yield Term(changing, (peak.axis, name), *target, fixed=own), names, candidate
 
 

@@ -38,7 +38,7 @@ class Peak:
 
     axis: str  # displacement_mm | time_s
     wavelength: float
-    sign_symmetric: bool  # True: same force in both directions (added force); False: signed (factor)
+    sign_symmetric: bool  # False: with the sign of the direction (factor); True: added force
     common_phase: bool
     statistic: float
     p_value: float  # adjusted over frequencies, axes and modes
@@ -166,49 +166,64 @@ def _coherent(spectrum: Spectrum) -> list[Peak]:
 def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
     """Return the best wave of few periods per stroke, per mode, unless a smooth curve is as likely.
 
-    The mean over files of the amplitudes of sine and cosine is tested against their scatter (Hotelling's T
-    squared). Nearly all of what any curve of the position that all files share explains must be the wave, and
-    a curve along the travel, as of warming, must explain less.
+    The modes are the same force in both directions, that with the sign of the direction, and a force in one
+    direction only. The mean over files of the amplitudes of sine and cosine is tested against their scatter
+    (Hotelling's T squared). Nearly all of what any curve of the position that all files share explains must
+    be the wave, and a curve along the travel, as of warming, must explain less.
     """
     strokes = AxisStrokes.of(samples, "displacement_mm")
-    units, unit = np.unique(strokes.unit, return_inverse=True)
-    if units.size < criteria.LEAST_GROUPS_HELD_OUT:
+    if not strokes.size.size:
         return []
-    span, low, high = np.median(strokes.span), strokes.low.min(), (strokes.low + strokes.span).max()
+    units, unit = np.unique(strokes.unit, return_inverse=True)
+    sides, side = np.unique(strokes.direction, return_inverse=True)
+    span = np.median(strokes.span)
     waves = np.array([m for m in LONG_WAVES if all(abs(m - span / length) > MAIN_LOBE for length in known)])
     if not waves.size:
         return []
     pairs = np.arange(2 * waves.size).reshape(2, -1).T  # columns of each wave's sine and cosine
     curve = pairs.size + np.arange(CURVE_DEGREE)
     travel = curve[-1] + 1 + np.arange(TRAVEL_DEGREES.size)
-    square, own_square = np.zeros((travel[-1] + 1, travel[-1] + 1)), np.zeros((units.size, waves.size, 2, 2))
-    product = np.zeros((units.size, 2, len(square)))  # with the residual, and with it times the direction
-    for k, own in enumerate(unit):
-        (place, value), direction = strokes.along(k), strokes.direction[k]
-        turn = 2 * np.pi * place[:, None] * waves / span
-        of_place = legvander(2 * (place - low) / (high - low) - 1, CURVE_DEGREE)[:, 1:]
-        of_travel = legvander(direction * _even(place), TRAVEL_DEGREES[-1])[:, TRAVEL_DEGREES]
-        every = np.column_stack([np.sin(turn), np.cos(turn), of_place, of_travel, value])
-        flat = _flattened(place, every)
-        gram = flat.T @ flat
-        square += gram[:-1, :-1]
-        own_square[own] += gram[pairs[:, :, None], pairs[:, None, :]]
-        product[own] += np.outer([1, direction], gram[-1, :-1])
+    size = travel[-1] + 1
+    square, product = np.zeros((sides.size, size, size)), np.zeros((sides.size, units.size, size))
+    own_square = np.zeros((sides.size, units.size, waves.size, 2, 2))
+    for k, place in enumerate(zip(side, unit, strict=True)):
+        gram = _long_wave_gram(strokes, k, waves / span)
+        square[place[0]] += gram[:-1, :-1]
+        product[place] += gram[-1, :-1]
+        own_square[place] += gram[pairs[:, :, None], pairs[:, None, :]]
     peaks = []
-    by_travel = max(_explained(square, own, travel) for own in product.sum(axis=0))
-    for mode in range(min(np.unique(strokes.direction).size, 2)):
-        explained = partial(_explained, square, product[:, mode].sum(axis=0))
+    modes = np.array([[1, 1], sides, [1, 0], [0, 1]]) if sides.size > 1 else np.ones((1, 1))
+    sums = [(np.tensordot(mode**2, square, 1), np.tensordot(mode, product, 1)) for mode in modes]
+    by_travel = max(_explained(own, along.sum(axis=0), travel) for own, along in sums)
+    for mode, (own, along) in zip(modes, sums, strict=True):
+        explained = partial(_explained, own, along.sum(axis=0))
         by_wave = np.array([explained(pair) for pair in pairs])
         best = int(np.argmax(by_wave))
         if by_wave[best] < max(WAVE_OF_CURVE * explained(curve), by_travel):
             continue
-        amplitudes = np.linalg.pinv(own_square[:, best]) @ product[:, mode, pairs[best], None]
-        statistic, p = _mean_of_zero(amplitudes[:, :, 0])
+        normal = np.tensordot(mode**2, own_square[:, :, best], 1)
+        seen = normal.any(axis=(1, 2))
+        if seen.sum() < criteria.LEAST_GROUPS_HELD_OUT:
+            continue
+        amplitudes = (np.linalg.pinv(normal[seen]) @ along[seen][:, pairs[best], None])[:, :, 0]
+        statistic, p = _mean_of_zero(amplitudes)
         length = span / _summit(waves, by_wave, best)
-        p *= 2 * waves.size  # wavelengths and modes
-        energy = float(np.linalg.norm(amplitudes.mean(axis=0))) ** 2 * unit.size
-        peaks.append(Peak("displacement_mm", length, mode == 0, True, statistic, p, energy))
+        p *= len(modes) * waves.size
+        energy = float(np.linalg.norm(amplitudes.mean(axis=0))) ** 2 * (mode[side] != 0).sum()
+        same = bool(mode.sum())  # not the sign of the direction
+        peaks.append(Peak("displacement_mm", length, same, True, statistic, p, energy))
     return peaks
+
+
+def _long_wave_gram(strokes: AxisStrokes, k: int, frequency: np.ndarray) -> np.ndarray:
+    """Return a stroke's Gram matrix of sines, cosines, curves of place and of travel, and the residual."""
+    place, value = strokes.along(k)
+    low, high = strokes.low.min(), (strokes.low + strokes.span).max()
+    turn = 2 * np.pi * place[:, None] * frequency
+    of_place = legvander(2 * (place - low) / (high - low) - 1, CURVE_DEGREE)[:, 1:]
+    of_travel = legvander(strokes.direction[k] * _even(place), TRAVEL_DEGREES[-1])[:, TRAVEL_DEGREES]
+    flat = _flattened(place, np.column_stack([np.sin(turn), np.cos(turn), of_place, of_travel, value]))
+    return flat.T @ flat
 
 
 def _explained(square: np.ndarray, product: np.ndarray, columns: np.ndarray) -> float:

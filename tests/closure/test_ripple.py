@@ -158,6 +158,20 @@ def test_a_wave_of_few_periods_per_stroke_is_found(wavelength, back):
     assert peak.p_value < 1e-6
 
 
+def backward_only(shape, each):
+    """Strokes both ways, with a shape in backward ones."""
+    samples, without = (short_strokes(shape=own, each=each, back=True) for own in (shape, None))
+    return samples.where(samples["direction"] < 0, without)
+
+
+def test_a_wave_of_few_periods_in_one_direction_is_found():
+    samples = backward_only(lambda x, _: 0.2 * np.sin(2 * np.pi * x / 3.1), each=0.1)
+    peak = find_ripple(samples, common_phase=True)
+    assert (peak.axis, peak.common_phase, peak.sign_symmetric) == ("displacement_mm", True, True)
+    assert peak.wavelength == pytest.approx(3.1, rel=0.03)
+    assert peak.p_value < 1e-6
+
+
 SMOOTH = {
     "warming": lambda _, travelled: 2.0 * np.exp(-travelled / 2.0),
     "the rest of a rise": lambda _, travelled: -np.exp(-travelled / 0.7),
@@ -170,8 +184,9 @@ SMOOTH = {
 @pytest.mark.parametrize("back", [False, True])
 @pytest.mark.parametrize("shape", SMOOTH)
 def test_a_smooth_shape_of_all_strokes_is_no_wave(shape, back):
-    peak = find_ripple(short_strokes(shape=SMOOTH[shape], each=0.1, back=back), common_phase=True)
-    assert peak.p_value > 1e-3
+    samples = short_strokes(shape=SMOOTH[shape], each=0.1, back=back)
+    for own in (samples, backward_only(SMOOTH[shape], each=0.1)) if back else (samples,):
+        assert find_ripple(own, common_phase=True).p_value > 1e-3
 
 
 @pytest.mark.long
