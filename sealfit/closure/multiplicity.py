@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import log_ndtr, polygamma, psi, stdtr
 
 from sealfit.closure import small_sample_test
 from sealfit.closure.criteria import JACKKNIFE_UNITS, SEARCHES, UNEQUAL_RUNS
 from sealfit.closure.score_test import Candidate, ScoreTestResult, ScoreTests, log_p_of_score, to_orthonormal
-from sealfit.closure.small_sample_test import ClusterTests, ContrastTest, SmallSampleTest, slope_log_p
+from sealfit.closure.small_sample_test import ClusterTests, ContrastTest, SmallSampleTest
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import POWER
 
@@ -189,3 +191,79 @@ def effective_number(tests: Sequence[ContrastTest]) -> int:
         return 0
     size = np.linalg.svd(np.concatenate([test.drawn for test in tests]), compute_uv=False) ** 2
     return int(np.searchsorted(np.cumsum(size), SHOWN_VARIANCE * size.sum()) + 1)
+
+
+# ---------------------------------------------------------------- moderated variances
+# All contrasts of one kind give a prior for their variances: moderated t (Smyth 2004,
+# doi:10.2202/1544-6115.1027). Its degrees of freedom are limited by the number of independent directions of
+# the scores. An effect is part of the scatter of all other contrasts, so the own variance alone is used, too:
+# the p-value is twice the smaller of the two.
+
+MOST_DF = 1e4  # Largest degrees of freedom of a prior. With more, the variance counts as known.
+# Number of variances a contrast is tested against: moderated, and its own. Each has half the error rate.
+N_VARIANCES = 2
+
+
+def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
+    """Return two-sided log p-values of several candidates' contrasts, not adjusted for their number."""
+    found = []
+    for test, (variance, df) in zip(tests, moderated(tests), strict=True):
+        logs = [log_p_of_t(test.slope / np.sqrt(v), d) for v, d in ((variance, df), (test.variance, test.df))]
+        found.append(np.minimum(np.log(N_VARIANCES) + np.minimum(*logs), 0.0))
+    return found
+
+
+def moderated(tests: Sequence[ContrastTest]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the variances of each test's contrasts, moderated by all of one kind, and degrees of freedom."""
+    priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
+    found = []
+    for test in tests:
+        variance, known = np.array([priors[test.level, bool(a)] for a in test.along]).T
+        df = test.df + known
+        found.append(((known * variance + test.df * test.variance) / df, df))
+    return found
+
+
+def log_p_of_t(t: np.ndarray, df: np.ndarray) -> np.ndarray:
+    """Return the two-sided log p-value of Student's t, shape of `t`."""
+    tail = np.log(np.maximum(stdtr(df, -np.abs(t)), 1e-300))
+    return np.log(2) + np.where(df >= MOST_DF, log_ndtr(-np.abs(t)), tail)
+
+
+def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> tuple[float, float]:
+    """Return the prior variance of contrasts of one kind, and its degrees of freedom.
+
+    They follow from the moments of their log variances without sampling error (Smyth 2004, 6.2).
+    """
+    chosen = [(t, t.along == along) for t in tests if t.level == level]
+    variance = np.concatenate([t.variance[own] for t, own in chosen])
+    df = np.concatenate([t.df[own] for t, own in chosen])
+    deviations = np.concatenate([t.deviations[:, own] for t, own in chosen], axis=1)
+    half = df / 2
+    logs = np.log(np.maximum(variance, 1e-12)) - psi(half) + np.log(half)
+    mean = float(np.mean(logs))
+    spread = float(np.var(logs, ddof=1) - np.mean(polygamma(1, half))) if logs.size > 1 else 0.0
+    known = _degrees_of_freedom(spread)
+    half = known / 2
+    typical = float(np.exp(mean + (psi(half) - np.log(half) if known < MOST_DF else 0.0)))
+    return typical, min(known, (_independent_directions(deviations) - 1) * float(np.median(df)))
+
+
+def _degrees_of_freedom(spread: float) -> float:
+    """Return d such that the logarithm of a scaled inverse chi-squared of d degrees has this variance."""
+    if spread <= polygamma(1, MOST_DF / 2):
+        return MOST_DF
+    if spread >= polygamma(1, 1e-3):
+        return 0.0
+    root = brentq(lambda x: polygamma(1, np.exp(x)) - spread, np.log(1e-3), np.log(MOST_DF / 2))
+    return float(2 * np.exp(root))
+
+
+def _independent_directions(deviations: np.ndarray) -> float:
+    """Return the effective number of independent columns of scores: (tr R)^2 / tr R^2, at least 1."""
+    size = np.sqrt((deviations**2).sum(axis=0))
+    standardised = deviations[:, size > 0] / size[size > 0]
+    if standardised.shape[1] == 0:
+        return 1.0
+    inner = standardised @ standardised.T  # tr R^2 is the same for the smaller product
+    return float(max(standardised.shape[1] ** 2 / (inner**2).sum(), 1.0))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -142,32 +142,35 @@ class ScoreTests:
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
         self.cluster_tests = {level: ClusterTests(fitted, level) for level in LEVELS}
+        self.other = np.empty((fitted.force.size, 0))  # columns beside which others are tested
         self.cache = Cache()
 
-    def variants(
-        self, columns: np.ndarray, unit: str, beside: np.ndarray | None = None
-    ) -> tuple[np.ndarray, ...]:
+    def beside(self, columns: np.ndarray) -> ScoreTests:
+        """Return these tests beside other columns of the force, shape (n, m), which are fitted as well."""
+        own = copy(self)
+        own.other = orthonormal(project(self.fitted, columns), OWN)
+        own.fitted = self.fitted.beside(own.other)
+        return own
+
+    def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:
         """Return the columns of a channel, shape (n, k), in each variant in which they must be significant.
 
-        The first variant is projected, also off the columns `beside`, shape (n, m). If the scatter of
-        specimens is not known, another is also projected off the specimens' own columns: a channel that
-        varies between runs would explain that scatter. The same holds for a few runs, or set-ups, and a
-        channel that varies between files.
+        The first variant is projected. If the scatter of specimens is not known, another is also projected
+        off the specimens' own columns: a channel that varies between runs would explain that scatter. The
+        same holds for a few runs, or set-ups, and a channel that varies between files.
         """
         left = project(self.fitted, columns)
-        if beside is not None:
-            other = orthonormal(project(self.fitted, beside), OWN)
-            left = _distinct(left - other @ (other.T @ left), left)
-        levels = [name for name in self._of_unknown_scatter if FINER[unit] < FINER[name]]
+        left = _distinct(left - self.other @ (self.other.T @ left), left)
+        levels = [name for name in self._of_unknown_scatter() if FINER[unit] < FINER[name]]
         own = map(self._own_columns, levels)
         return left, *(_distinct(basis.project_out(c.project_out(left)), left) for c, basis in own)
 
-    @cached_property
+    @cached
     def _noise(self) -> np.ndarray:
         """Draws of whitened noise, shape (n, draws)."""
         return np.random.default_rng(0).standard_normal((self.fitted.rows.force.size, NOISE_DRAWS))
 
-    @cached_property
+    @cached
     def _of_unknown_scatter(self) -> list[str]:
         """The levels whose groups scatter by an unknown amount."""
         starts = self.fitted.rows.groups.starts
@@ -208,7 +211,8 @@ class ScoreTests:
             if test is None:
                 return weakest
             return weakest._replace(chi2=test.chi2, df=test.basis.shape[1], small_sample=test)
-        tests = tuple(contrast_test(self.fitted, left, between, self._noise) for left in variants)
+        given = between, self._noise(), self.other
+        tests = tuple(contrast_test(self.fitted, left, *given) for left in variants)
         if any(test is None for test in tests):
             return None
         constant = self._test_of_constants(variants, target, between) if between in ("file", "run") else None
@@ -287,7 +291,8 @@ class ScoreTests:
         fitted, start = self.fitted, self.fitted.rows.groups.starts[level]
         units, k = start.size, left.shape[1]
         parts = np.split(left, start[1:])
-        inverse, product = self._without(level)
+        inverse = self._without(level)
+        product = fitted.basis.sums(fitted.rows.groups, level, fitted.white_residual).values
         own = np.add.reduceat(left * fitted.white_residual[:, None], start)
         bases = np.split(fitted.basis.values, start[1:])
         mixed = np.stack([b.T @ c for b, c in zip(bases, parts, strict=True)])
@@ -301,11 +306,10 @@ class ScoreTests:
         return _log(fdtrc(k, units - k, t * (units - k) / (k * (units - 1))))
 
     @cached
-    def _without(self, level: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return per unit the inverse of 1 - B'B, shape (units, k, k), and B'r, (units, k), in its block."""
+    def _without(self, level: str) -> np.ndarray:
+        """Return the inverse of 1 - B'B of each unit in its block of the basis, shape (units, k, k)."""
         share, axes = self.fitted.unit_shares(level)
-        groups, residual = self.fitted.rows.groups, self.fitted.white_residual
-        return _inverse_of(1 - share, axes), self.fitted.basis.sums(groups, level, residual).values
+        return _inverse_of(1 - share, axes)
 
 
 def _log(p_value: float) -> float:

@@ -202,11 +202,9 @@ def _tested(
     parts: Sequence[slice],
     unit: str,
     between: str,
-    beside: np.ndarray | None = None,
 ) -> Iterator[Candidate]:
-    """Yield a candidate for each part of the columns of `whole` that can be tested beside other columns."""
-    slope = tests.fitted.slope(*whole.target)[:, None]
-    variants = tests.variants(whole.columns * slope, unit, None if beside is None else beside * slope)
+    """Yield a candidate for each part of the columns of `whole` that can be tested."""
+    variants = tests.variants(whole.columns * tests.fitted.slope(*whole.target)[:, None], unit)
     for part in parts:
         test_result = tests([v[:, part] for v in variants], between, whole.unit, whole.target)
         if test_result is not None:
@@ -300,7 +298,8 @@ def _pair_candidates(tests: ScoreTests, one: Channel, other: Channel) -> list[Ca
     for target in MAIN_TARGETS:
         if "load_N" not in (one.name, other.name) or target[0] != "force":
             whole = Candidate((one.name, other.name), *target, level, shapes, NOT_TESTED, pair=True)
-            found += _tested(tests, whole, parts, finer, between, alone)
+            own = tests.beside(alone * tests.fitted.slope(*target)[:, None])
+            found += _tested(own, whole, parts, finer, between)
     return found
 
 

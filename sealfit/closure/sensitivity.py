@@ -19,18 +19,22 @@ from sealfit.closure import criteria
 from sealfit.closure.channels import FINER, Channel, scatter_level, too_short
 from sealfit.closure.confirm import about_means, error_of_rise_N
 from sealfit.closure.errors_and_intervals import degrees_of_freedom
-from sealfit.closure.multiplicity import critical_many, critical_small_sample, number_of_contrasts
+from sealfit.closure.multiplicity import (
+    N_VARIANCES,
+    critical_many,
+    critical_small_sample,
+    moderated,
+    number_of_contrasts,
+)
 from sealfit.closure.score_test import Candidate, ScoreTests, project
 from sealfit.closure.selection import Selection
 from sealfit.closure.small_sample_test import (
-    N_VARIANCES,
     ClusterTests,
     ContrastTest,
     SmallSampleTest,
     contrast_test,
     enough_specimens,
     least_share,
-    moderated,
 )
 from sealfit.fit.joint import Fitted
 from sealfit.fit.joint.rows import ALONG, LEVELS

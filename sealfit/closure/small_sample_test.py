@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import chdtrc, fdtrc, log_ndtr, polygamma, psi, stdtr
+from scipy.special import chdtrc, fdtrc
 
 from sealfit.closure import criteria
 from sealfit.fit.joint import Fitted
@@ -28,14 +26,8 @@ from sealfit.fit.joint.whitening import Whitening
 #
 # .. math:: V = \sum_u \frac{(s_u - h_u \hat\beta)^2}{1 - h_u}, \quad h_u = L_u^T L_u ,
 #
-# (CR2; Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181) with Satterthwaite's degrees of freedom. All
-# contrasts of one kind give a prior for V: moderated t (Smyth 2004, doi:10.2202/1544-6115.1027). Its degrees
-# of freedom are limited by the number of independent directions of the scores. An effect is part of the
-# scatter of all other contrasts, so V alone is used as well: the p-value is twice the smaller of the two.
+# (CR2; Bell & McCaffrey 2002, Survey Methodology 28(2), 169-181) with Satterthwaite's degrees of freedom.
 
-MOST_DF = 1e4  # Largest degrees of freedom of a prior. With more, the variance counts as known.
-# Number of variances a contrast is tested against: moderated, and its own. Each has half the error rate.
-N_VARIANCES = 2
 # Smallest variance of a contrast, so that one of noise-free data, 0 of 0, has the p-value 1.
 LEAST_VARIANCE = 1e-300
 
@@ -54,12 +46,17 @@ class ContrastTest(NamedTuple):
 
 
 def contrast_test(
-    fitted: Fitted, left: np.ndarray, level: str, noise: np.ndarray | None = None
+    fitted: Fitted,
+    left: np.ndarray,
+    level: str,
+    noise: np.ndarray | None = None,
+    other: np.ndarray | None = None,
 ) -> ContrastTest | None:
     """Return the contrasts of projected columns, one by one, in units of a level; None with too few.
 
     The columns of the force, shape (n, k), are whitened and projected; columns of zeros are ignored. `noise`
-    has draws of whitened noise, shape (n, draws).
+    has draws of whitened noise, shape (n, draws). Orthonormal columns `other`, shape (n, m), have been taken
+    out of both the columns and the residual.
     """
     groups = fitted.rows.groups
     if groups.starts[level].size < criteria.LEAST_UNITS_OF_SLOPES:
@@ -71,8 +68,11 @@ def contrast_test(
     leverage = groups.sums(left**2, level)
     slope = left.T @ fitted.white_residual
     scores = groups.sums(left * fitted.unit_residual(level)[:, None], level)
-    deviations = (scores - leverage * slope) / np.sqrt(1 - np.minimum(leverage, criteria.LARGEST_LEVERAGE))
-    df = satterthwaite_df(leverage)
+    shared = np.zeros((*leverage.shape, 0 if other is None else other.shape[1]))
+    for k in range(shared.shape[2]):
+        shared[:, :, k] = groups.sums(left * other[:, [k]], level)
+    deviations = (scores - leverage * slope) / np.sqrt(own_share(leverage, shared))
+    df = satterthwaite_df(leverage, shared)
     known = df >= criteria.LEAST_DF
     if not known.any():
         return None
@@ -84,14 +84,28 @@ def contrast_test(
     return ContrastTest(level, *parts, deviations[:, known], drawn, agree[known])
 
 
-def satterthwaite_df(leverage: np.ndarray) -> np.ndarray:
+def own_share(leverage: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """Return the share of each unit's variance that the contrast and other columns leave, shape (units, m).
+
+    `shared`, shape (units, m, columns), are the products of the contrast and the columns within each unit.
+    """
+    taken = leverage + (shared**2).sum(axis=2) / np.maximum(leverage, 1e-300)
+    return 1 - np.minimum(taken, criteria.LARGEST_LEVERAGE)
+
+
+def satterthwaite_df(leverage: np.ndarray, shared: np.ndarray | None = None) -> np.ndarray:
     """Return the degrees of freedom of CR2 variances of contrasts, shape (m,), from leverages, (units, m).
 
-    The leverages of a contrast add up to 1, or are all 0: its variance is 0 then, and known.
+    The leverages of a contrast add up to 1, or are all 0: its variance is 0 then, and known. For `shared` see
+    `own_share`.
     """
-    shared = leverage**2 / (1 - np.minimum(leverage, criteria.LARGEST_LEVERAGE))
-    inverse = (leverage**2).sum(axis=0) + shared.sum(axis=0) ** 2 - (shared**2).sum(axis=0)
-    return 1 / np.maximum(inverse, 1e-300)
+    shared = np.empty((*leverage.shape, 0)) if shared is None else shared
+    both = np.concatenate([leverage[:, :, None], shared], axis=2)
+    both /= np.sqrt(own_share(leverage, shared))[:, :, None]
+    # Sum of the squared elements of the covariance outside its diagonal, which is the leverage.
+    products = np.einsum("umi,umj->mij", both, both)
+    outside = (products**2).sum(axis=(1, 2)) - ((both**2).sum(axis=2) ** 2).sum(axis=0)
+    return 1 / np.maximum((leverage**2).sum(axis=0) + outside, 1e-300)
 
 
 def specimens_agree(fitted: Fitted, left: np.ndarray) -> np.ndarray:
@@ -187,71 +201,6 @@ def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
     sums = fitted.rows.groups.sums
     between = sums(left, "stroke") ** 2 / sums(np.ones(len(left)), "stroke")[:, None]
     return between.sum(axis=0) < 0.5 * (left**2).sum(axis=0)
-
-
-def slope_log_p(tests: Sequence[ContrastTest]) -> list[np.ndarray]:
-    """Return two-sided log p-values of several candidates' contrasts, not adjusted for their number."""
-    found = []
-    for test, (variance, df) in zip(tests, moderated(tests), strict=True):
-        logs = [log_p_of_t(test.slope / np.sqrt(v), d) for v, d in ((variance, df), (test.variance, test.df))]
-        found.append(np.minimum(np.log(N_VARIANCES) + np.minimum(*logs), 0.0))
-    return found
-
-
-def moderated(tests: Sequence[ContrastTest]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the variances of each test's contrasts, moderated by all of one kind, and degrees of freedom."""
-    priors = {kind: _prior(tests, *kind) for kind in {(t.level, bool(a)) for t in tests for a in t.along}}
-    found = []
-    for test in tests:
-        variance, known = np.array([priors[test.level, bool(a)] for a in test.along]).T
-        df = test.df + known
-        found.append(((known * variance + test.df * test.variance) / df, df))
-    return found
-
-
-def log_p_of_t(t: np.ndarray, df: np.ndarray) -> np.ndarray:
-    """Return the two-sided log p-value of Student's t, shape of `t`."""
-    tail = np.log(np.maximum(stdtr(df, -np.abs(t)), 1e-300))
-    return np.log(2) + np.where(df >= MOST_DF, log_ndtr(-np.abs(t)), tail)
-
-
-def _prior(tests: Sequence[ContrastTest], level: str, along: bool) -> tuple[float, float]:
-    """Return the prior variance of contrasts of one kind, and its degrees of freedom.
-
-    They follow from the moments of their log variances without sampling error (Smyth 2004, 6.2).
-    """
-    chosen = [(t, t.along == along) for t in tests if t.level == level]
-    variance = np.concatenate([t.variance[own] for t, own in chosen])
-    df = np.concatenate([t.df[own] for t, own in chosen])
-    deviations = np.concatenate([t.deviations[:, own] for t, own in chosen], axis=1)
-    half = df / 2
-    logs = np.log(np.maximum(variance, 1e-12)) - psi(half) + np.log(half)
-    mean = float(np.mean(logs))
-    spread = float(np.var(logs, ddof=1) - np.mean(polygamma(1, half))) if logs.size > 1 else 0.0
-    known = _degrees_of_freedom(spread)
-    half = known / 2
-    typical = float(np.exp(mean + (psi(half) - np.log(half) if known < MOST_DF else 0.0)))
-    return typical, min(known, (_independent_directions(deviations) - 1) * float(np.median(df)))
-
-
-def _degrees_of_freedom(spread: float) -> float:
-    """Return d such that the logarithm of a scaled inverse chi-squared of d degrees has this variance."""
-    if spread <= polygamma(1, MOST_DF / 2):
-        return MOST_DF
-    if spread >= polygamma(1, 1e-3):
-        return 0.0
-    root = brentq(lambda x: polygamma(1, np.exp(x)) - spread, np.log(1e-3), np.log(MOST_DF / 2))
-    return float(2 * np.exp(root))
-
-
-def _independent_directions(deviations: np.ndarray) -> float:
-    """Return the effective number of independent columns of scores: (tr R)^2 / tr R^2, at least 1."""
-    size = np.sqrt((deviations**2).sum(axis=0))
-    standardised = deviations[:, size > 0] / size[size > 0]
-    if standardised.shape[1] == 0:
-        return 1.0
-    inner = standardised @ standardised.T  # tr R^2 is the same for the smaller product
-    return float(max(standardised.shape[1] ** 2 / (inner**2).sum(), 1.0))
 
 
 # ---------------------------------------------------------------- small sample test

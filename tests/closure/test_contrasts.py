@@ -8,15 +8,10 @@ from scipy import stats
 
 from sealfit.closure.channels import find_channels, level_values, scatter_level, settings, unit_of
 from sealfit.closure.loop import close_loop
+from sealfit.closure.multiplicity import log_p_of_t, slope_log_p
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search, search_pairs
-from sealfit.closure.small_sample_test import (
-    ContrastTest,
-    contrast_test,
-    log_p_of_t,
-    slope_log_p,
-    specimens_agree,
-)
+from sealfit.closure.small_sample_test import ContrastTest, contrast_test, specimens_agree
 from sealfit.fit.joint import fit_declared
 from sealfit.fit.joint.rows import make_rows
 

@@ -17,9 +17,10 @@ from sealfit.closure.multiplicity import (
     adjust_small_sample,
     critical_many,
     number_of_contrasts,
+    slope_log_p,
 )
 from sealfit.closure.score_test import Candidate, ScoreTestResult, log_p_of_score, to_orthonormal
-from sealfit.closure.small_sample_test import ContrastTest, SmallSampleTest, slope_log_p
+from sealfit.closure.small_sample_test import ContrastTest, SmallSampleTest
 from sealfit.closure.small_sample_test import log_p_of_numbers as small_sample_log_p
 
 NOWHERE = -1e-9  # log of a p-value of 1

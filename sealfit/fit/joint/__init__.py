@@ -94,6 +94,16 @@ class Fitted:
         """Return another model fitted to the same rows, to be compared: scatter and friction are the same."""
         return fit(model, self.rows, self.scatter, turns=0, loads=self.loads)
 
+    def beside(self, columns: np.ndarray) -> Fitted:
+        """Return this fit with whitened columns, shape (n, m), taken out of the residual.
+
+        They are orthonormal and off the tangent space, which is the same.
+        """
+        own = replace(self, white_residual=self.white_residual - columns @ (columns.T @ self.white_residual))
+        vars(own)["basis"] = self.basis
+        own.cache.update({key: value for key, value in self.cache.items() if key[0] != "unit_residual"})
+        return own
+
     @cached
     def slope(self, acts_on: str, operation: str) -> np.ndarray:
         """Return the force's derivative dF/dh for the shape h of a term not yet in the model, shape (n,)."""
