@@ -97,13 +97,27 @@ def test_one_contrast_of_equal_units_is_students_t():
     units = rows.groups.starts["run"].size
     left = np.tile(np.linspace(-1, 1, 8), rows.force.size // 8)[:, None]
     noise = rng.normal(size=rows.force.size)
-    bare = replace(fitted, white_residual=noise)
-    bare.__dict__["_widened"] = {"run": noise}  # nothing was taken out of the units
-    test = contrast_test(bare, left, "run")
+    test = contrast_test(replace(fitted, white_residual=noise), left, "run")
     scores = rows.groups.sums(left[:, 0] * noise, "run") / np.sqrt((left**2).sum())
     wanted = stats.ttest_1samp(scores, 0.0)
     npt.assert_allclose(test.slope / np.sqrt(test.variance), wanted.statistic, rtol=1e-9)
     npt.assert_allclose(test.df, units - 1, rtol=1e-9)
+
+
+def test_a_contrast_of_two_groups_beside_their_mean_is_the_t_test_of_two_samples():
+    rng = np.random.default_rng(0)
+    rows = make_rows(make_bins(0, days=(1.0, 4.0), speeds=FEW_SPEEDS, bins=8), has_aging=True)
+    units = rows.groups.starts["run"].size
+    second = (np.arange(units) % 2)[rows.codes("run")]
+    along = np.tile(np.linspace(-1, 1, 8), rows.force.size // 8)
+    fitted = replace(fit_declared(rows), white_residual=5.0 * second * along + rng.normal(size=along.size))
+    mean = along[:, None] / np.linalg.norm(along)
+    left = (2.0 * second - 1.0)[:, None] * mean
+    test = contrast_test(fitted.beside(mean), left, "run", other=mean)
+    scores = rows.groups.sums(along * fitted.white_residual, "run")
+    wanted = stats.ttest_ind(scores[1::2], scores[::2])
+    npt.assert_allclose(test.slope / np.sqrt(test.variance), wanted.statistic, rtol=1e-9)
+    npt.assert_allclose(test.df, units - 2, rtol=1e-9)
 
 
 def test_moderated_p_values_are_uniform_where_every_unit_has_its_own_slope():
