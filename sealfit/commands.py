@@ -140,7 +140,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
     StaleError if the fits of the model are stale. RequestError if the request does not fit the campaign.
     """
     from sealfit.fit.aging.joint_law import rivals_of
-    from sealfit.fit.aging.lifetime import answer, excluded, finite_ends, goal_of, over_laws
+    from sealfit.fit.aging.lifetime import answer, finite_ends, goal_of, over_laws, unknown_scatter
 
     store = Store.open(out)
     require_model(asked.model)
@@ -157,7 +157,7 @@ def lifetime(out: Path, asked: LifetimeRequest) -> dict:
             chosen["ci95_over_laws"] = finite_ends(over_laws(laws, goal, **place))
     model = asked.model if store.state.properties is None else None  # a property has one model only
     said = {"out": str(store.out), "quantity": asked.quantity, "model": model, "effects": taken_out}
-    said["notes"] = [*notes, *excluded(laws[0])]
+    said["notes"] = [*notes, *unknown_scatter(laws[0])]
     before = None
     if taken_out:
         with suppress(RequestError):  # the declared model may have no answer where this one has

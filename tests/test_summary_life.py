@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sealfit.fit.aging.joint_law import Aged, fit_laws, rivals_of
-from sealfit.fit.aging.lifetime import Goal, answer, excluded, finite_ends, over_laws
+from sealfit.fit.aging.lifetime import Goal, answer, finite_ends, over_laws, unknown_scatter
 from sealfit.report.summary_lines import lifetime_lines
 
 DAYS = np.array([0.0, *[1.0, 2.0, 4.0, 8.0, 12.0, 16.0] * 3])
@@ -67,8 +67,15 @@ def test_a_remark_on_the_values_stands_above_the_life(laws):
     assert "\nnote        mu_s is the mean coefficient over these speeds.\nlife " in text
 
 
-def test_a_law_with_as_many_parameters_as_days_excludes_the_scatter_of_specimens(laws):
-    few = fit_laws(Aged(np.array([0.0, 2.0, 8.0]), np.array([0.93, 0.85, 0.8])))
-    text = said(few, Goal(0.82), notes=excluded(few[0]))
-    assert "mu_s is known without the scatter between specimens" in text
-    assert excluded(laws[0]) == []
+def test_a_law_with_as_many_parameters_as_days_has_an_interval_only_if_specimens_are_known_to_scatter(laws):
+    days, values = np.array([0.0, 2.0, 8.0]), np.array([0.93, 0.85, 0.8])
+    few = fit_laws(Aged(days, values))
+    text = said(few, Goal(0.82), notes=unknown_scatter(few[0]))
+    assert "mu_s is of unknown uncertainty" in text
+    assert "95 %" not in text
+    known = fit_laws(Aged(days, values, specimens=(0.02, 3.0)))
+    assert unknown_scatter(known[0]) == []
+    life = answer(known[0], Goal(0.82))
+    assert 0 < life["ci95"][0] < 0.7 * life["days"]
+    assert (known[0].df, known[0].scatter) == (3.0, 0.02)
+    assert unknown_scatter(laws[0]) == []

@@ -283,6 +283,9 @@ def line(title: str, text: str) -> str:
     return f"{title:<11} {text}"
 
 
+OPEN = [0.0, None]  # an interval that excludes nothing
+
+
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
@@ -298,7 +301,7 @@ def lifetime_lines(part: Mapping) -> list[str]:
     law = f"{part['quantity']} = {part['form']}, {_change(part)}"
     found.append(line("law", f"{law}; it {clause}" if clause else law))
     found += [line("note", f"{part['quantity']} is {note}") for note in part["notes"]]
-    if part.get("ci95_over_laws") and part["rivals"] and part["days"] != 0:
+    if part.get("ci95_over_laws") and part["rivals"] and part["days"] != 0 and part["ci95"] != OPEN:
         found.append(line("life", _life({**part, "ci95": part["ci95_over_laws"]})))
         found.append(line("", "the interval is over all laws, weighted by their BIC"))
         found.append(line("", f"95 % interval if this law is true: {_days_between(part['ci95'])}"))
@@ -339,12 +342,13 @@ def _life(part: Mapping) -> str:
         beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
         ends = _degrees(part["temperature_ci95"])
         return f"it lasts {years} at {part['temperature_C']:.1f} degC{ends}{beyond}"
-    ends = "" if part["ci95"] in ([None, None], [0, 0]) else f", 95 % {_days_between(part['ci95'])}"
+    no_ends = part["ci95"] in ([None, None], [0, 0], OPEN)
+    ends = "" if no_ends else f", 95 % {_days_between(part['ci95'])}"
     if part["days"] is None:
         return f"{part['threshold']:.4g} is not reached within 1e9 d{ends}"
     if part["days"] == 0:
         return f"unaged rubber is already beyond {part['threshold']:.4g}{ends}"
-    text = f"{part['days']:.3g} d to {part['threshold']:.4g}, 95 % {_days_between(part['ci95'])}"
+    text = f"{part['days']:.3g} d to {part['threshold']:.4g}{ends}"
     if part["beyond_tests"] is not None and part["beyond_tests"] > 1:
         text += f" (extrapolated: {part['beyond_tests']:.2g} times the longest test)"
     if part["outside"]:

@@ -99,11 +99,14 @@ def _fit_rubber(steady_fit: SteadyFit) -> LawRows:
     series = list(dict.fromkeys(own.loc[own["aging_days"].to_numpy(float) > 0, "series"]))
     found = found.assign(moved=np.nan_to_num(moved))
     covariance = steady_covariance(found, steady_fit["steady_covariance"])
-    return laws_of_series(found, series, pair, covariance, specimens=_specimens_of(found, own, covariance))
+    return laws_of_series(found, series, pair, covariance, specimens=specimens_of(found, own, covariance))
 
 
-def _specimens_of(found: pd.DataFrame, own: pd.DataFrame, covariance: csr_array) -> Specimens:
-    """Return what the steady fits know of the scatter of specimens: it is in their `se` only."""
+def specimens_of(found: pd.DataFrame, own: pd.DataFrame, covariance: csr_array) -> Specimens:
+    """Return what the steady fits `own` know of the scatter of specimens: it is in their `se` only.
+
+    `found` are their values, with `quantity`, and `covariance`, shape (n, n), is that without specimens.
+    """
     df = own.loc[own["parameter"] == "specimen_df", "value"].max()
     if not df > 0:
         return {}

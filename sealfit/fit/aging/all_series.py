@@ -21,7 +21,7 @@ from scipy.special import fdtrc
 
 from sealfit.config import Config
 from sealfit.errors import FitError, RequestError
-from sealfit.fit.aging import steady_covariance
+from sealfit.fit.aging import specimens_of, steady_covariance
 from sealfit.fit.aging.joint_law import DRIVERS, Aged, JointLaw, fit_laws, left_out, rivals_of
 from sealfit.fit.aging.law import Values, fit_law, law_model
 from sealfit.fit.joint.declared import series_of_curve
@@ -192,15 +192,22 @@ def aged_values(steady: pd.DataFrame, steady_fit: SteadyFit) -> AgedValues:
     levels, covariance = shared_levels(steady, steady_fit)
     rubber, quantity = levels["rubber"], levels["quantity"]
     order, found = [*FORCES, *FORCES.values()], {}
+    fit = steady_fit["steady_fit"]
     for name in sorted(set(rubber)):
+        own = fit[fit["rubber"] == name]
+        alone = own[(own["quantity"] == "steady") & own["parameter"].isin(order) & own["se"].notna()]
+        alone = alone.assign(quantity=alone["parameter"])
+        within = steady_covariance(alone, steady_fit["steady_covariance"])
+        specimens = specimens_of(alone, own, within)
         for one in sorted(set(quantity[rubber == name]), key=order.index):
             here = ((rubber == name) & (quantity == one)).to_numpy()
-            found[name, one] = aged_of(levels[here], covariance[here][:, here])
+            known = specimens.get(one)
+            found[name, one] = aged_of(levels[here], covariance[here][:, here], specimens=known)
     return found
 
 
 def aged_of(rows: pd.DataFrame, covariance, **scatter) -> Aged:
-    """Return the values of table rows with the condition's columns; `scatter` is as in `Measured`."""
+    """Return the values of table rows with the condition's columns; `scatter` is as in `Aged`."""
     known = []
     for name in (TEMPERATURE, COMPRESSION):
         known.append(rows[name].to_numpy(float) if name in rows and rows[name].notna().any() else None)

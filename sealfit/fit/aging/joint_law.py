@@ -45,6 +45,8 @@ class Aged(Measured):
     temperature_C: np.ndarray | None = None  # not used for unaged specimens; None if unknown
     compression_ratio_pct: np.ndarray | None = None  # the same; height in percent
     variance: np.ndarray | csr_array | None = None  # of measurement, or its covariance, (n, n); None if 0
+    # Relative scatter between specimens and its degrees of freedom, for laws that leave no residual.
+    specimens: tuple[float, float] | None = None
 
     def part(self, keep: np.ndarray) -> "Aged":
         """Return the values in a mask, shape (n,)."""
@@ -145,7 +147,13 @@ class JointLaw:
     @property
     def df(self) -> float:
         """Degrees of freedom of intervals of the law's values: those of the scatter that they contain."""
-        return self.aged.df(self.aged.value.size - self.x.size, self.scatter, level=True)
+        return self._df(level=True)
+
+    def _df(self, *, level: bool) -> float:
+        left = self.aged.value.size - self.x.size
+        if left <= 0 and self.aged.specimens:
+            left = self.aged.specimens[1]
+        return self.aged.df(left, self.scatter, level=level)
 
     @property
     def t(self) -> float:
@@ -216,7 +224,7 @@ class JointLaw:
 
         Without a loss (a may be 0) its shape, E and kappa have no meaning.
         """
-        df = self.aged.df(self.aged.value.size - self.x.size, self.scatter, level=False)
+        df = self._df(level=False)
         t = float(t_quantile(max(df, 1)))
         lost = bool(abs(self.x[1]) > t * np.sqrt(self.covariance[1, 1]))
         for k, name in enumerate(self.names):
@@ -346,6 +354,8 @@ def fit_joint_law(aged: Aged, loss: str = "log", acts_on: str = "rate") -> Joint
         before, scatter = scatter, paule_mandel(chi2, aged.value.size - len(names), relative)
         if abs(scatter - before) <= CONVERGED * before:
             break
+    if aged.value.size <= len(names) and aged.specimens:
+        scatter = aged.specimens[0]
     white = aged.whitening(scatter)
     chi2 = float(((white @ (aged.value - empty.at(aged, x))) ** 2).sum())
     bic = chi2 + log_determinant(white) + len(names) * float(np.log(aged.value.size))

@@ -82,6 +82,8 @@ def lifetime(
     else:  # the start or the limit of the law may lie on the other side of the threshold
         low, high = (float(end) for end in np.quantile(_drawn(law, goal, place), ENDS, method=OF_DRAWS))
     low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
+    if law.df <= 0:
+        low, high = 0.0, np.inf
     asked = days * float(law.factors(place)[0][0])
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
     return DaysToThreshold(days, low, high, threshold, beyond, _outside(law, place))
@@ -266,11 +268,12 @@ def goal_of(threshold: float | None, loss_pct: float | None) -> Goal:
     return Goal(threshold) if loss_pct is None else Goal(loss=loss_pct / 100)
 
 
-def excluded(law: JointLaw) -> list[str]:
-    """Return a note on what the intervals of a law exclude; none if they include the scatter of specimens."""
+def unknown_scatter(law: JointLaw) -> list[str]:
+    """Return a note if a law has no interval, as nothing shows the scatter of specimens; else none."""
     if law.df > 0:
         return []
-    return ["known without the scatter between specimens: the law has as many parameters as days"]
+    why = "the law has as many parameters as days, and the scatter of specimens is not known"
+    return [f"of unknown uncertainty: {why}. Test more days, or two specimens of a condition"]
 
 
 def answer(
@@ -320,7 +323,7 @@ def answer(
         "beyond_tests": _finite(life.beyond),
         "outside": list(life.outside),
     }
-    if resample and 0 < life.days < FOREVER:
+    if resample and law.df > 0 and 0 < life.days < FOREVER:
         found["ci95_resampled"] = finite_ends(resampled(law, goal, temperature_C, compression_ratio_pct))
     return found
 
