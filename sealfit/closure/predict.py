@@ -36,6 +36,7 @@ FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 NO_INTERVAL = "no interval: as many parameters in the model as runs; test more speeds"
 NOT_CONFIRMED = "not confirmed: {}; the interval holds the force with and without each"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
+BETWEEN_DAYS = "no interval: these days were not tested, and the scatter of specimens is not known"
 
 
 def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None = None) -> pd.DataFrame:
@@ -66,8 +67,11 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
     code = np.where([bool(note) for note in notes], -1, code)
     good = code >= 0
     answer = np.full((len(table), len(FORCE_COLUMNS)), np.nan)
+    untested = np.zeros(len(table), dtype=bool)  # days between the tested ones, of which there is no specimen
     if not model["scatter"]["of_specimens"]:
-        _note(notes, good, TESTED_ONLY)
+        untested = good & (code >= len(model["conditions"]["condition"]))
+        _note(notes, good & ~untested, TESTED_ONLY)
+        _note(notes, untested, BETWEEN_DAYS)
     if unconfirmed:
         _note(notes, good, NOT_CONFIRMED.format(" and ".join(one["label"] for one in model["unconfirmed"])))
     if model["df"] == 0:
@@ -99,6 +103,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         spread = reach * np.sqrt((half / reach) ** 2 + one)
         forces = (before_N, mean, least - half, most + half)
         answer[good] = np.column_stack([*forces, least - spread, most + spread])
+        answer[untested, 2:] = np.nan
     return points.reset_index(drop=True).assign(
         **dict(zip(FORCE_COLUMNS, answer.T, strict=True)),
         extrapolated=extrapolated & ~np.isnan(answer[:, 1]),  # of `force_after_N`

@@ -55,6 +55,20 @@ def test_a_point_with_an_infinite_number_has_no_answer(of_three_speeds):
             assert answer["note"].str.contains(f"{name} must be a").all()
 
 
+def test_days_between_the_tested_ones_have_an_interval_only_if_the_scatter_of_specimens_is_known():
+    bins = make_bins(temperatures=(60.0,), days=(2.0, 8.0), bins=4)
+    model = close_loop(bins, make_traces(bins), TWO_FOLDS).model
+    assert not model["scatter"]["of_specimens"]
+    point = bins[bins["aging_days"] == 2].head(1)
+    tested, between = (predict(model, point.assign(aging_days=days)).iloc[0] for days in (2.0, 4.0))
+    ends = ["force_after_lo95_N", "force_after_hi95_N", "meas_lo95_N", "meas_hi95_N"]
+    assert np.isfinite(tested[ends].astype(float)).all()
+    assert "hold for the tested ones" in tested["note"]
+    assert between[ends].isna().all()
+    assert between["force_after_N"] < tested["force_after_N"]
+    assert "no interval: these days were not tested" in between["note"]
+
+
 @pytest.mark.parametrize(("column", "refused"), [("load_kN", True), ("load_cell", False), ("load_V", False)])
 def test_a_load_in_another_unit_is_not_taken_for_the_tested_one(of_three_speeds, column, refused):
     bins, model = of_three_speeds
