@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure.channels import too_short
-from sealfit.closure.confirm import AcceptedEffect, added_force
+from sealfit.closure.confirm import added_force
 from sealfit.closure.criteria import IDENTIFIABLE
 from sealfit.closure.forms import AGING, describe, grid_of, reference
 from sealfit.closure.left_out import OutlierFile
+from sealfit.closure.linearised import Proposal
 from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects.contract import CHANNEL, Effect
@@ -23,7 +24,7 @@ from sealfit.fit.joint.model import Model, Term, evaluate, mean_derivatives
 from sealfit.fit.joint.rows import ALONG, POWER, Rows, sliding_power
 from sealfit.fit.joint.search import bounds_of
 from sealfit.ingest.columns import condition_columns
-from sealfit.tables import HISTORY
+from sealfit.tables import CALENDAR, HISTORY
 
 # ---------------------------------------------------------------- aliases
 # A sensor offset in a campaign with one direction is the same as friction; a drift over time, with one
@@ -99,7 +100,8 @@ def _alias(fitted: Fitted, term: Term, values: Mapping[str, float], column: np.n
 
 
 # ---------------------------------------------------------------- next runs
-BEYOND = 0.5  # Share of a channel's range by which a run may exceed it.
+BEYOND = 0.5  # Share of the calendar's range, or that of the days, by which a run may exceed it.
+MOST_REFUSED = 2  # Refused effects for which a run is proposed.
 SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
 DISTINCT = 0.1  # Least difference between two models that a run is to show, as a share of the RMSE.
 TIE = 1e-9  # Relative difference below which two runs differ by rounding only.
@@ -115,17 +117,26 @@ SECOND_SPECIMEN = (
     "would show the scatter of specimens, which these do not determine, and no interval has it: "
     "another specimen of a tested condition"
 )
+UNDECIDED = (
+    "would show effects of {}, which these files do not decide: another specimen of each tested condition, "
+    "here first"
+)
 ONE_ORDER = 0.99  # Rank correlation above which a channel follows another one.
 ROWS = 4  # Rows per stroke at which forces are compared.
 
 
 def next_runs(
-    selection: Selection, config: Config, effects: Mapping[str, Effect], outliers: Sequence[OutlierFile] = ()
+    selection: Selection,
+    config: Config,
+    effects: Mapping[str, Effect],
+    outliers: Sequence[OutlierFile] = (),
+    undecided: Sequence[str] = (),
 ) -> list[dict]:
     """Return the runs that would distinguish effects from rivals, and those that would show aliases.
 
     The runs of files that were left out come first: they are to be repeated. Then there is a run for each
-    effect, which would distinguish it from its nearest rival, and a run for each alias, which would show it.
+    effect, which would distinguish it from its nearest rival, runs for effects that were not confirmed and
+    for `undecided` variables, and a run for each alias, which would show it.
 
     Returns
     -------
@@ -147,11 +158,18 @@ def next_runs(
                 why = f"{tested}would distinguish {forms}: they differ there by {size}"
                 wanted.append({"why": why, "conditions": conditions})
     if selection.inconclusive is not None:
-        wanted.append(_replicate_of(selection.inconclusive, config))
+        wanted.append(_replicate_of(selection.inconclusive.proposal, config))
+    refused = [item for item in selection.refused if not item.negligible]
+    wanted += [_replicate_of(item.proposal, config, item.reason) for item in refused[:MOST_REFUSED]]
     rows = selection.after.rows
-    if rows.has_aging and not selection.after.knows_specimens:
+    if not selection.after.knows_specimens:
         last = rows.table.iloc[int(np.argmax(rows.days))]
         wanted.append({"why": SECOND_SPECIMEN, "conditions": _settings(last, condition_columns(config))})
+    elif undecided:
+        condition = rows.table.groupby("condition")["specimen_id"].nunique().idxmin()
+        first = rows.table[rows.table["condition"] == condition].iloc[0]
+        why = UNDECIDED.format(", ".join(undecided))
+        wanted.append({"why": why, "conditions": _settings(first, condition_columns(config))})
     if too_short(rows):
         wanted.append({"why": LONGER_STROKES, "conditions": {}})
     wanted += _runs_for_aliases(selection.after, config, effects)
@@ -213,15 +231,18 @@ def _runs_for_aliases(fitted: Fitted, config: Config, effects: Mapping[str, Effe
             yield {"why": why, "conditions": found[0]}
 
 
-def _replicate_of(item: AcceptedEffect, config: Config) -> dict:
-    """Return the condition to repeat on a new specimen: where an effect in too few specimens is largest."""
-    fitted = item.proposal.fitted
-    k = int(np.argmax(np.abs(added_force(item.proposal))))
+def _replicate_of(proposal: Proposal, config: Config, reason: str = "") -> dict:
+    """Return the condition to repeat on a new specimen: where an effect that is not confirmed is largest."""
+    fitted = proposal.fitted
+    k = int(np.argmax(np.abs(added_force(proposal))))
     count = fitted.rows.groups.starts["specimen"].size
-    few = "one specimen is" if count == 1 else f"{count} specimens are"
-    label = describe(item.proposal.term, fitted.rows)
-    why = f"{few} too few to distinguish {label} from the scatter of specimens: "
-    why += "test a second specimen of the same conditions, here first"
+    label = describe(proposal.term, fitted.rows)
+    if reason:
+        why = f"would confirm or refute {label}, which was refused ({reason})"
+    else:
+        few = "one specimen is" if count == 1 else f"{count} specimens are"
+        why = f"{few} too few to distinguish {label} from the scatter of specimens"
+    why += ": test another specimen of the same conditions, here first"
     conditions = _settings(fitted.rows.table.iloc[k], (*condition_columns(config), "speed_mm_s"))
     return {"why": why, "conditions": conditions}
 
@@ -259,7 +280,8 @@ def largest_difference(
 def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterator[dict[str, object]]:
     """Yield combinations of values of the channels; days are kept without an aging law.
 
-    A channel that follows an earlier one, as two sensors of one pressure do, follows it here too.
+    Only the days and the calendar, in which runs to make are late, go on beyond what was tested. A channel
+    that follows an earlier one, as two sensors of one pressure do, follows it here too.
     """
     values: dict[str, list] = {}
     followed = _followed(rows, channels)
@@ -276,8 +298,9 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
             values[name] = list(np.unique(own))
             continue
         low, high = float(own.min()), float(own.max())
-        beyond = high if name == "repeat" else high + BEYOND * (high - low)
-        values[name] = [low, float(np.median(own)), high, beyond]
+        later = [high, high + BEYOND * (high - low)]
+        inside = [low, _middle_of_gap(own), float(np.median(own))]
+        values[name] = later if name in CALENDAR else [*inside, *(later if name == AGING else [high])]
     for point in itertools.product(*values.values()):
         changes = dict(zip(values, point, strict=True))
         for name, leader in followed.items():
@@ -285,6 +308,17 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
                 x, first = np.unique(rows.unsigned(leader), return_index=True)
                 changes[name] = float(np.interp(changes[leader], x, rows.unsigned(name)[first]))
         yield changes
+
+
+def _middle_of_gap(values: np.ndarray) -> float:
+    """Return the middle of the widest gap between the values of a channel, shape (n,).
+
+    Repeats and other consecutive whole numbers have no gap: the value below it is returned.
+    """
+    x = np.unique(values)
+    k = int(np.argmax(np.diff(x, append=x[-1])))
+    counts = bool((x == np.round(x)).all()) and np.diff(x).max(initial=1.0) <= 1.0
+    return float(x[k] if counts else x[k : k + 2].mean())
 
 
 def _followed(rows: Rows, channels: Sequence[str]) -> dict[str, str]:

@@ -137,6 +137,7 @@ def closure_document(
         verdict = "closed"
     else:
         verdict = "cannot_tell" if undecided or unseen else "nothing_missing"
+    unknown = [name for name in undetectable if verdict == "cannot_tell"]
     return {
         "schema": 1,
         "verdict": verdict,
@@ -155,7 +156,7 @@ def closure_document(
             for one in outliers
             if not one.instead
         ],
-        "next_runs": next_runs(selection, config, effects, outliers),
+        "next_runs": next_runs(selection, config, effects, outliers, unknown),
         "incomplete_channels": incomplete_channels(after.rows),
     }
 

@@ -146,10 +146,14 @@ class ScoreTests:
         self.cache = Cache()
 
     def beside(self, columns: np.ndarray) -> ScoreTests:
-        """Return these tests beside other columns of the force, shape (n, m), which are fitted as well."""
+        """Return these tests beside other columns of the force, shape (n, m), which are fitted as well.
+
+        Those of up to four specimens are not: without their mean the slopes of so few agree with anything.
+        """
         own = copy(self)
         own.other = orthonormal(project(self.fitted, columns), OWN)
-        own.fitted = self.fitted.beside(own.other)
+        if not few_specimens(self.fitted):
+            own.fitted = self.fitted.beside(own.other)
         return own
 
     def variants(self, columns: np.ndarray, unit: str) -> tuple[np.ndarray, ...]:

@@ -56,7 +56,7 @@ def contrast_test(
 
     The columns of the force, shape (n, k), are whitened and projected; columns of zeros are ignored. `noise`
     has draws of whitened noise, shape (n, draws). Orthonormal columns `other`, shape (n, m), have been taken
-    out of both the columns and the residual.
+    out of the columns, and out of the residual: if they are still in it, the variance is too large.
     """
     groups = fitted.rows.groups
     if groups.starts[level].size < criteria.LEAST_UNITS_OF_SLOPES:

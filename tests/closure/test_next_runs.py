@@ -2,9 +2,11 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from bins_helpers import make_bins
 
+from sealfit.closure.confirm import RefusedEffect
 from sealfit.closure.left_out import OutlierFile
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.next_runs import (
@@ -40,7 +42,7 @@ def between(chosen, rival):
 @pytest.mark.parametrize("unknown", [None, "f0003.csv"])  # a file without the channel
 def test_channels_that_always_went_together_are_taken_apart(unknown):
     bins = make_bins(bins=4, repeats=1)
-    bins["humidity_pct"] = 30.0 + 2.0 * bins["elapsed_h"]  # rose with the calendar
+    bins["humidity_pct"] = 2.0 * bins["elapsed_h"]  # rose with the calendar
     bins.loc[bins["file"] == unknown, "humidity_pct"] = np.nan
     fitted = fit_declared(make_rows(bins, has_aging=True))
     chosen = bound(fitted, "linear", "humidity_pct", A=0.01)
@@ -48,9 +50,8 @@ def test_channels_that_always_went_together_are_taken_apart(unknown):
     where, apart = between(chosen, rival)
     hours = bins["elapsed_h"]
     assert {"humidity_pct", "elapsed_h"} <= where.keys()
-    # Dry at the end, or humid at the start: by the whole range, and half of it beyond, of the factor on some
-    # 45 N.
-    assert abs((where["humidity_pct"] - 30.0) / 2.0 - where["elapsed_h"]) > np.ptp(hours)
+    # Dry after the end: by the whole range, and half of it beyond, of the factor on some 45 N.
+    assert where["elapsed_h"] - where["humidity_pct"] / 2.0 > np.ptp(hours)
     assert apart > 0.02 * np.ptp(hours) * 40.0
 
 
@@ -92,7 +93,7 @@ def test_repeats_are_asked_where_the_models_differ_most_at_a_tested_run(rival, b
     most = {**first, "speed_mm_s": first["speed_mm_s"] * (1.0 if begins.startswith("more") else 1.3)}
     monkeypatch.setattr("sealfit.closure.next_runs.largest_difference", lambda *given: (most, 0.5))
     item = SimpleNamespace(proposal=chosen, rivals=((other, 0.1),))
-    selection = SimpleNamespace(added=[item], after=fitted, inconclusive=None)
+    selection = SimpleNamespace(added=[item], after=fitted, inconclusive=None, refused=())
     run, *_ = next_runs(selection, Config(), {})
     assert run["why"].startswith(begins)
 
@@ -103,6 +104,26 @@ def test_no_run_that_was_made_is_said_to_show_what_these_runs_cannot():
     found, _ = largest_difference(*models, fitted.rows, ("repeat",), Config())
     assert _is_tested(found, fitted.rows)
     assert largest_difference(*models, fitted.rows, ("repeat",), Config(), untested=True) is None
+
+
+def test_runs_lie_within_what_was_tested_except_for_the_calendar_and_the_days():
+    bins = make_bins(bins=2, repeats=1).assign(pressure_bar=lambda t: 2.0 * (t["elapsed_h"] % 4).round())
+    fitted = fit_declared(make_rows(bins, has_aging=True))
+    names = ("pressure_bar", "aging_days", "elapsed_h")
+    tried = pd.DataFrame(_combinations(fitted.model, fitted.rows, names))
+    tested = {name: fitted.rows.values(name) for name in names}
+    assert sorted(tried["pressure_bar"].unique()) == [0.0, 1.0, 4.0, 8.0]
+    assert tried["aging_days"].max() == 1.5 * tested["aging_days"].max()
+    assert tried["elapsed_h"].min() == tested["elapsed_h"].max()
+
+
+def test_an_effect_that_was_refused_and_variables_without_power_have_a_run_each():
+    fitted = fit_declared(make_rows(make_bins(bins=4, repeats=2), has_aging=True))
+    item = RefusedEffect(bound(fitted, "linear", "elapsed_h", A=0.01), "it rests on one day")
+    selection = SimpleNamespace(added=(), inconclusive=None, refused=(item,), after=fitted)
+    whys = [run["why"] for run in next_runs(selection, Config(), {}, undecided=["pressure_bar"])]
+    assert any("would confirm or refute linear in elapsed_h" in why for why in whys)
+    assert fitted.knows_specimens == any("would show effects of pressure_bar" in why for why in whys)
 
 
 def test_an_offset_is_friction_where_all_runs_go_one_way():
@@ -121,7 +142,7 @@ def test_an_offset_is_friction_where_all_runs_go_one_way():
 def test_a_slower_speed_is_wanted_where_speeds_are_too_few():
     bins = make_bins(speeds=(2.0, 10.0, 40.0), directions=(1, -1), bins=4, repeats=2)
     fitted = fit_declared(make_rows(bins, has_aging=True))
-    selection = SimpleNamespace(added=(), inconclusive=None, after=fitted)
+    selection = SimpleNamespace(added=(), inconclusive=None, refused=(), after=fitted)
     wanted = next_runs(selection, Config(), EFFECTS)
     assert "four speeds in one direction" in wanted[-1]["why"]  # the terminal has the first three runs
     assert wanted[-1]["conditions"]["speed_mm_s"] == 1.0
@@ -151,7 +172,7 @@ def test_an_effect_on_what_does_not_act_where_it_is_there_is_no_alias():
 
 def test_the_run_of_an_outlying_file_comes_first():
     fitted = fit_declared(make_rows(make_bins(bins=4, repeats=1), has_aging=True))
-    selection = SimpleNamespace(added=(), inconclusive=None, after=fitted)
+    selection = SimpleNamespace(added=(), inconclusive=None, refused=(), after=fitted)
     known = {"temperature_C": 80.0, "aging_days": 4.0, "speed_mm_s": 2.0}
     where = {**known, "load_N": float("nan"), "bin": 3}  # a log without the load
     outlier = OutlierFile("a.csv", -0.12, 1e-6, where)
@@ -169,7 +190,7 @@ def test_longer_strokes_are_wanted_where_the_friction_is_not_steady_at_their_end
     bins = make_bins(bins=4, repeats=1)
     bins["presliding_N"] = -0.05 * bins["force_N"]
     selection = SimpleNamespace(
-        added=(), inconclusive=None, after=fit_declared(make_rows(bins, has_aging=True))
+        added=(), inconclusive=None, refused=(), after=fit_declared(make_rows(bins, has_aging=True))
     )
     assert {"why": LONGER_STROKES, "conditions": {}} in next_runs(selection, Config(), {})
 
@@ -194,5 +215,5 @@ def test_files_with_a_specimen_each_show_the_scatter_of_specimens():
     fitted = fit_declared(make_rows(bins.assign(specimen_id=bins["file"]), has_aging=True))
     assert not fitted.scatter.estimates("specimen")
     assert fitted.knows_specimens
-    selection = SimpleNamespace(added=(), inconclusive=None, after=fitted)
+    selection = SimpleNamespace(added=(), inconclusive=None, refused=(), after=fitted)
     assert not any("scatter of specimens" in run["why"] for run in next_runs(selection, Config(), {}))
