@@ -10,7 +10,7 @@ import pandas as pd
 
 from sealfit.config import AGING_CONDITION
 from sealfit.effects.contract import CHANNEL, Effect
-from sealfit.report.summary_lines import has_weak_evidence
+from sealfit.report.summary_lines import has_weak_evidence, weakness
 from sealfit.units import Units
 
 if TYPE_CHECKING:
@@ -228,7 +228,8 @@ def verdict_clauses(closure: Mapping, units: Units) -> list[str]:
     if closure["left"]["significant"]:
         remains = f"what remains{residual_clause(closure, units)} is less than repeats scatter by"
     elif has_weak_evidence(closure["left"]):
-        remains = f"the evidence of what remains{residual_clause(closure, units)} is weak"
+        end = weakness(closure["left"])
+        remains = f"the evidence of what remains{residual_clause(closure, units)} {end}"
     return [remains, quality, f"not decided by these files: {untold}" if untold else ""]
 
 

@@ -12,6 +12,7 @@ NOT_TRACES = {  # why a file in the campaign's folder is none of its traces, by 
 }
 # Family-wise error rate of the search, by default. A larger p-value is not significant.
 SEARCHED = 0.005
+CERTAIN = 1e-6  # p-value above which evidence is weak; below it the units were too few, or disagreed
 # Level of the test for lack of fit.
 LACKING = 0.05
 # Largest activation energy of aging that is plausible, in kJ/mol; rubbers have 20 to 150.
@@ -226,10 +227,15 @@ def has_weak_evidence(left: Mapping) -> bool:
     return left["p_value"] is not None and left["p_value"] <= SEARCHED and not left["significant"]
 
 
+def weakness(left: Mapping) -> str:
+    """Return why such a residual is not significant: what its evidence lacks, as the end of a clause."""
+    return "rests on too few specimens or runs" if left["p_value"] <= CERTAIN else "is weak"
+
+
 def _left(left: Mapping, unit: str) -> str:
     """Return the remaining residual: its size above the floor, the variable, and the p-value."""
     above = f"rms {_number(left['rmse_N'])} {unit} above the noise floor, " if left["rmse_N"] else ""
-    weak = ", weak evidence" if has_weak_evidence(left) else ", not significant"
+    weak = f", its evidence {weakness(left)}" if has_weak_evidence(left) else ", not significant"
     significant = "" if left["significant"] else weak
     return f"{above}along {left['channel']} (p = {left['p_value']:.2g}{significant})"
 

@@ -41,7 +41,7 @@ from sealfit.report.summary import (
     split_channels,
     verdict_clauses,
 )
-from sealfit.report.summary_lines import has_weak_evidence
+from sealfit.report.summary_lines import has_weak_evidence, weakness
 
 MOST_TESTS = 40
 CURVE_PLACES = 7  # of a free shape that a card lists
@@ -147,7 +147,7 @@ def left_over(closure: Mapping, config: Config) -> Markup:
     elif left["channel"] and any(effect["candidate"] for effect in closure["effects"]):
         said.append(Markup("the evidence rests on too few specimens: it varies{}").format(where))
     elif left["channel"] and has_weak_evidence(left):
-        said.append(Markup("the evidence of what remains{} is weak").format(where))
+        said.append(Markup("the evidence of what remains{} {}").format(where, weakness(left)))
     elif left["channel"]:
         said.append(Markup("no variable is significant. The smallest p-value:{}").format(where))
     else:

@@ -239,6 +239,8 @@ def test_what_is_left_is_called_scatter_only_if_it_is():
     assert "scatter" not in text
     weak = left_over(document(**left | {"significant": False}), Config())
     assert "The evidence of what remains along displacement (mm) along strokes (p = 0.0005) is weak." in weak
+    few = left_over(document(**left | {"significant": False, "p_value": 1e-9}), Config())
+    assert "(p = 1e-09) rests on too few specimens or runs." in few
     none = left_over(document(**left | {"significant": False, "p_value": 0.3}), Config())
     assert "No variable is significant. The smallest p-value: along displacement (mm)" in none
 

@@ -20,6 +20,8 @@ FIRST_STEP = 0.25
 
 # b is not determined if the ends of its 95 % interval differ by more than this ratio.
 WIDE_B = 100.0
+# Earliest aging time at which a test is proposed, in days: a quarter of an hour.
+EARLIEST = 0.01
 # Level of the test for lack of fit.
 SIGNIFICANT = 0.05
 
@@ -297,8 +299,12 @@ def _judge(curve: SeriesCurve, found: Estimate, ends: CurveInterval, t: float) -
         verdict["a"] = (False, why)
     elif low == 0.0 or high > WIDE_B * low:
         span = f"from {low:.2g} to {high:.2g} d" if low > 0 else f"anything up to {high:.2g} d"
-        why = f"b may be {span}: it trades off with a and mu_0; tests before "
-        why += f"{max(min(high, first), 1e-3):.2g} d decide."
+        why = f"b may be {span}: it trades off with a and mu_0; "
+        early = min(high, first)
+        when = (
+            f"tests before {early:.2g} d decide" if early >= EARLIEST else "most of the loss may be at once"
+        )
+        why += f"{when}."
     else:
         why = remark = ""
         if b < first and curve.unaged:
