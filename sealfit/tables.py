@@ -300,6 +300,7 @@ SHAPES = table(
     Column("effect", "row in closure.json's effects, from 0", INT),
     Column("id", "effect", TEXT),
     Column("channel", "channel drawn along", TEXT),
+    Column("category", "category of the effect's other channel in which it is drawn, or null", TEXT),
     Column("x", "channel value; null for a category"),
     Column("label", "the category, or null", TEXT),
     Column("value", "added force, factor minus one, or change of the parameter"),

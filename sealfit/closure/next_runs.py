@@ -100,7 +100,8 @@ def _alias(fitted: Fitted, term: Term, values: Mapping[str, float], column: np.n
 
 
 # ---------------------------------------------------------------- next runs
-BEYOND = 0.5  # Share of the calendar's range, or that of the days, by which a run may exceed it.
+BEYOND = 0.5  # Share of the range of a channel by which a run may exceed it: the calendar, and `EXTENDED`.
+EXTENDED = (AGING, "speed_mm_s")  # A rig may not reach other settings beyond what was tested.
 MOST_REFUSED = 2  # Refused effects for which a run is proposed.
 SHOWN = 0.5  # Least share of an effect's size that a proposed run must show.
 DISTINCT = 0.1  # Least difference between two models that a run is to show, as a share of the RMSE.
@@ -159,7 +160,7 @@ def next_runs(
                 wanted.append({"why": why, "conditions": conditions})
     if selection.inconclusive is not None:
         wanted.append(_replicate_of(selection.inconclusive.proposal, config))
-    refused = [item for item in selection.refused if not item.negligible]
+    refused = [item for item in selection.refused if not item.negligible and item.proposal.fitted]
     wanted += [_replicate_of(item.proposal, config, item.reason) for item in refused[:MOST_REFUSED]]
     rows = selection.after.rows
     if not selection.after.knows_specimens:
@@ -280,7 +281,7 @@ def largest_difference(
 def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterator[dict[str, object]]:
     """Yield combinations of values of the channels; days are kept without an aging law.
 
-    Only the days and the calendar, in which runs to make are late, go on beyond what was tested. A channel
+    Only speeds, days and the calendar, in which runs to make are late, go beyond what was tested. A channel
     that follows an earlier one, as two sensors of one pressure do, follows it here too.
     """
     values: dict[str, list] = {}
@@ -300,7 +301,7 @@ def _combinations(model: Model, rows: Rows, channels: tuple[str, ...]) -> Iterat
         low, high = float(own.min()), float(own.max())
         later = [high, high + BEYOND * (high - low)]
         inside = [low, _middle_of_gap(own), float(np.median(own))]
-        values[name] = later if name in CALENDAR else [*inside, *(later if name == AGING else [high])]
+        values[name] = later if name in CALENDAR else [*inside, *(later if name in EXTENDED else [high])]
     for point in itertools.product(*values.values()):
         changes = dict(zip(values, point, strict=True))
         for name, leader in followed.items():

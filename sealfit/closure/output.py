@@ -25,7 +25,7 @@ from sealfit.closure.selection import Selection
 from sealfit.config import Config
 from sealfit.effects import EFFECTS
 from sealfit.effects.contract import SECOND, Effect
-from sealfit.effects.free import FREE, LEVELS, SMOOTH, SURFACE, WIDE, free_effect
+from sealfit.effects.free import FREE, LEVELS, SLOPES, SMOOTH, SURFACE, WIDE, free_effect
 from sealfit.errors import ParameterError
 from sealfit.fit.joint import Fitted, fit
 from sealfit.fit.joint.declared import QUANTITIES, Declared, JointParameter, tested_speeds
@@ -249,9 +249,23 @@ def shape_table(after: Fitted, config: Config) -> pd.DataFrame:
         free = _free_shape(after, number, x)
         unit = parameter_unit("{y}", term, config.units)
         drawn = {"effect": number, "id": term.effect.id, "channel": first, "x": x}
-        drawn |= {"label": labels, "value": value, "lo95": value - reach * se, "hi95": value + reach * se}
+        drawn |= {
+            "category": _category_drawn(term, values),
+            "label": labels,
+            "value": value,
+            "lo95": value - reach * se,
+            "hi95": value + reach * se,
+        }
         shapes.append(pd.DataFrame({**drawn, "free": np.nan if free is None else free, "unit": unit}))
     return pd.concat(shapes, ignore_index=True) if shapes else pd.DataFrame(columns=SHAPES.names())
+
+
+def _category_drawn(term: Term, values: Mapping[str, float]) -> str | None:
+    """Return the category in which an effect is drawn: its own, or that of the largest slope; else None."""
+    if term.effect.id == SLOPES:
+        sizes = [abs(values[p.name]) for p in term.effect.parameters]
+        return str(term.fixed["categories"][int(np.argmax(sizes))])
+    return term.fixed.get("category")
 
 
 def _drawn(model: Model) -> Iterator[tuple[int, str]]:
@@ -277,8 +291,9 @@ def shape_points(after: Fitted, shapes: pd.DataFrame) -> pd.DataFrame:
         values = term.inputs(rows)[term.effect.reads[term.channels.index(first)]]
         numeric = bool(own["label"].isna().all())
         known = np.isfinite(values) if numeric else np.full(values.size, True)
-        if "category" in term.fixed:
-            known &= rows.values(term.channels[-1]) == term.fixed["category"]
+        category = _category_drawn(term, after.model.values[number])
+        if category is not None:
+            known &= rows.values(term.channels[-1]) == category
         if numeric:
             low, high = own["x"].min(), own["x"].max()
             values = np.where(values > high, low + (values - low) % ((high - low) or 1.0), values)
@@ -324,7 +339,7 @@ def _along(
         if channel == first:
             inputs[name] = x
         elif others.dtype.kind != "f":
-            inputs[name] = np.full(x.size, str(term.fixed.get("category", np.unique(others)[0])))
+            inputs[name] = np.full(x.size, _category_drawn(term, parameters) or str(np.unique(others)[0]))
         else:
             far = name == SECOND and term.effect.id != SURFACE
             inputs[name] = np.full(x.size, np.quantile(others, 0.9) if far else np.abs(others).mean())

@@ -411,6 +411,8 @@ def effect_shapes(tables: Tables, closure: Mapping, config: Config) -> Plot | No
         alt = f"Shape of {words} along {channel_words(channel, config.units)}: "
         alt += f"{shape_label(rows, effect, config.units)} "
         alt += f"from {number(values.min())} to {number(values.max())}."
+        if effect["id"] == "slopes":
+            words = f"{rows['category'].iloc[0]}: {words}"
         number_of = f"{place[int(index)] + 1}. " if len(effects) > 1 else ""
         panels.append(Panel(number_of + capital(words), alt, draw))
     legend = [Key("effect, 95 % band", drawing.AFTER)]
