@@ -215,7 +215,7 @@ def test_what_too_few_specimens_show_is_a_candidate_and_in_no_model():
     assert set(points["x"]) <= set(hardness.values())
     line = np.polyfit(points["x"].astype(float), points["value"], 1)
     assert line[0] == pytest.approx(0.04, rel=0.2)
-    assert any("second specimen" in run["why"] for run in document["next_runs"])
+    assert any("another specimen" in run["why"] for run in document["next_runs"])
     points = bins[bins["speed_set_mm_s"] == 16.0].drop_duplicates("specimen_id")
     alone = predict(made.model | {"unconfirmed": []}, points)
     answer = predict(made.model, points)
