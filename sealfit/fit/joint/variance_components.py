@@ -84,22 +84,21 @@ def _minimum(
 ) -> OptimizeResult:
     """Return the minimum of a function and its gradient between 0 and `high`, shape (k,).
 
-    The first descent is in standard deviations, as the slopes along variances of different size differ by
-    orders of magnitude, which ends other descents early. The second one is in the variances, so that one
-    which became 0 may grow again.
+    The first descent is in logarithms, as the slopes along components of different size differ by orders of
+    magnitude, which ends other descents early. The second one is in the variances, so that they may become 0.
     """
 
-    def in_deviations(u: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = objective(u**2)
-        return value, gradient * 2.0 * u
+    def in_logarithms(u: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = objective(np.exp(u))
+        return value, gradient * np.exp(u)
 
-    def descend(function: Callable, x: np.ndarray, high: np.ndarray) -> OptimizeResult:
-        bounds = [(0.0, most) for most in high]
+    def descend(function: Callable, x: np.ndarray, low: float, high: np.ndarray) -> OptimizeResult:
+        bounds = [(low, most) for most in high]
         options = {"maxiter": 200, "ftol": 1e-10}  # so that rounding in the residual changes no estimate
         return minimize(function, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
 
-    first = descend(in_deviations, np.sqrt(start), np.sqrt(high))
-    return descend(objective, first.x**2, high)
+    first = descend(in_logarithms, np.log(start), np.log(LEAST / 10), np.log(high))
+    return descend(objective, np.exp(first.x), 0.0, high)
 
 
 class RestrictedLikelihood:
