@@ -176,7 +176,7 @@ def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
         return []
     units, unit = np.unique(strokes.unit, return_inverse=True)
     sides, side = np.unique(strokes.direction, return_inverse=True)
-    span = np.median(strokes.span)
+    span, ends = np.median(strokes.span), (strokes.low.min(), (strokes.low + strokes.span).max())
     waves = np.array([m for m in LONG_WAVES if all(abs(m - span / length) > MAIN_LOBE for length in known)])
     if not waves.size:
         return []
@@ -187,7 +187,7 @@ def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
     square, product = np.zeros((sides.size, size, size)), np.zeros((sides.size, units.size, size))
     own_square = np.zeros((sides.size, units.size, waves.size, 2, 2))
     for k, place in enumerate(zip(side, unit, strict=True)):
-        gram = _long_wave_gram(strokes, k, waves / span)
+        gram = _long_wave_gram(strokes, k, waves / span, ends)
         square[place[0]] += gram[:-1, :-1]
         product[place] += gram[-1, :-1]
         own_square[place] += gram[pairs[:, :, None], pairs[:, None, :]]
@@ -215,10 +215,14 @@ def _long_waves(samples: pd.DataFrame, known: Sequence[float]) -> list[Peak]:
     return peaks
 
 
-def _long_wave_gram(strokes: AxisStrokes, k: int, frequency: np.ndarray) -> np.ndarray:
-    """Return a stroke's Gram matrix of sines, cosines, curves of place and of travel, and the residual."""
-    place, value = strokes.along(k)
-    low, high = strokes.low.min(), (strokes.low + strokes.span).max()
+def _long_wave_gram(
+    strokes: AxisStrokes, k: int, frequency: np.ndarray, ends: tuple[float, float]
+) -> np.ndarray:
+    """Return a stroke's Gram matrix of sines, cosines, curves of place and of travel, and the residual.
+
+    `ends` are the lowest and the highest place of all strokes.
+    """
+    (place, value), (low, high) = strokes.along(k), ends
     turn = 2 * np.pi * place[:, None] * frequency
     of_place = legvander(2 * (place - low) / (high - low) - 1, CURVE_DEGREE)[:, 1:]
     of_travel = legvander(strokes.direction[k] * _even(place), TRAVEL_DEGREES[-1])[:, TRAVEL_DEGREES]
