@@ -169,7 +169,8 @@ def next_runs(
     elif undecided:
         condition = rows.table.groupby("condition")["specimen_id"].nunique().idxmin()
         first = rows.table[rows.table["condition"] == condition].iloc[0]
-        why = UNDECIDED.format(", ".join(undecided))
+        names = ["differences between specimens" if name == "specimen_id" else name for name in undecided]
+        why = UNDECIDED.format(", ".join(names))
         wanted.append({"why": why, "conditions": _settings(first, condition_columns(config))})
     if too_short(rows):
         wanted.append({"why": LONGER_STROKES, "conditions": {}})
