@@ -371,5 +371,7 @@ def untold_clause(closure: Mapping, units: Units) -> str:
             many = "more than 100 times as many" if smallest > 10 else f"about {_two_digits(files or 0)}"
             more = f"; 1 % needs {many} files"
         variable = f"{units.label(entry['variable'])} {level_words(entry['level'])}"
+        if entry["variable"] == "specimen_id":  # it has no level of its own
+            variable, size = "differences between specimens", "too few specimens"
         texts.append(f"{variable} ({size}{more if files else ''})")
     return ", ".join(texts)

@@ -223,6 +223,9 @@ def test_what_is_not_decided_has_names_in_words():
     text = str(verdict(closure, Config()))
     assert "Not decided by these files: linear in time (s), factor on <i>μ</i><sub>s</sub> (p" in text
     assert "dust mg along strokes (no effect" in text
+    seen |= {"variable": "specimen_id", "level": "condition", "files_needed": 40}
+    text = str(verdict(document() | {"sensitivity": [seen], "refused": []}, Config()))
+    assert "differences between specimens (too few specimens; at least 40 files are needed)" in text
     untold = verdict(closure | {"verdict": "cannot_tell"}, Config())
     assert "is missing: linear in time (s), factor on <i>μ</i><sub>s</sub> (p" in untold
 
