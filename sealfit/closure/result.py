@@ -129,15 +129,15 @@ def closure_document(
     significant = bool(selection.worse) or (selection.left is not None and not only_unclaimable)
     # What remains beside effects that were found may be less than repeats scatter by.
     small = bool(selection.added) and not selection.worse and (quality["ratio"] or np.inf) <= 1.0
-    undecided = only_unclaimable or any(not item.negligible for item in selection.refused)
+    unconfirmed = only_unclaimable or any(not item.negligible for item in selection.refused)
     unseen = any(undetectable.values()) or (undetectable and quality["state"] != "within_scatter")
     if significant and not small:
         verdict = "unexplained"
     elif selection.added:
         verdict = "closed"
     else:
-        verdict = "cannot_tell" if undecided or unseen else "nothing_missing"
-    unknown = [name for name in undetectable if verdict == "cannot_tell"]
+        verdict = "cannot_tell" if unconfirmed or unseen else "nothing_missing"
+    undecided = list(undetectable) if verdict == "cannot_tell" else []
     return {
         "schema": 1,
         "verdict": verdict,
@@ -156,7 +156,7 @@ def closure_document(
             for one in outliers
             if not one.instead
         ],
-        "next_runs": next_runs(selection, config, effects, outliers, unknown),
+        "next_runs": next_runs(selection, config, effects, outliers, undecided),
         "incomplete_channels": incomplete_channels(after.rows),
     }
 

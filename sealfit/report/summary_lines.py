@@ -12,7 +12,10 @@ NOT_TRACES = {  # why a file in the campaign's folder is none of its traces, by 
 }
 # Family-wise error rate of the search, by default. A larger p-value is not significant.
 SEARCHED = 0.005
-CERTAIN = 1e-6  # p-value above which evidence is weak; below it the units were too few, or disagreed
+# A larger p-value is weak evidence, as `WEAK_P` in the criteria of the loop.
+WEAK = 1e-6
+# An interval of a lifetime that excludes nothing.
+OPEN = [0.0, None]
 # Level of the test for lack of fit.
 LACKING = 0.05
 # Largest activation energy of aging that is plausible, in kJ/mol; rubbers have 20 to 150.
@@ -229,7 +232,7 @@ def has_weak_evidence(left: Mapping) -> bool:
 
 def weakness(left: Mapping) -> str:
     """Return why such a residual is not significant: what its evidence lacks, as the end of a clause."""
-    return "rests on too few specimens or runs" if left["p_value"] <= CERTAIN else "is weak"
+    return "is weak" if left["p_value"] > WEAK else "rests on too few specimens or runs"
 
 
 def _left(left: Mapping, unit: str) -> str:
@@ -287,9 +290,6 @@ def predict_lines(part: Mapping) -> list[str]:
 def line(title: str, text: str) -> str:
     """Return a line of a summary under its title."""
     return f"{title:<11} {text}"
-
-
-OPEN = [0.0, None]  # an interval that excludes nothing
 
 
 def _count(number: int, what: str) -> str:

@@ -72,7 +72,9 @@ def lifetime(
     """
     place = _place(law, temperature_C, compression_ratio_pct)
     days = _days(law, law.x, goal, place)
-    if 0 < days < FOREVER:
+    if law.df <= 0:  # nothing shows the scatter of specimens
+        low, high = 0.0, np.inf
+    elif 0 < days < FOREVER:
         # The lifetime may be 0 or inf nearby, or change too fast.
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             slope = central_jacobian(lambda x: np.log(np.array([_days(law, x, goal, place)])), law.x)[0]
@@ -82,8 +84,6 @@ def lifetime(
     else:  # the start or the limit of the law may lie on the other side of the threshold
         low, high = (float(end) for end in np.quantile(_drawn(law, goal, place), ENDS, method=OF_DRAWS))
     low, high = 0.0 if low < AT_ONCE else low, np.inf if high > FOREVER else high
-    if law.df <= 0:
-        low, high = 0.0, np.inf
     asked = days * float(law.factors(place)[0][0])
     threshold, beyond = float(goal.reached(law.x[0])), asked / law.tested_days().max()
     return DaysToThreshold(days, low, high, threshold, beyond, _outside(law, place))
