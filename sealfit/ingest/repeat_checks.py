@@ -14,6 +14,8 @@ from sealfit.ingest.scatter import RepeatCodes, ScatterFit, fit_scatter, repeat_
 
 # Share of the repeats that the search takes out at most. Beyond it the bulk is not known.
 MAX_OUTLIERS = 0.1
+# Steps in a row without a convincing outlier after which the search ends: so many equal ones mask each other.
+UNCONVINCING = 10
 # Share of its variance below which a residual is that of a run's only repeat.
 ALONE = 1e-9
 
@@ -35,9 +37,9 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
     force = means["force_N"].to_numpy(float)
     tiny = 1e-6 * float(np.max(np.abs(force), initial=0.0)) + 1e-300  # repeats that agree to the last digit
     kept = np.ones(len(means), bool)
-    found = []
+    found, unconvincing = [], 0
     fit = fit_scatter(layout, force, kept)
-    while len(found) < max(1, int(MAX_OUTLIERS * len(means))):
+    while unconvincing < UNCONVINCING and len(found) < max(1, int(MAX_OUTLIERS * len(means))):
         tests = int((kept & (fit.share > ALONE)).sum())
         if fit.scatter.df < 4 or not tests:
             break
@@ -49,8 +51,7 @@ def outlying_repeats(means: pd.DataFrame, level: float) -> pd.DataFrame:
         apart = fit_scatter(layout, force, kept)
         t, p, mean_N = _judged(fit, apart, rows, tests, tiny)
         found.append(means.iloc[rows].assign(run_mean_N=mean_N, t=t, p=p, alone=len(rows) == 2))
-        if p >= level and abs(t) < 3.0:  # nothing further out remains
-            break
+        unconvincing = unconvincing + 1 if p >= level and abs(t) < 3.0 else 0
         fit = apart
     last = max((number for number, one in enumerate(found, start=1) if one["p"].iloc[0] < level), default=0)
     return pd.concat([means.iloc[:0].assign(run_mean_N=0.0, t=0.0, p=0.0, alone=False), *found[:last]])

@@ -110,6 +110,14 @@ def test_several_outliers_do_not_hide_each_other():
     assert set(outlying_repeats(means, 0.001)["file"]) == {"0/1", "10/1", "20/1", "30/1"}
 
 
+def test_equal_outliers_of_pairs_do_not_hide_each_other():
+    """Each inflates the scatter of the others: none of them is three SDs off while all are in."""
+    means = campaign(24, np.random.default_rng(5), repeats=2, pattern=(0.0, 0.0))
+    means.loc[[1, 9, 25, 41], "force_N"] *= 0.87  # run 4 has 7 N, where the scatter is large
+    found = outlying_repeats(means, 0.001)
+    assert set(found["file"]) == {f"{run}/{k}" for run in (0, 12, 20) for k in (0, 1)}
+
+
 def test_a_common_change_from_repeat_to_repeat_is_no_outlier():
     means = campaign(20, np.random.default_rng(3), pattern=(0.2, 0.0, -0.1))
     assert len(outlying_repeats(means, 0.001)) == 0
