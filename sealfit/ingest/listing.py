@@ -217,7 +217,7 @@ def misspelt(
     faults, wanted = [], [*dict.fromkeys([*KNOWN, *config.condition])]
     for name in names:
         close = nearest(name, wanted) if name not in wanted and name != "file" else ""
-        if not close or close in beside:
+        if not close or close in beside or name.endswith(f"_{close}"):  # lab_temperature_C is another one
             continue
         if close.lower() == name.lower():
             reason, fix = f"differs from '{close}' in the case of letters only.", f"Write '{close}'."

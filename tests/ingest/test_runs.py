@@ -375,6 +375,12 @@ def test_misspelt_channels_and_slips_in_them_are_warned_of(tmp_path):
     assert refs[3].channels["lab_C"] == "3"
 
 
+def test_the_temperature_of_the_lab_is_not_taken_for_a_misspelt_one(tmp_path):
+    table = "file,aging_days,lab_temperature_C\na.csv,4,21\nb.csv,4,22"
+    _, found = list_traces(campaign(tmp_path, table), config(DAYS))
+    assert [fault for fault in found if fault.column == "lab_temperature_C"] == []
+
+
 @settings(max_examples=30, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(1, 3), st.sampled_from([5, 10]), st.booleans()), min_size=1, max_size=12)
