@@ -60,6 +60,8 @@ TRAVEL_DEGREES = np.arange(3, 7)
 # Least share of what a curve of the position explains that a wave must explain. A bump of the position, a
 # change of slope and warming leave 7 % and more of the curve unexplained.
 WAVE_OF_CURVE = 0.95
+# Least ratio of what a wave along the other axis explains to what the peak explains if it takes its place.
+OTHER_AXIS = 1.2
 
 
 def find_ripple(
@@ -78,7 +80,7 @@ def find_ripple(
     peaks, locked = [], []
     if common_phase and samples["unit"].nunique() < criteria.LEAST_GROUPS_HELD_OUT:
         samples = samples.assign(unit=samples["stroke_id"])  # strokes are held out, too
-    speed = _one_speed(samples) if known else 0.0
+    speed = _one_speed(samples)
     for axis in (name for name in AXES if name not in ignored):
         lengths = [length for own, length in known if own == axis]
         if speed:  # a wave in time is the same as one along displacement
@@ -101,6 +103,8 @@ def find_ripple(
     significant = [peak for peak in peaks if peak.p_value < criteria.SHARED_PHASE]
     best = min(peaks, key=lambda p: (p.p_value, -p.statistic))
     best = max(significant, key=lambda p: p.energy, default=best)
+    if not best.common_phase and best.p_value < criteria.SHARED_PHASE and not speed:
+        best = _along_likelier_axis(best, samples, ignored)
     # A common phase is stronger evidence than power.
     shared = [p for p in (*peaks, *locked) if p.common_phase and p.p_value < criteria.SHARED_PHASE]
     same_axis = [p for p in shared if p.axis == best.axis]
@@ -116,6 +120,35 @@ def _one_speed(samples: pd.DataFrame) -> float:
     spans = [ends[axis]["max"] - ends[axis]["min"] for axis in AXES]
     speeds = (spans[0] / spans[1].where(spans[1] > 0)).dropna()
     return float(speeds.median()) if speeds.size and speeds.max() <= SPEEDS_APART * speeds.min() else 0.0
+
+
+def _along_likelier_axis(peak: Peak, samples: pd.DataFrame, ignored: Collection[str]) -> Peak:
+    """Return a peak as a wave along the other axis, if that explains more of the strokes of all speeds.
+
+    At the speed of the strokes that it explains most of, both are the same wave. Strokes with fewer than two
+    samples per wave are left out.
+    """
+    other = next(axis for axis in AXES if axis != peak.axis)
+    ends = samples.groupby("stroke_id")[list(AXES)].agg(np.ptp)
+    speed = ends[peak.axis] / ends[other].where(ends[other] > 0)
+    explained = _explained_by_wave(samples, peak.axis, peak.wavelength)
+    length = peak.wavelength / float(speed[explained.idxmax()])
+    steps = ends.div(samples.groupby("stroke_id").size(), axis=0)
+    fine = (steps[peak.axis] < peak.wavelength / 2) & (steps[other] < length / 2)
+    seen = samples[samples["stroke_id"].isin(fine.index[fine])]
+    if other in ignored or seen["unit"].nunique() < 2:
+        return peak
+    length, _ = common_wavelength(seen, length, other)
+    own, its = (
+        _explained_by_wave(seen, *place).sum() for place in ((peak.axis, peak.wavelength), (other, length))
+    )
+    return replace(peak, axis=other, wavelength=length) if its > OTHER_AXIS * own else peak
+
+
+def _explained_by_wave(samples: pd.DataFrame, axis: str, wavelength: float) -> pd.Series:
+    """Return the sum of squares that a wave of any phase explains in each stroke, by `stroke_id`."""
+    strokes = waves_of(samples.assign(unit=samples["stroke_id"]), np.array([wavelength]), axis)
+    return pd.Series((strokes.amplitudes * strokes.product).sum(axis=(1, 2)), strokes.unit)
 
 
 def _with_shared_phase(peak: Peak, samples: pd.DataFrame) -> Peak:

@@ -93,6 +93,23 @@ def test_hum_in_time_is_not_taken_for_position():
     assert peak.wavelength == pytest.approx(0.3, rel=0.02)
 
 
+@pytest.mark.parametrize("axis", ["time_s", "displacement_mm"])
+def test_a_wave_that_is_strong_at_one_speed_has_the_axis_along_which_all_speeds_show_it(axis):
+    """A long slow stroke makes the spectrum in time fine, in which the hum of short strokes is broad."""
+    rng, tables = np.random.default_rng(3), []
+    for unit, speed in enumerate(np.repeat([2.0, 10.0, 40.0, 150.0], 6)):
+        speed *= 1 + 1e-4 * rng.standard_normal()  # no two strokes have the same
+        time = np.arange(0, 60.0 / speed, 1 / min(2000.0, 50.037 + 12.5 * speed))
+        place = 20.0 + speed * time
+        wave = time / 0.02 if axis == "time_s" else place / 3.0
+        force = 0.5 * np.sin(2 * np.pi * (wave + rng.random())) + rng.normal(0, 0.2, time.size)
+        own = {"stroke_id": unit, "unit": unit, "direction": 1.0, "residual_N": force}
+        tables.append(pd.DataFrame({"displacement_mm": place, "time_s": time, **own}))
+    peak = find_ripple(pd.concat(tables, ignore_index=True), common_phase=True)
+    assert peak.axis == axis
+    assert peak.wavelength == pytest.approx(0.02 if axis == "time_s" else 3.0, rel=0.01)
+
+
 def test_at_one_speed_a_known_wave_of_the_position_is_not_found_again_in_time():
     samples = make_samples(amplitude=0.15)
     at_10_mm_s = 5.0 + 10.0 * samples["time_s"] * samples["direction"] + 40.0 * (samples["direction"] < 0)
