@@ -129,8 +129,8 @@ SAMPLES_PER_VALUE = 10.0  # With more samples per distinct force, the steps are 
 WEAK_P = 1e-6
 LEAST_FALL = 0.05  # Least relative fall of the held-out RMSE by an effect of weak evidence.
 # If all effects have smaller p-values they are refitted in the folds, not searched again. In three campaigns
-# with p-values of 1e-20 to 1e-18 that changes the held-out error by -2.4 to 3 %, and the loop takes a third of
-# the time. With p-values of 1e-8 to 1e-13 it is 0.18 mN m in place of 0.25 (the measured screw drives).
+# with p-values of 1e-20 to 1e-18 that changes the held-out error by -2.4 to 3 %, and the loop takes a third
+# of the time. With p-values of 1e-8 to 1e-13 it is 0.18 mN m in place of 0.25 (the measured screw drives).
 CERTAIN_P = 1e-15
 # Largest p-value of an accepted shape that changes the Stribeck curve or the aging law. These are free shapes
 # of one coefficient or of the speed together with another variable, and mechanisms along strokes, such as

@@ -80,7 +80,7 @@ def find_ripple(
     peaks, locked = [], []
     if common_phase and samples["unit"].nunique() < criteria.LEAST_GROUPS_HELD_OUT:
         samples = samples.assign(unit=samples["stroke_id"])  # strokes are held out, too
-    speed = _one_speed(samples)
+    speed = _one_speed(samples) if known else 0.0
     for axis in (name for name in AXES if name not in ignored):
         lengths = [length for own, length in known if own == axis]
         if speed:  # a wave in time is the same as one along displacement
@@ -103,8 +103,7 @@ def find_ripple(
     significant = [peak for peak in peaks if peak.p_value < criteria.SHARED_PHASE]
     best = min(peaks, key=lambda p: (p.p_value, -p.statistic))
     best = max(significant, key=lambda p: p.energy, default=best)
-    if not best.common_phase and best.p_value < criteria.SHARED_PHASE and not speed:
-        best = _along_likelier_axis(best, samples, ignored)
+    best = _along_likelier_axis(best, samples, ignored)
     # A common phase is stronger evidence than power.
     shared = [p for p in (*peaks, *locked) if p.common_phase and p.p_value < criteria.SHARED_PHASE]
     same_axis = [p for p in shared if p.axis == best.axis]
@@ -123,12 +122,15 @@ def _one_speed(samples: pd.DataFrame) -> float:
 
 
 def _along_likelier_axis(peak: Peak, samples: pd.DataFrame, ignored: Collection[str]) -> Peak:
-    """Return a peak as a wave along the other axis, if that explains more of the strokes of all speeds.
+    """Return a peak of the mean power as a wave along the other axis, if that explains more of all strokes.
 
-    At the speed of the strokes that it explains most of, both are the same wave. Strokes with fewer than two
+    At the speed of the stroke that it explains most of, both are the same wave. Strokes with fewer than two
     samples per wave are left out.
     """
     other = next(axis for axis in AXES if axis != peak.axis)
+    sure = not peak.common_phase and peak.p_value < criteria.SHARED_PHASE
+    if not sure or other in ignored or _one_speed(samples):
+        return peak
     ends = samples.groupby("stroke_id")[list(AXES)].agg(np.ptp)
     speed = ends[peak.axis] / ends[other].where(ends[other] > 0)
     explained = _explained_by_wave(samples, peak.axis, peak.wavelength)
@@ -136,7 +138,7 @@ def _along_likelier_axis(peak: Peak, samples: pd.DataFrame, ignored: Collection[
     steps = ends.div(samples.groupby("stroke_id").size(), axis=0)
     fine = (steps[peak.axis] < peak.wavelength / 2) & (steps[other] < length / 2)
     seen = samples[samples["stroke_id"].isin(fine.index[fine])]
-    if other in ignored or seen["unit"].nunique() < 2:
+    if seen["unit"].nunique() < 2:
         return peak
     length, _ = common_wavelength(seen, length, other)
     own, its = (
