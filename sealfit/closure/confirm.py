@@ -344,7 +344,8 @@ def _amplitude_too_large(proposal: Proposal, samples: pd.DataFrame) -> bool:
     values = fitted.model.values[-1]
     own = waves_of(samples, np.array([values["lambda_"]]), term.channels[0]).amplitudes[:, 0]
     size = 1.0 if term.operation == "add" else _rms(fitted.rows.force)
-    return abs(values["A"]) * size > criteria.AMPLITUDE_RATIO * _rms(np.hypot(*own.T))
+    wave = np.nan_to_num(term.effect.shape(term.inputs(fitted.rows), **values))  # not averaged over bins
+    return np.sqrt(2) * _rms(wave) * size > criteria.AMPLITUDE_RATIO * _rms(np.hypot(*own.T))
 
 
 def _changes_the_curve(proposal: Proposal) -> bool:

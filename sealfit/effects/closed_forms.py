@@ -20,8 +20,8 @@ from sealfit.effects.contract import (
     factors,
     log_ratio,
     log_ratio_from_zero,
+    mean_sine,
     not_negative,
-    sine_attenuation,
 )
 
 
@@ -257,7 +257,7 @@ def sinusoid(inputs, *, A, lambda_, phi):
     Along the position it is the physical effect `ripple`. x_ref is 0, or near values that are far from 0.
     """
     angle = 2 * np.pi * deviation(inputs, CHANNEL) / lambda_ + phi
-    return A * np.sin(angle) * sine_attenuation(inputs, CHANNEL, lambda_)
+    return A * mean_sine(inputs, CHANNEL, angle, lambda_)
 
 
 @effect(
@@ -314,8 +314,8 @@ def sinusoid_harmonics(inputs, *, A, B, lambda_, phi, phi_2):
     It is for simulated campaigns.
     """
     angle = 2 * np.pi * np.asarray(inputs[CHANNEL], dtype=float) / lambda_
-    once, twice = (sine_attenuation(inputs, CHANNEL, lambda_ / k) for k in (1, 2))
-    return A * np.sin(angle + phi) * once + B * np.sin(2 * angle + phi_2) * twice
+    once = mean_sine(inputs, CHANNEL, angle + phi, lambda_)
+    return A * once + B * mean_sine(inputs, CHANNEL, 2 * angle + phi_2, lambda_ / 2)
 
 
 # ---------------------------------------------------------------- two channels

@@ -222,6 +222,7 @@ def _in_brackets(unit: str) -> str:
 
 
 SAMPLES = "samples"  # key of the inputs of an effect: number of samples in each row's mean
+LAG = "lag"  # key of the inputs of an effect: signed length over which friction follows it in each row
 
 
 def width_of(name: str) -> str:
@@ -229,26 +230,35 @@ def width_of(name: str) -> str:
     return f"{name} width"
 
 
-def sine_attenuation(inputs: Mapping, name: str, wavelength: float):
-    r"""Return the factor by which averaging reduces a sine in each row, shape (n,); 1 if rows are not means.
+def mean_sine(inputs: Mapping, name: str, angle: np.ndarray, wavelength: float) -> np.ndarray:
+    r"""Return the sine of the angles at the middle of each row, shape (n,), as the row measures it.
 
-    .. math:: \frac{\sin(\pi w / \lambda)}{n \sin(\pi w / (n \lambda))}
-
-    This is the Dirichlet kernel for n samples spread evenly over a width w.
+    The mean of n samples spread evenly over a width w reduces it by the Dirichlet kernel
+    :math:`\sin(\pi w / \lambda) / (n \sin(\pi w / (n \lambda)))`. Friction that follows it over a length l,
+    :math:`l\,dz/dx = \sin(2 \pi x / \lambda) - z`, is later by :math:`\arctan(2 \pi l / \lambda)` and smaller
+    by :math:`1 / \sqrt{1 + (2 \pi l / \lambda)^2}`.
 
     Examples
     --------
     Two samples half a wave apart cancel; many over a whole wave, too.
 
     >>> given = {"x width": np.array([1.0, 2.0, 0.5]), "samples": np.array([2.0, 2.0, 1.0])}
-    >>> [round(float(f), 12) for f in sine_attenuation(given, "x", 1.0)]
+    >>> [round(float(f), 12) for f in mean_sine(given, "x", np.pi / 2, 1.0)]
     [0.0, -1.0, 1.0]
+
+    Over the length of a radian, it is an eighth of a turn later.
+
+    >>> round(float(mean_sine({"lag": np.array(1.0)}, "x", np.pi / 4, 2 * np.pi)), 12)
+    0.0
     """
+    turn = 2 * np.pi / wavelength
+    lag = turn * inputs.get(LAG, 0.0)
+    sine = np.sin(angle - np.arctan(lag)) / np.hypot(1.0, lag)
     width = inputs.get(width_of(name))
     if width is None:
-        return 1.0
-    half, samples = np.pi * np.asarray(width, float) / wavelength, np.asarray(inputs[SAMPLES], float)
+        return sine
+    half, samples = turn * np.asarray(width, float) / 2, np.asarray(inputs[SAMPLES], float)
     each = np.sin(half / samples)
     equal = np.abs(each) < 1e-9  # samples whole wavelengths apart have equal values
     whole = np.cos(half) * np.cos(half / samples)
-    return np.where(equal, whole, np.sin(half) / np.where(equal, 1.0, samples * each))
+    return sine * np.where(equal, whole, np.sin(half) / np.where(equal, 1.0, samples * each))

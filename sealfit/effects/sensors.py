@@ -11,8 +11,8 @@ from sealfit.effects.contract import (
     deviation,
     effect,
     factors,
+    mean_sine,
     reference,
-    sine_attenuation,
 )
 
 WAVELENGTH = "wavelength: pitch of the screw, or its whole fraction"
@@ -48,7 +48,7 @@ def ripple(inputs, *, A, lambda_, phi):
     phase. x_ref is 0, or near the positions of a rig that counts from far away.
     """
     x = np.asarray(inputs["displacement_mm"], dtype=float) - reference(inputs, CHANNEL, 0.0)
-    return A * np.sin(2 * np.pi * x / lambda_ + phi) * sine_attenuation(inputs, "displacement_mm", lambda_)
+    return A * mean_sine(inputs, "displacement_mm", 2 * np.pi * x / lambda_ + phi, lambda_)
 
 
 @effect(

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from sealfit.effects.contract import CHANNEL, QUANTITIES_OF, SAMPLES, SECOND, Effect, width_of
+from sealfit.effects.contract import CHANNEL, LAG, QUANTITIES_OF, SAMPLES, SECOND, Effect, width_of
 from sealfit.fit.joint.declared import QUANTITIES, Declared
 from sealfit.fit.joint.rows import ALONG, Rows
 from sealfit.fit.joint.tangent import BlockLayout, Tangent, blocks_of
@@ -50,15 +50,18 @@ class Term:
     def follows(self) -> bool:
         """Whether it changes what the bristles follow, and not the measured force.
 
-        The phase of a ripple is its own, and a wave shorter than a bristle lags by less than one.
+        The phase of a ripple whose origin differs between passes contains the lag.
         """
-        return self.acts_on != "force" and not self.effect.periodic
+        return self.acts_on != "force" and "shift" not in self.fixed
 
     def inputs(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return the inputs of the effect's shape: channels of the rows, shape (n,), and fixed values."""
         given = {}
         for name, channel in zip(self.effect.reads, self.channels, strict=True):
-            if self.follows and channel in ALONG:
+            if self.follows and channel in ALONG and self.effect.periodic:
+                given[name] = rows.values(channel)
+                given[LAG] = given[name] - rows.followed(channel)
+            elif self.follows and channel in ALONG:
                 given[name] = rows.followed(channel)
             else:
                 given[name] = rows.unsigned(channel) if name in (CHANNEL, SECOND) else rows.values(channel)
