@@ -21,7 +21,13 @@ from sealfit.ingest.quality import (
     quality_table,
     repeats_of_force,
 )
-from sealfit.ingest.repeat_checks import judged, outlying_files, settings_within_runs, turned_sign
+from sealfit.ingest.repeat_checks import (
+    judged,
+    other_units,
+    outlying_files,
+    settings_within_runs,
+    turned_sign,
+)
 from sealfit.ingest.runs import FIX, list_traces
 from sealfit.ingest.stored_parts import asked_again, load_parts, make_part, stored_strokes
 from sealfit.progress import timed
@@ -151,7 +157,11 @@ def ingest_campaign(
     inputs = force_inputs(config)
     seen = steady.drop(columns=[*INNER, *config.loop.ignore_channels, *inputs], errors="ignore")
     faults += incomplete_columns(seen, config.series_columns if config.aging else ())
-    faults += improbable_loads(steady, config) + computed_force(inputs & {*steady.columns})
+    faults += (
+        improbable_loads(steady, config)
+        + other_units(steady, config)
+        + computed_force(inputs & {*steady.columns})
+    )
     faults += repeats_of_force(seen)
     faults += settings_within_runs(seen, {*STEADY.names(), *condition_columns(config)})
     used = strokes["used"].to_numpy(bool).copy()

@@ -8,9 +8,10 @@ import pandas as pd
 from scipy.special import stdtr
 
 from sealfit.config import Config
-from sealfit.errors import KEPT, NOTED, STROKE_OUT, Fault
+from sealfit.errors import KEPT, NOTED, STROKE_OUT, ConfigError, Fault
 from sealfit.ingest.quality import FINE, MEASURE_AGAIN
 from sealfit.ingest.scatter import RepeatCodes, ScatterFit, fit_scatter, repeat_means
+from sealfit.units import conversion
 
 # Share of the repeats that the search takes out at most. Beyond it the bulk is not known.
 MAX_OUTLIERS = 0.1
@@ -263,6 +264,45 @@ def settings_within_runs(steady: pd.DataFrame, known: Collection[str]) -> list[F
             reason = f"differs between the repeats of {(counts > 1).sum()} of {len(counts)} runs: {values}."
             fix = "If it was set, put it into the config's condition, or give these files a run_id each."
             faults.append(Fault("setting_in_run", reason, column=name, fix=fix, **KEPT))
+    return faults
+
+
+# Units of force that an export may be in.
+FORCE_UNITS = ("kgf", "lbf", "kN", "mN")
+# Largest error of the ratio to the force of other specimens that shows a unit: friction of specimens differs.
+SAME_RATIO = 0.2
+ALIKE = 2.0  # Most by which the other specimens may differ from their median: else no ratio is surprising.
+SPEED_STEP = 0.2  # Steps of the logarithm of the speed within which levels are compared.
+
+
+def other_units(steady: pd.DataFrame, config: Config) -> list[Fault]:
+    """Return that the force of some specimens is as if in another unit, by that of the rest at their speeds.
+
+    It is the force over the load if all files have one. A specimen counts once in each condition.
+    """
+    rows = steady[steady["used"].to_numpy(bool) & (steady["force_N"].abs() > NOTHING)]
+    known = "load_N" in rows and bool((rows["load_N"].abs() > 0).all())
+    level = np.log(rows["force_N"].abs() / (rows["load_N"].abs() if known else 1.0))
+    piece = pd.MultiIndex.from_frame(rows[["condition", "specimen_id"]].fillna("")).to_flat_index()
+    speed = np.round(np.log(rows["speed_set_mm_s"].fillna(rows["speed_mm_s"].abs())) / SPEED_STEP)
+    levels = level.groupby([piece, speed.to_numpy()]).median().unstack()
+    off = (levels - levels.median()).median(axis=1)
+    faults, ours = [], config.units.unit("force")
+    for unit in FORCE_UNITS:
+        try:
+            ratio = 1 / conversion(unit, ours).factor
+        except ConfigError:  # a torque
+            return []
+        wrong = (off - math.log(ratio)).abs() < math.log1p(SAME_RATIO)
+        if unit == ours or not 0 < wrong.sum() < len(off) / 2 or off[~wrong].abs().max() > math.log(ALIKE):
+            continue
+        files = rows["file"][piece.isin(off.index[wrong])].unique()
+        reason = (
+            f"the friction force is {math.exp(off[wrong].median()):.2g} times that of other specimens at "
+        )
+        reason += f"the same speeds, in {len(files)} files, such as {files[0]}."
+        fix = f"Is the force of these files in {unit}? Export them again in {ours}."
+        faults.append(Fault("other_unit", reason, column="force_N", value=ratio, fix=fix, **KEPT))
     return faults
 
 

@@ -18,7 +18,7 @@ from sealfit.ingest.quality import (
     stuck_samples,
     swapped_faults,
 )
-from sealfit.ingest.repeat_checks import constant_strokes, outlying_files, reversed_strokes
+from sealfit.ingest.repeat_checks import constant_strokes, other_units, outlying_files, reversed_strokes
 from sealfit.ingest.strokes import Stroke, find_strokes
 from sealfit.ingest.trace_checks import displacement_spikes, force_spikes, resolution
 from sealfit.tables import QUALITY
@@ -435,3 +435,26 @@ def test_columns_that_follow_the_force_in_all_strokes_are_named():
     assert repeats_of_force(steady.head(5)) == []
     unknown = steady.assign(load_N=np.nan)
     assert [fault.column for fault in repeats_of_force(unknown)] == ["cof", "force_kN"]
+
+
+def specimens_of(scale, speeds=(1.0, 10.0, 100.0)):
+    """Steady strokes of specimens at a few speeds, the force of each multiplied by its scale."""
+    force = {speed: 30.0 / (1 + k) for k, speed in enumerate(speeds)}
+    rows = [(f"s{k}", speed, force[speed] * own) for k, own in enumerate(scale) for speed in speeds]
+    table = pd.DataFrame(rows, columns=["specimen_id", "speed_mm_s", "force_N"])
+    table["file"] = table["specimen_id"] + "_" + table["speed_mm_s"].astype(str) + ".csv"
+    return table.assign(condition="c", speed_set_mm_s=table["speed_mm_s"], load_N=np.nan, used=True)
+
+
+@pytest.mark.parametrize(("unit", "in_N"), [("kgf", 9.80665), ("lbf", 4.4482), ("kN", 1e3), ("mN", 1e-3)])
+def test_specimens_whose_force_is_in_another_unit_are_named(unit, in_N):
+    (fault,) = other_units(specimens_of([1.0, 0.9, 1.05 / in_N, 1.1]), Config())
+    assert "in 3 files, such as s2_1.0.csv" in fault.reason
+    assert fault.fix == f"Is the force of these files in {unit}? Export them again in N."
+
+
+@pytest.mark.parametrize("scale", [[1.0, 0.9, 0.5, 1.1], [1.0, 0.1], [1.0, 0.3, 0.1, 2.0], [1.0]])
+def test_no_unit_is_suspected_where_friction_differs_otherwise(scale):
+    assert other_units(specimens_of(scale), Config()) == []
+    torque = parse_config('[quantities]\nforce = {quantity = "torque", unit = "mN m"}\n', "rig.toml")
+    assert other_units(specimens_of([1.0, 0.1, 1.0, 1.0]), torque) == []
