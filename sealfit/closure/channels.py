@@ -97,7 +97,7 @@ def find_channels(
             values = settings(level_values(values, rows))
         elif not 2 <= np.unique(values).size <= criteria.MOST_LEVELS:
             continue
-        if name == "stroke" and "direction" not in ignore and _out_and_back(values, rows):
+        if name == "stroke" and "direction" not in ignore and out_and_back(rows):
             continue
         channel = Channel(name, values, unit_of(values, rows))
         channel = replace(channel, grouping=not channel.numeric and _is_grouping(channel, rows))
@@ -260,9 +260,9 @@ def flip_level(unit: str, rows: Rows) -> str:
     return "stroke"
 
 
-def _out_and_back(stroke: np.ndarray, rows: Rows) -> bool:
+def out_and_back(rows: Rows) -> bool:
     """Whether the stroke number only distinguishes the two directions."""
-    pairs = np.unique(np.column_stack([stroke, np.sign(rows.speed)]), axis=0)
+    pairs = np.unique(np.column_stack([rows.values("stroke"), np.sign(rows.speed)]), axis=0)
     return len(pairs) == 2 and bool((np.ptp(pairs, axis=0) > 0).all())
 
 

@@ -10,18 +10,18 @@ import numpy as np
 import pandas as pd
 
 from sealfit.closure import criteria
-from sealfit.closure.channels import follows_strokes, level_values, settings, varies
+from sealfit.closure.channels import follows_strokes, level_values, out_and_back, settings, varies
 from sealfit.closure.errors_and_intervals import mean_se
 from sealfit.closure.forms import describe
 from sealfit.closure.left_out import between_speeds, blocks, covered, foldable, folds, whole_settings
 from sealfit.closure.linearised import Proposal
-from sealfit.closure.naming import rivals
+from sealfit.closure.naming import LINEAR, rivals
 from sealfit.closure.ripples import agreement, pass_shifts, waves_of
 from sealfit.config import Config, Loop
 from sealfit.effects.contract import Effect
 from sealfit.effects.free import WITHIN
 from sealfit.fit.joint import Fitted, fit, with_reml_smoothness
-from sealfit.fit.joint.model import Model, evaluate, shape_of
+from sealfit.fit.joint.model import Model, Term, evaluate, shape_of
 from sealfit.fit.joint.rows import ALONG, LEVELS, Rows
 from sealfit.fit.joint.whitening import Whitening
 from sealfit.progress import Silent
@@ -256,8 +256,12 @@ def confirmed(
         label = describe(proposal.term, fitted.rows)
         context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
-            others = rivals(proposal, proposals)
-            most = criteria.MOST_RIVALS if context.compare else 0
+            others, most = rivals(proposal, proposals), 0
+            if context.compare:
+                others, most = (
+                    _by_stroke_number(proposal, context.effects[LINEAR]) + others,
+                    criteria.MOST_RIVALS,
+                )
             left = [heldout_gain(fitted, rival, config.loop, samples).left_N for rival in others[:most]]
             left += [np.nan] * (len(others) - len(left))
             others = tuple(zip(others, left, strict=True))
@@ -265,6 +269,21 @@ def confirmed(
         if proposal.p_value <= config.loop.family_error:
             refused.append(RefusedEffect(proposal, reason))
     return None, refused
+
+
+def _by_stroke_number(proposal: Proposal, linear: Effect) -> list[Proposal]:
+    """Return an asymmetry as an effect of the stroke number if that only distinguishes the directions."""
+    term = proposal.term
+    if term.effect.id != "asymmetry" or not out_and_back(proposal.fitted.rows):
+        return []
+    rows = proposal.fitted.rows
+    forward = rows.values("stroke")[rows.speed > 0][0]
+    middle = float(rows.values("stroke").min() + rows.values("stroke").max()) / 2
+    model = proposal.fitted.model
+    own = Term(linear, ("stroke",), *term.target, fixed={"x_ref": middle})
+    slope = model.values[-1]["A"] / (2 * (forward - middle))
+    model = model.without_term(len(model.terms) - 1).with_term(own, {"A": float(slope)})
+    return [replace(proposal, term=own, fitted=replace(proposal.fitted, model=model))]
 
 
 def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.DataFrame) -> str | None:

@@ -2,6 +2,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import numpy.testing as npt
 import pandas as pd
 import pytest
 from bins_helpers import make_bins
@@ -13,6 +14,7 @@ from sealfit.closure.confirm import (
     OF_THE_RISE,
     Context,
     Gain,
+    _by_stroke_number,
     about_means,
     confirmed,
     error_of_rise_N,
@@ -30,7 +32,7 @@ from sealfit.closure.linearised import Proposal
 from sealfit.config import Config, Loop
 from sealfit.effects import EFFECTS
 from sealfit.fit.joint import fit, fit_declared, fitted_at
-from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.model import Term, evaluate
 from sealfit.fit.joint.rows import make_rows
 
 
@@ -386,6 +388,21 @@ def test_a_recorder_hides_what_is_less_than_the_rounding_of_its_steps():
     assert rounding_error_N(pd.concat([noisy] * 9)) == 0.0  # noise of a step spreads the rounding
     assert rounding_error_N(STEPS.assign(force_N=rng.normal(10, 0.1, len(STEPS)))) == 0.0  # no steps
     assert rounding_error_N(STEPS.assign(force_N=10.0)) == 0.0
+
+
+@pytest.mark.parametrize(("strokes", "same"), [((1, 2), True), ((2, 1), True), ((1, 1), False)])
+def test_an_asymmetry_of_strokes_out_and_back_may_be_one_of_the_stroke_number(strokes, same):
+    bins = make_bins(0, temperatures=(60.0,), days=(4.0,), bins=4, directions=(1, -1))
+    rows = make_rows(bins.assign(stroke=np.where(bins["direction"] > 0, *strokes)), has_aging=True)
+    before = fit_declared(rows)
+    term = Term(EFFECTS["asymmetry"], ("direction",), "mu", "multiply")
+    after = fitted_at(before.model.with_term(term, {"A": 0.1}), rows, before.scatter)
+    column = np.zeros(rows.force.size)
+    proposal = Proposal(term, {"A": 0.1}, "run", 10, 1.0, 1e-9, column, ((),), fitted=after)
+    found = _by_stroke_number(proposal, EFFECTS["linear"])
+    assert [one.term.channels for one in found] == [("stroke",)] * same
+    for one in found:
+        npt.assert_allclose(evaluate(one.fitted.model, rows, jacobian=False)[0], after.force)
 
 
 def test_means_are_taken_in_groups_and_directions():
