@@ -374,7 +374,8 @@ def _missing(ours: str, layout: FileLayout, width: int, settings: TraceFormat) -
         marks = ((";", ";"), ("\t", "tab"), (",", ","), ("|", "|"), (" ", "whitespace"))
         likely = [w for mark, w in marks if len(split_line(line, mark)) >= 2 and mark != settings.delimiter]
         if likely:
-            fix = f'The header looks separated otherwise: set delimiter = "{likely[0]}" in the rig config.'
+            fix = f'The header looks separated otherwise. If all files are so, set delimiter = "{likely[0]}" '
+            fix += "in the rig config; else export this one as the others are."
     return missing_column(theirs, layout, fix)
 
 

@@ -44,28 +44,44 @@ FEW_LEVELS, NEXT_LEVELS = 5, 30
 BY_CHANCE = 1e-4  # that so many samples lie at the extreme; few strokes come so far that it is asked
 # Share of the force that may be missing where a stroke ends: more, and it was never steady.
 STILL_RISING = 0.01
+# Least size of a jump of the displacement: in usual steps, and as a share of the way of the stroke.
+JUMP, SMALLEST_JUMP = 20.0, 0.02
 MEASURE_AGAIN = "Check the cable and the logger, and measure again."
 
 
 def stroke_faults(stroke: Stroke, trace: Trace, settings: Quality) -> list[Fault]:
     """Return what is wrong with one stroke of a trace by itself: short, gappy, saturated, stuck."""
+    whole, steady = slice(stroke.start, stroke.stop), stroke.rows
+    drive = "Drive at a constant speed"
+    if not stroke.settles and (jump := _jump(trace, whole)):
+        drive = f"{jump}. Otherwise drive at a constant speed"
     if stroke.short is not None:
         reason, samples = stroke.short, float(len(stroke.rows))
         fix = "Slide further or sample faster; or set strokes.min_samples and min_steady_share in the config."
         if not stroke.settles:
-            reason, fix = f"the speed never settles: {reason}", f"Drive at a constant speed. {fix}"
+            reason, fix = f"the speed never settles: {reason}", f"{drive}. {fix}"
         return [Fault("too_short", f"{reason}.", value=samples, fix=fix, **STROKE_OUT)]
     found = []
     if not stroke.settles:
         reason = "the speed never settles: where it is highest it still changes by more than the tolerance. "
         reason += "Its steady force is a mean over these speeds; bins have a speed each."
-        fix = "Drive at a constant speed; lower strokes.speed_tolerance where steps of the speed are smaller."
+        fix = f"{drive}; lower strokes.speed_tolerance where steps of the speed are smaller."
         speed = float(stroke.speed_mm_s)
         found = [Fault("no_plateau", reason, column="speed_mm_s", value=speed, fix=fix, **KEPT)]
-    whole, steady = slice(stroke.start, stroke.stop), stroke.rows
     found += _gaps(trace.columns["time_s"][whole], trace.line[whole], trace.number[whole], settings)
     force_N, line = trace.columns["force_N"][steady], trace.line[steady]
     return found + (_saturated(force_N, line, settings) or _stuck(force_N, line, settings))
+
+
+def _jump(trace: Trace, rows: slice) -> str:
+    """Return where the displacement of a stroke jumps within a usual step of the time, or ""."""
+    steps, times = (np.abs(np.diff(trace.columns[name][rows])) for name in ("displacement_mm", "time_s"))
+    steps = np.where(times < 2 * np.median(times), steps, 0.0)
+    most = int(steps.argmax())
+    if steps[most] < JUMP * np.median(steps) or steps[most] < SMALLEST_JUMP * steps.sum():
+        return ""
+    line = trace.line[rows][most + 1]
+    return f"The displacement jumps by {steps[most]:.3g} at line {line}: look for slip of the encoder"
 
 
 def rising_faults(left_N: float, force_N: float, unit: str) -> list[Fault]:

@@ -329,6 +329,10 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
             f"{abs(row.t):.1f} SDs of the scatter pooled over runs (p = {row.p:.1g})."
         )
         fix = "Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out."
+        if row.alone:
+            fix = (
+                "Look into the notes of both tests, and take the wrong file out; two do not show which it is."
+            )
         place = {"file": row.file, "column": "force_N", "value": float(row.force_N), "severity": "warning"}
         action = "file left out" if out else "kept"
         found.append(Fault("outlier", reason, action=action, fix=fix, **place))

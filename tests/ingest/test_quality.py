@@ -158,8 +158,20 @@ def fault_of_a_sinusoid(settings):
     x = -10.0 * np.cos(0.5 * np.pi * time)
     force = 20.0 + 0.1 * np.gradient(x, time)
     (stroke,) = find_strokes(time, x, force, settings)
-    (fault,) = stroke_faults(stroke, rows_of(time, force), Quality())
+    rows = rows_of(time, force)
+    rows.columns["displacement_mm"] = x
+    (fault,) = stroke_faults(stroke, rows, Quality())
     return fault
+
+
+def test_where_the_displacement_jumps_the_encoder_may_have_slipped():
+    time, x, force = trace()
+    x[500:] += 3.0
+    (stroke,) = find_strokes(time, x, force, Strokes())
+    rows = rows_of(time, force)
+    rows.columns["displacement_mm"] = x
+    (fault,) = stroke_faults(stroke, rows, Quality())
+    assert fault.fix.startswith("The displacement jumps by 3.04 at line 502: look for slip of the encoder. ")
 
 
 def test_a_stroke_whose_speed_never_settles_is_kept_however_short_its_window_is():
