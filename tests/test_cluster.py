@@ -186,6 +186,7 @@ def campaign(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(partitions, "PART_FILES", 12)
         patch.setattr(loop, "JACKKNIFE_UNITS", 6)  # so that the folds search, few runs as there are
+        patch.setattr(loop, "CERTAIN_P", 0.0)  # and sure as the effect is
         run(folder / "c", folder / "here", folder / "rig.toml", steps=STEPS[:-1], workers=1)
     return folder / "c", folder / "rig.toml", results(folder / "here")
 
@@ -252,6 +253,7 @@ def test_the_pipeline_on_a_cluster_gives_the_same_although_a_worker_is_killed(
     folder, rig, (here, closure) = campaign
     monkeypatch.setattr(partitions, "PART_FILES", 12)
     monkeypatch.setattr(loop, "JACKKNIFE_UNITS", 6)
+    monkeypatch.setattr(loop, "CERTAIN_P", 0.0)
     kills = KillsAt(dask.workers[1], "fold 1 of")
     run(folder, tmp_path / "there", rig, steps=STEPS[:-1], scheduler=str(dask.file), progress=kills)
     assert kills.killed
