@@ -120,6 +120,20 @@ def test_a_contrast_of_two_groups_beside_their_mean_is_the_t_test_of_two_samples
     npt.assert_allclose(test.df, units - 2, rtol=1e-9)
 
 
+def test_a_contrast_of_units_that_other_columns_determine_is_not_tested():
+    """Their deviations are rounding errors, to which any contrast is large."""
+    rows = make_rows(make_bins(0, days=(1.0, 4.0), speeds=FEW_SPEEDS, bins=8), has_aging=True)
+    run, rng = rows.codes("run"), np.random.default_rng(0)
+    fitted = replace(fit_declared(rows), white_residual=rng.normal(size=run.size))
+    scale = np.isin(run, (0, 1)) / np.sqrt(np.isin(run, (0, 1)).sum())
+    left, mean = (np.where(run == 0, 1.0, -1.0) * scale)[:, None], scale[:, None]
+    assert contrast_test(fitted.beside(mean), left, "run", other=mean) is None
+    half = np.where(run == 2, 1.0, left[:, 0])[:, None]  # a third unit, which is free
+    half /= np.linalg.norm(half)
+    test = contrast_test(fitted.beside(mean), half, "run", other=mean)
+    assert test is None or test.variance > 0.01
+
+
 def test_moderated_p_values_are_uniform_where_every_unit_has_its_own_slope():
     rng = np.random.default_rng(5)
     units, contrasts, found = 8, 40, []
