@@ -256,12 +256,10 @@ def confirmed(
         label = describe(proposal.term, fitted.rows)
         context.say(f"  round {number}: {label}: held-out gain {gain.rmse_N:.4g} {unit}")
         if reason is None:
-            others, most = rivals(proposal, proposals), 0
+            others = rivals(proposal, proposals)
             if context.compare:
-                others, most = (
-                    _by_stroke_number(proposal, context.effects[LINEAR]) + others,
-                    criteria.MOST_RIVALS,
-                )
+                others = _by_stroke_number(proposal, context.effects[LINEAR]) + others
+            most = criteria.MOST_RIVALS if context.compare else 0
             left = [heldout_gain(fitted, rival, config.loop, samples).left_N for rival in others[:most]]
             left += [np.nan] * (len(others) - len(left))
             others = tuple(zip(others, left, strict=True))

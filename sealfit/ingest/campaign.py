@@ -157,11 +157,8 @@ def ingest_campaign(
     inputs = force_inputs(config)
     seen = steady.drop(columns=[*INNER, *config.loop.ignore_channels, *inputs], errors="ignore")
     faults += incomplete_columns(seen, config.series_columns if config.aging else ())
-    faults += (
-        improbable_loads(steady, config)
-        + other_units(steady, config)
-        + computed_force(inputs & {*steady.columns})
-    )
+    faults += improbable_loads(steady, config) + computed_force(inputs & {*steady.columns})
+    faults += other_units(steady, config)
     faults += repeats_of_force(seen)
     faults += settings_within_runs(seen, {*STEADY.names(), *condition_columns(config)})
     used = strokes["used"].to_numpy(bool).copy()

@@ -298,10 +298,9 @@ def other_units(steady: pd.DataFrame, config: Config) -> list[Fault]:
         if unit == ours or not 0 < wrong.sum() < len(off) / 2 or off[~wrong].abs().max() > math.log(ALIKE):
             continue
         files = rows["file"][piece.isin(off.index[wrong])].unique()
-        reason = (
-            f"the friction force is {math.exp(off[wrong].median()):.2g} times that of other specimens at "
-        )
-        reason += f"the same speeds, in {len(files)} files, such as {files[0]}."
+        times = math.exp(off[wrong].median())
+        reason = f"the friction force is {times:.2g} times that of other specimens at the same speeds, "
+        reason += f"in {len(files)} files, such as {files[0]}."
         fix = f"Is the force of these files in {unit}? Export them again in {ours}."
         faults.append(Fault("other_unit", reason, column="force_N", value=ratio, fix=fix, **KEPT))
     return faults
@@ -330,9 +329,7 @@ def outlying_files(steady: pd.DataFrame, config: Config) -> tuple[pd.DataFrame, 
         )
         fix = "Look into the notes of that test; quality.drop_outliers in the config leaves such repeats out."
         if row.alone:
-            fix = (
-                "Look into the notes of both tests, and take the wrong file out; two do not show which it is."
-            )
+            fix = "Look into the notes of both tests, and take the file of the wrong one out."
         place = {"file": row.file, "column": "force_N", "value": float(row.force_N), "severity": "warning"}
         action = "file left out" if out else "kept"
         found.append(Fault("outlier", reason, action=action, fix=fix, **place))

@@ -297,10 +297,8 @@ def outlier_clause(closure: Mapping) -> str:
     outliers = closure["outlier_files"]
     if not outliers:
         return ""
-    named = [
-        f"{one['file']} ({one['deviation_pct']:+.{0 if abs(one['deviation_pct']) >= 10 else 1}f} %)"
-        for one in outliers[:NAMED]
-    ]
+    sizes = [(one["file"], one["deviation_pct"]) for one in outliers[:NAMED]]
+    named = [f"{file} ({size:+.{int(abs(size) < 10)}f} %)" for file, size in sizes]
     more = f" and {len(outliers) - NAMED} more" if len(outliers) > NAMED else ""
     what = "a file whose force is" if len(outliers) == 1 else f"{len(outliers)} files whose force is"
     return f"left out: {what} far off what all others predict: {', '.join(named)}{more}"
