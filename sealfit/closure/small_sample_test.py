@@ -30,8 +30,7 @@ from sealfit.fit.joint.whitening import Whitening
 
 # Smallest variance of a contrast, so that one of noise-free data, 0 of 0, has the p-value 1.
 LEAST_VARIANCE = 1e-300
-# Least share of a contrast's variance that the deviations of the units are expected to show.
-LEAST_EXPECTED = 0.5
+LEAST_FREE = 0.5  # Least share of a contrast in units whose scores other columns do not determine.
 
 
 class ContrastTest(NamedTuple):
@@ -74,11 +73,11 @@ def contrast_test(
     for k in range(shared.shape[2]):
         shared[:, :, k] = groups.sums(left * other[:, [k]], level)
     own = own_share(leverage, shared)
-    divisor = np.maximum(own, 1 - criteria.LARGEST_LEVERAGE)
-    deviations = (scores - leverage * slope) / np.sqrt(divisor)
+    deviations = (scores - leverage * slope) / np.sqrt(own)
     df = satterthwaite_df(leverage, shared)
-    # Where the other columns determine the units' scores the deviations are rounding errors.
-    known = (df >= criteria.LEAST_DF) & ((leverage * own / divisor).sum(axis=0) >= LEAST_EXPECTED)
+    # Where the other columns determine the scores of units their deviations are rounding errors.
+    free = own > 1 - criteria.LARGEST_LEVERAGE
+    known = (df >= criteria.LEAST_DF) & ((leverage * free).sum(axis=0) >= LEAST_FREE)
     if not known.any():
         return None
     variance = np.maximum((deviations**2).sum(axis=0), LEAST_VARIANCE)
@@ -94,7 +93,8 @@ def own_share(leverage: np.ndarray, shared: np.ndarray) -> np.ndarray:
 
     `shared`, shape (units, m, columns), are the products of the contrast and the columns within each unit.
     """
-    return 1 - leverage - (shared**2).sum(axis=2) / np.maximum(leverage, 1e-300)
+    taken = leverage + (shared**2).sum(axis=2) / np.maximum(leverage, 1e-300)
+    return 1 - np.minimum(taken, criteria.LARGEST_LEVERAGE)
 
 
 def satterthwaite_df(leverage: np.ndarray, shared: np.ndarray | None = None) -> np.ndarray:
@@ -105,7 +105,7 @@ def satterthwaite_df(leverage: np.ndarray, shared: np.ndarray | None = None) -> 
     """
     shared = np.empty((*leverage.shape, 0)) if shared is None else shared
     both = np.concatenate([leverage[:, :, None], shared], axis=2)
-    both /= np.sqrt(np.maximum(own_share(leverage, shared), 1 - criteria.LARGEST_LEVERAGE))[:, :, None]
+    both /= np.sqrt(own_share(leverage, shared))[:, :, None]
     # Sum of the squared elements of the covariance outside its diagonal, which is the leverage.
     products = np.einsum("umi,umj->mij", both, both)
     outside = (products**2).sum(axis=(1, 2)) - ((both**2).sum(axis=2) ** 2).sum(axis=0)

@@ -76,9 +76,12 @@ def stroke_faults(stroke: Stroke, trace: Trace, settings: Quality) -> list[Fault
 def _jump(trace: Trace, rows: slice) -> str:
     """Return where the displacement of a stroke jumps within a usual step of the time, or ""."""
     steps, times = (np.abs(np.diff(trace.columns[name][rows])) for name in ("displacement_mm", "time_s"))
+    if not steps.any():
+        return ""
+    usual = np.median(steps[steps > 0])  # a coarse encoder stands still in most samples
     steps = np.where(times < 2 * np.median(times), steps, 0.0)
     most = int(steps.argmax())
-    if steps[most] < JUMP * np.median(steps) or steps[most] < SMALLEST_JUMP * steps.sum():
+    if steps[most] < JUMP * usual or steps[most] < SMALLEST_JUMP * steps.sum():
         return ""
     line = trace.line[rows][most + 1]
     return f"The displacement jumps by {steps[most]:.3g} at line {line}: look for slip of the encoder"

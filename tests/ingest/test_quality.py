@@ -8,6 +8,7 @@ from sealfit.ingest.averages import read_strokes
 from sealfit.ingest.cells import Trace
 from sealfit.ingest.columns import TraceRef
 from sealfit.ingest.quality import (
+    _jump,
     improbable_loads,
     incomplete_columns,
     load_faults,
@@ -470,3 +471,20 @@ def test_no_unit_is_suspected_where_friction_differs_otherwise(scale):
     assert other_units(specimens_of(scale), Config()) == []
     torque = parse_config('[quantities]\nforce = {quantity = "torque", unit = "mN m"}\n', "rig.toml")
     assert other_units(specimens_of([1.0, 0.1, 1.0, 1.0]), torque) == []
+
+
+@pytest.mark.parametrize("commanded", [0.0, np.nan])
+def test_speeds_that_are_not_commanded_are_measured_where_units_are_compared(commanded):
+    assert (
+        len(other_units(specimens_of([1.0, 0.9, 0.1, 1.1]).assign(speed_set_mm_s=commanded), Config())) == 1
+    )
+
+
+def test_steps_of_a_coarse_encoder_are_no_jumps():
+    place = np.repeat(np.arange(20.0), 50)
+    rows = rows_of(np.arange(1000) * 0.01, place)
+    rows.columns["displacement_mm"] = place
+    assert _jump(rows, slice(0, 1000)) == ""
+    assert _jump(rows, slice(0, 1)) == _jump(rows, slice(0, 40)) == ""  # nothing moves
+    place[500:] += 30.0
+    assert "jumps by 31 at line 502" in _jump(rows, slice(0, 1000))
