@@ -16,7 +16,15 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sealfit.config import Strokes
-from sealfit.ingest.window import SAME_SPEED, SPEED_NOISE, STANDSTILL, speed_along, steady_window, stretches
+from sealfit.ingest.window import (
+    LEAST_ROWS,
+    SAME_SPEED,
+    SPEED_NOISE,
+    STANDSTILL,
+    speed_along,
+    steady_window,
+    stretches,
+)
 
 # Share of the travel of a motion that a steady speed covers at least. It is ten times what counts as a rest
 # (`_bounds`), so that no creep is one; 1, 3, 10 and 30 mm/s for equal times cover 2 % and more.
@@ -27,6 +35,10 @@ LEAST_TRAVEL = 0.01
 OFF_SPEED, MOST_OFF_SPEED = 0.2, 0.3
 # Samples of a steady speed among several, at least. With 6, some are found on ramps of 50 samples.
 FEWEST_SAMPLES = 10
+# Lengths of the rise from rest over which friction follows a step from another speed: of a change of 50 %
+# then 0.05 % are left. At least a half of the steady window is kept, and all of it where the transient is
+# below so many standard errors.
+AFTER_STEP, KEPT, CLEAR_STEP = 7.0, 0.5, 4.0
 # Share of a turn below which what comes before the first or after the last whole turn is no turn of its own.
 PART_OF_TURN = 0.05
 # Ratio of measured speeds from which they are two settings. Without speed control they vary nearly as much.
@@ -71,12 +83,13 @@ OF_ROWS = ("steady", "sliding", "presliding_N", "speed_along_mm_s")  # arrays of
 
 
 class _TraceMotion(NamedTuple):
-    """A trace as strokes are found in it: arrays of shape (n,), and the noise of a displacement sample."""
+    """A trace as strokes are found in it: arrays of shape (n,), noise of a displacement sample, settings."""
 
     time_s: np.ndarray
     displacement_mm: np.ndarray
     force_N: np.ndarray
     noise_mm: float
+    settings: Strokes
 
 
 def find_strokes(
@@ -104,28 +117,35 @@ def find_strokes(
         return []
     bounds, origin = _bounds(smooth, turns, max(3.0 * noise, 1e-3 * span), settings.smooth_samples)
     # Single spikes must not decide where a rise ends.
-    motion = _TraceMotion(time_s, displacement_mm, median_filter(force_N, 3, mode="nearest"), noise)
+    motion = _TraceMotion(time_s, displacement_mm, median_filter(force_N, 3, mode="nearest"), noise, settings)
     found = []
     for number, (start, stop) in enumerate(pairwise(bounds), start=1):
         way = 1 if smooth[turns[number]] > smooth[turns[number - 1]] else -1
         first = origin if number == 1 else start
         rows = slice(start, stop)
         parts = steady_speeds(time_s[rows], way * displacement_mm[rows], noise, settings)
+        rise_mm = 0.0  # that of the last start from rest
         for part, begin in parts:
             own = slice(start + part.start, start + part.stop)
-            stroke = _stroke(motion, settings, own, start + begin, first, way)
+            stroke = _stroke(motion, own, start + begin, first, way, rise_mm)
+            rise_mm = stroke.rise_mm or rise_mm
             stroke = replace(stroke, several_speeds=len(parts) > 1)
             found += _turns(time_s, displacement_mm, smooth, stroke, settings)
     return found
 
 
-def _stroke(
-    motion: _TraceMotion, settings: Strokes, rows: slice, begin: int, origin: int, way: int
-) -> Stroke:
-    """Return the stroke that takes these rows of a trace; before `begin` it slides at another speed."""
+def _stroke(motion: _TraceMotion, rows: slice, begin: int, origin: int, way: int, rise_mm: float) -> Stroke:
+    """Return the stroke that takes these rows of a trace; before `begin` it slides at another speed.
+
+    Without a pre-sliding rise of its own, friction may still follow the step between the speeds: `rise_mm` is
+    the length of the rise from rest.
+    """
+    settings = motion.settings
     time_s, displacement_mm, force_N = (values[begin : rows.stop] for values in motion[:3])
     along, noise, tolerance = way * displacement_mm, motion.noise_mm, settings.speed_tolerance
     window = steady_window(time_s, along, way * force_N, max(origin - begin, 0), noise, tolerance)
+    if rise_mm and not window.rise_mm:
+        window.steady[_following_step(along, way * force_N, window.steady, rise_mm)] = False
     before = np.zeros(begin - rows.start)  # it slides there, at another speed
     steady, sliding = np.r_[before > 0.0, window.steady], np.r_[before == 0.0, window.sliding]
     left_N = way * np.r_[before, window.left_N]
@@ -136,6 +156,29 @@ def _stroke(
     ends = (rows.start, rows.stop)
     of_rows = (steady, sliding, left_N, along)
     return Stroke(*ends, origin, way, speed, *of_rows, window.rise_mm, short, window.settles)
+
+
+def _following_step(
+    along_mm: np.ndarray, force_N: np.ndarray, steady: np.ndarray, rise_mm: float
+) -> np.ndarray:
+    """Return which rows of a steady window follow a step between two speeds, as a mask of shape (n,).
+
+    The transient is C exp(-x / `rise_mm`) beside a straight line, by least squares.
+    """
+    none = np.zeros(len(along_mm), dtype=bool)
+    if np.count_nonzero(steady) < LEAST_ROWS:
+        return none
+    x = along_mm - along_mm[0]
+    own = x[steady]
+    columns = np.vstack([np.exp(-own / rise_mm), np.ones(own.size), own]).T
+    basis, triangle = np.linalg.qr(columns[:, ::-1])
+    coefficients = basis.T @ force_N[steady]
+    left = force_N[steady] - basis @ coefficients
+    noise = np.sqrt(left @ left / (own.size - 3))
+    if abs(triangle[2, 2]) < 1e-9 or abs(coefficients[2]) <= CLEAR_STEP * noise:
+        return none
+    end = min(AFTER_STEP * rise_mm, own[-1] - KEPT * np.ptp(own))
+    return steady & (x < end)
 
 
 def _turns(

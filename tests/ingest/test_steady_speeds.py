@@ -49,6 +49,25 @@ def assert_parts(found, time, speed, speeds):
         assert len(stroke.rows) > 0.6 * there.sum() / speeds.count(wanted)
 
 
+def test_friction_follows_a_step_between_speeds_before_its_window_begins():
+    """Bristles of 0.5 mm, whose force relaxes as exp(-x / 0.5 mm) to the level of each speed."""
+    levels = {2.0: 40.0, 4.0: 36.0, 8.0: 30.0}
+    time, x, _, speed = moved([2.0, 4.0, 8.0, 4.0, 2.0], 500, hold=6.0)
+    level = np.interp(speed, [0.0, *levels], [40.0, *levels.values()])
+    force = np.zeros(time.size)
+    for row in range(1, time.size):
+        left = np.exp(-(x[row] - x[row - 1]) / 0.5)
+        force[row] = level[row] + (force[row - 1] - level[row]) * left
+    force += np.random.default_rng(1).normal(0.0, 0.05, time.size)
+    found = found_in(time, x, force)
+    assert len(found) == 5
+    for stroke in found:
+        rows, wanted = stroke.rows, levels[round(stroke.speed_mm_s)]
+        settled = force[rows] + stroke.presliding_N[rows - stroke.start]
+        npt.assert_allclose(settled[:100].mean(), wanted, rtol=0.002)
+        assert rows.size > 0.4 * 6.0 * 500
+
+
 SPEEDS = [[5.0, 10.0, 20.0, 40.0], [40.0, 20.0, 10.0, 5.0], [42.0, 83.0, 125.0, 42.0], [1.0, 3.0, 10.0, 30.0]]
 
 
