@@ -22,7 +22,7 @@ from sealfit.closure.small_sample_test import (
     specimens_agree,
 )
 from sealfit.fit.joint import Fitted
-from sealfit.fit.joint.rows import LEVELS, Cache, cached
+from sealfit.fit.joint.rows import CELL, LEVELS, Cache, cached
 from sealfit.fit.joint.tangent import OwnColumns, Tangent
 from sealfit.fit.joint.variance_components import orthonormal
 
@@ -44,6 +44,7 @@ from sealfit.fit.joint.variance_components import orthonormal
 # against the scatter of their slopes (`slopes`).
 
 NOISE_DRAWS = 300  # Number of draws of noise from which the effective number of contrasts follows, to 5 %.
+FRICTION = ("mu", "multiply")  # Target along which the forces of cells are compared.
 # A unit alone determines a direction if the eigenvalue of what is left without the unit is smaller.
 OWN = 1e-6
 # A direction of the tangent space with a smaller singular value lies in the specimens' own columns.
@@ -141,7 +142,8 @@ class ScoreTests:
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
-        self.cluster_tests = {level: ClusterTests(fitted, level) for level in LEVELS}
+        levels = LEVELS if fitted.rows.cells() is None else (CELL, *LEVELS)
+        self.cluster_tests = {level: ClusterTests(fitted, level) for level in levels}
         self.other = np.empty((fitted.force.size, 0))  # columns beside which others are tested
         self.cache = Cache()
 
@@ -208,6 +210,10 @@ class ScoreTests:
             return None
         weakest = max(found, key=lambda j: max(j.log_p, j.log_p_jackknife))
         weakest = weakest._replace(units=starts[level].size)
+        if level in ("file", "run") and self._constant_in_cells(variants):
+            test = self._test_of_constants(variants, FRICTION, (CELL,))
+            found = weakest._replace(small_sample=test)
+            return found._replace(chi2=test.chi2, df=test.basis.shape[1]) if test is not None else None
         if not few_units:
             return weakest._replace(consistent=all(map(self._specimens_agree, variants)))
         if level == "specimen":
@@ -219,7 +225,8 @@ class ScoreTests:
         tests = tuple(contrast_test(self.fitted, left, *given) for left in variants)
         if any(test is None for test in tests):
             return None
-        constant = self._test_of_constants(variants, target, between) if between in ("file", "run") else None
+        own = ("run", "file") if between in ("run", "file") else ()
+        constant = self._test_of_constants(variants, target, own)
         return weakest._replace(slopes=tests, small_sample=constant)
 
     def _specimens_agree(self, left: np.ndarray) -> bool:
@@ -230,15 +237,22 @@ class ScoreTests:
         explained = self._explained(left)[:, None]
         return not along_strokes(fitted, explained)[0] or bool(specimens_agree(fitted, explained)[0])
 
-    def _test_of_constants(
-        self, variants: Sequence[np.ndarray], target: tuple[str, str], coarsest: str
-    ) -> SmallSampleTest | None:
-        """Return the weakest exact F test of columns constant in each run, file or specimen, or None.
+    def _constant_in_cells(self, variants: Sequence[np.ndarray]) -> bool:
+        """Whether columns are one number per cell. Their files are no independent evidence then."""
+        cells = self.cluster_tests.get(CELL)
+        if cells is None:
+            return False
+        return all(cells.share(left, FRICTION) > criteria.CONSTANT_IN_RUNS for left in variants)
 
-        Of runs or files it is not significant if fewer than `LEAST_BEARING` bear the evidence: a wrong file
-        is no normal scatter.
+    def _test_of_constants(
+        self, variants: Sequence[np.ndarray], target: tuple[str, str], levels: Sequence[str]
+    ) -> SmallSampleTest | None:
+        """Return the weakest exact F test of columns that are constant in units of the first such level.
+
+        Of cells, runs or files it is not significant if fewer than `LEAST_BEARING` bear the evidence: a wrong
+        file is no normal scatter.
         """
-        for level in ("specimen",) if coarsest == "specimen" else ("run", "file"):
+        for level in levels:
             tests = [self.cluster_tests[level].test(left, target) for left in variants]
             if all(test is not None and test.share > criteria.CONSTANT_IN_RUNS for test in tests):
                 weakest = max(tests, key=lambda test: test.log_p)
@@ -251,8 +265,7 @@ class ScoreTests:
 
         It is (sum s)^2 / sum s^2 of the sums of squares s that the columns explain in each unit.
         """
-        fitted = self.fitted
-        scores = fitted.rows.groups.sums(self._explained(left) * fitted.white_residual, level)
+        scores = self.cluster_tests[level].sums(self._explained(left) * self.fitted.white_residual)
         return float(scores.sum() ** 2 / max((scores**2).sum(), 1e-300))
 
     def _explained(self, left: np.ndarray) -> np.ndarray:
@@ -277,7 +290,8 @@ class ScoreTests:
         if units >= criteria.JACKKNIFE_UNITS:
             explained, against_units = _log(chdtrc(left.shape[1], total @ total)), 0.0
             if level != "stroke" and explained < np.log(criteria.TESTED_AGAINST_RUNS):
-                test = self._test_of_constants([left], target, level)
+                own = ("specimen",) if level == "specimen" else ("run", "file")
+                test = self._test_of_constants([left], target, own)
                 if test is not None:
                     against_units = test.log_p
                     explained = min(explained, against_units)

@@ -37,7 +37,7 @@ from sealfit.closure.small_sample_test import (
     least_share,
 )
 from sealfit.fit.joint import Fitted
-from sealfit.fit.joint.rows import ALONG, LEVELS
+from sealfit.fit.joint.rows import ALONG, CELL, LEVELS
 from sealfit.fit.joint.variance_components import estimate_scatter, orthonormal
 from sealfit.fit.joint.whitening import Whitening
 from sealfit.tables import CALENDAR, HISTORY
@@ -194,17 +194,18 @@ class _Search:
         self.critical_many = critical_many(many, self.level / 2, np.random.default_rng(0)) if many else 0.0
         self.critical_small_sample = {}
         for name in {test.level for test in small_sample}:
-            level = self.level / (1 if name == SPECIMENS else N_VARIANCES)  # runs are also tested by slopes
+            # Runs are also tested by slopes.
+            level = self.level / (1 if name in (SPECIMENS, CELL) else N_VARIANCES)
             own = [t for t in small_sample if t.level == name]
             self.critical_small_sample[name] = critical_small_sample(self.fitted, own, level)
 
     def _retested(self, candidate: Candidate) -> SmallSampleTest | None:
         """Return a candidate's small-sample test on the final model, which may have fewer effects."""
-        known, target = candidate.test_result.small_sample, candidate.target
+        known = candidate.test_result.small_sample
         if known is None:
             return None
-        columns = candidate.columns * self.fitted.slope(*target)[:, None]
-        return self.tests.cluster_tests[known.level].test(project(self.fitted, columns), target)
+        columns = candidate.columns * self.fitted.slope(*candidate.target)[:, None]
+        return self.tests.cluster_tests[known.level].test(project(self.fitted, columns), known.target)
 
     def surer(self, times: float, candidate: Candidate) -> float:
         """Return the factor on an effect, found with `TARGET_POWER`, with which its evidence is not weak.

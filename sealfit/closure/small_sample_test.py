@@ -7,10 +7,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.special import chdtrc, fdtrc
 
 from sealfit.closure import criteria
 from sealfit.fit.joint import Fitted
+from sealfit.fit.joint.rows import CELL
 from sealfit.fit.joint.tangent import Tangent
 from sealfit.fit.joint.variance_components import orthonormal
 from sealfit.fit.joint.whitening import Whitening
@@ -221,6 +223,8 @@ def along_strokes(fitted: Fitted, left: np.ndarray) -> np.ndarray:
 # with the same covariance (a rotation test: Langsrud 2005, doi:10.1007/s11222-005-4789-5).
 
 MANY = 100  # Number of units from which their covariance is not computed as a matrix.
+# Level below which the forces of cells scatter more than the files do.
+CELLS_SCATTER_P = 0.05
 
 
 class SmallSampleTest(NamedTuple):
@@ -284,11 +288,31 @@ def small_root(taken: Tangent, moved: np.ndarray) -> np.ndarray:
 
 
 class ClusterTests:
-    """Tests on one number per unit of a fit; the groups of the level share only the model."""
+    """Tests on one number per unit of a fit; the groups of the level share only the model.
+
+    The level may also be `CELL`. Cells lie across the groups, so that their sums are made here.
+    """
 
     def __init__(self, fitted: Fitted, level: str = "specimen") -> None:
         self.fitted, self.level = fitted, level
         self._numbers: dict[tuple[str, str], Numbers] = {}
+        rows = fitted.rows
+        self.codes = rows.cells() if level == CELL else rows.codes(level)
+        self.units = int(self.codes.max()) + 1
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of `values`, shape (n,) or (n, k), over each unit."""
+        if self.level != CELL:
+            return self.fitted.rows.groups.sums(values, self.level)
+        each = np.arange(self.codes.size)
+        return csr_array((np.ones(each.size), (self.codes, each)), shape=(self.units, each.size)) @ values
+
+    def _taken(self, direction: np.ndarray) -> Tangent:
+        """Return the sums of the model's basis along a direction, shape (n,)."""
+        basis = self.fitted.basis
+        if self.level != CELL:
+            return basis.sums(self.fitted.rows.groups, self.level, direction)
+        return Tangent.dense(self.sums(direction[:, None] * basis.toarray()))
 
     @cached_property
     def _residual(self) -> np.ndarray:
@@ -299,52 +323,59 @@ class ClusterTests:
     def _finer(self) -> Whitening:
         """Whitening as if the units themselves did not scatter."""
         fitted, starts = self.fitted, self.fitted.rows.groups.starts
-        units = starts[self.level].size  # without repeats runs and files share their scatter
-        finer = tuple(c for c in fitted.scatter.components if starts[c.level].size > units)
+        # Without repeats runs and files share their scatter.
+        finer = tuple(c for c in fitted.scatter.components if starts[c.level].size > self.units)
         return Whitening(replace(fitted.scatter, components=finer), fitted.loads, fitted.rows.groups)
 
     def numbers(self, target: tuple[str, str]) -> Numbers:
         """Return the units' numbers along the direction of a quantity: (acts_on, operation)."""
         if target not in self._numbers:
-            fitted, groups = self.fitted, self.fitted.rows.groups
-            slope = fitted.slope(*target)[:, None]
-            white = fitted.whitening(slope)[:, 0]
-            size, finer = (groups.sums(w**2, self.level) for w in (white, self._finer(slope)[:, 0]))
-            known = criteria.KNOWN_DF * min(mean_ratio(size, finer), 1.0)
-            self._numbers[target] = self.along(white)._replace(known=known)
+            slope = self.fitted.slope(*target)[:, None]
+            white = self.fitted.whitening(slope)[:, 0]
+            numbers = self.along(white)
+            if self.level == CELL:
+                share = float(chdtrc(numbers.df, numbers.values @ numbers.values) > CELLS_SCATTER_P)
+            else:
+                size, finer = (self.sums(w**2) for w in (white, self._finer(slope)[:, 0]))
+                share = min(mean_ratio(size, finer), 1.0)
+            self._numbers[target] = numbers._replace(known=criteria.KNOWN_DF * share)
         return self._numbers[target]
 
     def along(self, white: np.ndarray) -> Numbers:
         """Return the units' numbers along a whitened column, shape (n,), without prior degrees of freedom."""
-        groups = self.fitted.rows.groups
-        size = np.sqrt(groups.sums(white**2, self.level))
+        size = np.sqrt(self.sums(white**2))
         inverse = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
-        direction = white * inverse[groups.codes[self.level]]
-        taken = self.fitted.basis.sums(groups, self.level, direction)
+        direction = white * inverse[self.codes]
+        taken = self._taken(direction)
         root = (Root if size.size > MANY else small_root)(taken, size > 0)
-        values = root @ groups.sums(direction * self._residual, self.level)
+        values = root @ self.sums(direction * self._residual)
         df = root.df if isinstance(root, Root) else values.size
         return Numbers(direction, taken, root, values, df, 0.0)
+
+    def share(self, left: np.ndarray, target: tuple[str, str]) -> float:
+        """Return the share of projected columns' sum of squares, (n, k), that is one number per unit."""
+        columns = self.sums(self.numbers(target).direction[:, None] * left)
+        return float((columns**2).sum() / max((left**2).sum(), 1e-300))
 
     def test(self, left: np.ndarray, target: tuple[str, str]) -> SmallSampleTest | None:
         """Return the F test of projected columns, shape (n, k), on a quantity; None with too few units."""
         numbers = self.numbers(target)
-        columns = self.fitted.rows.groups.sums(numbers.direction[:, None] * left, self.level)
+        columns = self.sums(numbers.direction[:, None] * left)
         basis = orthonormal(numbers.root @ columns, 1e-3)
         d, k = numbers.df, basis.shape[1]
         if k == 0 or d == k:
             return None
         chi2 = float(((numbers.values @ basis) ** 2).sum())
         log_p = float(log_p_of_numbers(numbers.values[None, :], basis, numbers.known, d)[0])
-        share = float((columns**2).sum() / max((left**2).sum(), 1e-300))
+        share = self.share(left, target)
         return SmallSampleTest(target, basis, numbers.known, chi2, log_p, share, d - k, self.level)
 
     def draws(self, count: int, rng: np.random.Generator) -> dict[tuple[str, str], np.ndarray]:
         """Return draws of the numbers under the null hypothesis, shape (count, d), for each quantity."""
-        groups, known = self.fitted.rows.groups, list(self._numbers.values())
+        known = list(self._numbers.values())
 
         def covariance(one: Numbers, other: Numbers) -> np.ndarray:
-            shared = np.diag(groups.sums(one.direction * other.direction, self.level))
+            shared = np.diag(self.sums(one.direction * other.direction))
             half = one.root @ (shared - one.taken @ other.taken.toarray().T)
             return (other.root @ half.T).T  # a `Root` multiplies from the left only
 

@@ -9,7 +9,7 @@ from sealfit.closure.channels import find_channels
 from sealfit.closure.score_test import ScoreTests
 from sealfit.closure.search import search
 from sealfit.fit.joint import fit_declared
-from sealfit.fit.joint.rows import SET_UP, make_rows
+from sealfit.fit.joint.rows import CELL, SET_UP, make_rows
 from sealfit.fit.joint.set_ups import with_both_directions, with_set_ups, with_specimens_by_condition
 
 SMALL = {"temperatures": (60.0,), "bins": 4}
@@ -163,6 +163,18 @@ def test_nothing_is_significant_where_only_set_ups_scatter():
     )
     assert sum(p < 0.005 for p in by_runs) >= 2  # by files, taken for independent
     assert min(by_set_ups) > 0.005
+
+
+@pytest.mark.parametrize("seed", [301, 303])
+def test_repeats_in_several_set_ups_are_no_independent_evidence_of_the_speed(seed):
+    """Each specimen has its own force at each speed, the same in all its mounts; p was 8e-7 and 5e-6."""
+    bins = with_set_ups(mounted_anew(seed, repeats=4, setup=0.02, days=(2.0, 8.0)))
+    assert SET_UP in bins
+    rows = make_rows(bins, has_aging=True)
+    (speed,) = (channel for channel in find_channels(rows) if channel.name == "speed_mm_s")
+    found = search(ScoreTests(fit_declared(rows)), [speed], np.random.default_rng(seed))
+    assert {c.test_result.small_sample.level for c in found} == {CELL}
+    assert min(c.p_value for c in found) > 0.001
 
 
 # ---------------------------------------------------------------- specimens of one name in several conditions

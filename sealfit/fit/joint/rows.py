@@ -66,6 +66,8 @@ SPEED_AND_SIGN = r"( at \d[\d.e+-]*?)?[+-]?$"
 LEVELS = ("stroke", "file", "run", "specimen")
 # Column of the set-up of each row, if repeats are set-ups. No channel of a campaign begins with `_`.
 SET_UP = "_set_up"
+# Level of the runs in a campaign with set-ups, each of which is part of several set-ups.
+CELL = "cell"
 # Channels that increase along a stroke, so that they vary within a bin.
 ALONG = ("displacement_mm", "distance_mm", "time_s")
 # Derived channel if loads differ: load times |speed|, the power of friction over its coefficient.
@@ -195,6 +197,15 @@ class Rows:
     def level_name(self, level: str) -> str:
         """Return the name of a level in the results: the groups of level "run" may be set-ups."""
         return "set_up" if level == "run" and SET_UP in self.table else level
+
+    @cached
+    def cells(self) -> np.ndarray | None:
+        """Return each row's number of its run where runs lie across set-ups, shape (n,); None elsewhere."""
+        if SET_UP not in self.table:
+            return None
+        found = pd.factorize(nesting_run(self.table, self.table["record"]))[0]
+        several = self.table[SET_UP].groupby(found).nunique().max() > 1
+        return found if several else None
 
     @cached
     def sparse(self, most: int) -> Rows:
