@@ -476,6 +476,19 @@ def test_specimens_of_one_run_each_are_scatter_between_runs(campaign):
     pd.testing.assert_frame_equal(nested["steady_fit"][columns], plain["steady_fit"][columns])
 
 
+def test_three_speeds_and_two_loads_show_the_scatter_of_specimens(campaign):
+    """The friction has a Stribeck curve and falls with the load; neither is in the model of three speeds."""
+    pieces = {**PIECES, "speeds": (1, 5, 25), "noise": 0.002}
+    light = campaign(specimens=4, specimen=0.02, seed=3, **pieces)
+    heavy = light.assign(load_N=2 * light.load_N, force_N=2 * 0.93 * light.force_N)
+    names = {name: heavy[name] + " heavy" for name in ("file", "run_id")}
+    table = pd.concat([light, heavy.assign(**names)], ignore_index=True)
+    levels = np.log(light.groupby(["condition", "specimen_id"])["force_N"].mean())
+    spread = 100 * np.sqrt(levels.groupby("condition").var().mean())
+    scatter = statistic(fit_conditions(table, Config()), "specimen_sd_pct")
+    assert scatter.value == pytest.approx(spread, rel=0.1)
+
+
 def test_specimens_that_differ_in_v_s_widen_its_interval(campaign):
     table = campaign(specimens=4, **PIECES)
     factor = table.specimen_id.str[-1].map({"0": 0.7, "1": 0.9, "2": 1.1, "3": 1.3})

@@ -205,11 +205,14 @@ def find_specimens(conditions: list[Condition]) -> None:
 def _specimen_part(condition: Condition, differs: str) -> SpecimenPart:
     """Return what specimens explain beyond the model and what they are known to explain.
 
-    With few speeds the model has one force per speed.
+    With few speeds the model of the condition has one factor per speed, direction and load.
     """
     if condition.few_speeds:
-        _, cell = np.unique(condition.run_levels(), axis=0, return_inverse=True)
-        model = np.eye(cell.max() + 1)[cell]
+        load = condition.arrays[1]
+        loads = [part[0] for part in speed_clusters(np.unique(load))]  # loads that differ by more than 25 %
+        cells = np.column_stack([condition.run_levels(), np.searchsorted(loads, load, side="right")])
+        _, cell = np.unique(cells, axis=0, return_inverse=True)
+        model = np.eye(cell.max() + 1)[cell] * condition.model_force()[:, None]
     else:
         model = condition.jacobian()[:, free_parameters(condition.names, condition.values)]
     model = np.hstack([model, *map(condition.by_specimen, condition.specimens)])
@@ -260,13 +263,17 @@ class SpecimenScatter:
 def specimen_scatter(conditions: list[Condition], unit: np.ndarray) -> SpecimenScatter:
     """Return the scatter of specimens, pooled over conditions.
 
-    `unit`, shape (conditions,), are the factors on the variances stated by the weights. Henderson 1953,
-    Biometrics 9(2), 226-252, doi:10.2307/3001853, method 3.
+    `unit`, shape (conditions,), are the factors on the variances stated by the weights. With few speeds it is
+    what one factor per speed, direction and load leaves, if known: the model has no Stribeck curve. Henderson
+    1953, Biometrics 9(2), 226-252, doi:10.2307/3001853, method 3.
     """
     variances, df = {}, 0
     for differs in dict.fromkeys(name for c in conditions for name in c.specimens):
-        pairs = zip(conditions, unit, strict=True)
-        parts = [(c.specimens[differs], value) for c, value in pairs if differs in c.specimens]
+        found = [(c, value) for c, value in zip(conditions, unit, strict=True) if differs in c.specimens]
+        by_cell = [c.specimens[differs] for c, _ in found if c.few_speeds]
+        rest_df = sum(part.rest_df for part in by_cell)
+        rest = sum(part.rest for part in by_cell) / rest_df if rest_df else np.nan
+        parts = [(c.specimens[differs], rest if c.few_speeds and rest_df else u) for c, u in found]
         excess = sum(part.explained - part.df * value for part, value in parts)
         variances[differs] = max(excess / sum(part.expected for part, _ in parts), 0.0)
         df = df or sum(part.df for part, _ in parts)

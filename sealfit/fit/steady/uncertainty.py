@@ -180,6 +180,8 @@ class SpecimenPart(NamedTuple):
     explained: float
     expected: float  # of `explained`, per variance of the specimens
     df: int
+    rest: float  # chi-square that the model and the specimens leave, and its degrees of freedom
+    rest_df: int
 
 
 def specimen_part(model: np.ndarray, own: np.ndarray, residual: np.ndarray) -> SpecimenPart:
@@ -193,7 +195,10 @@ def specimen_part(model: np.ndarray, own: np.ndarray, residual: np.ndarray) -> S
     left = own - basis @ (basis.T @ own)
     axes, size, _ = np.linalg.svd(left, full_matrices=False)
     axes = axes[:, size > DEPENDENT * np.linalg.norm(own)]
-    return SpecimenPart(float(((axes.T @ residual) ** 2).sum()), float((left**2).sum()), axes.shape[1])
+    explained = float(((axes.T @ residual) ** 2).sum())
+    rest = max(float(residual @ residual - ((basis.T @ residual) ** 2).sum()) - explained, 0.0)
+    rest_df = len(residual) - basis.shape[1] - axes.shape[1]
+    return SpecimenPart(explained, float((left**2).sum()), axes.shape[1], rest, rest_df)
 
 
 def speed_levels(runs: pd.DataFrame) -> dict[int, np.ndarray]:
