@@ -45,6 +45,14 @@ def test_what_is_never_or_already_reached_is_said(laws, value, words):
     assert "nan" not in text
 
 
+def test_a_life_without_limits_is_said_to_have_none():
+    """Rubber that does not age."""
+    days = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
+    value = 0.7 + 0.01 * np.random.default_rng(3).standard_normal(8)
+    text = said(fit_laws(Aged(days, value)), Goal(0.69))
+    assert "d to 0.69, without a finite 95 % interval (extrapolated" in text
+
+
 def test_the_interval_over_all_laws_is_given_if_the_first_law_never_ends():
     days = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
     value = 0.7 - 0.05 * np.log1p(days) * (1 + 0.05 * (-1.0) ** np.arange(8))
@@ -72,7 +80,7 @@ def test_a_law_with_as_many_parameters_as_days_has_an_interval_only_if_specimens
     few = fit_laws(Aged(days, values))
     text = said(few, Goal(0.82), notes=unknown_scatter(few[0]))
     assert "mu_s is of unknown uncertainty" in text
-    assert "95 %" not in text
+    assert "0.82, without a finite 95 % interval" in text
     known = fit_laws(Aged(days, values, specimens=(0.02, 3.0)))
     assert unknown_scatter(known[0]) == []
     life = answer(known[0], Goal(0.82))

@@ -16,6 +16,7 @@ SEARCHED = 0.005
 WEAK = 1e-6
 # An interval of a lifetime that excludes nothing.
 OPEN = [0.0, None]
+NO_ENDS = ", without a finite 95 % interval"
 # Level of the test for lack of fit.
 LACKING = 0.05
 # Largest activation energy of aging that is plausible, in kJ/mol; rubbers have 20 to 150.
@@ -348,8 +349,10 @@ def _life(part: Mapping) -> str:
         beyond = f" (extrapolated: tested from {low:g} to {high:g} degC)" if part["extrapolated"] else ""
         ends = _degrees(part["temperature_ci95"])
         return f"it lasts {years} at {part['temperature_C']:.1f} degC{ends}{beyond}"
-    no_ends = part["ci95"] in ([None, None], [0, 0], OPEN)
+    no_ends = part["ci95"] in ([None, None], [0, 0])
     ends = "" if no_ends else f", 95 % {_days_between(part['ci95'])}"
+    if part["ci95"] == OPEN:
+        ends = NO_ENDS
     if part["days"] is None:
         return f"{part['threshold']:.4g} is not reached within 1e9 d{ends}"
     if part["days"] == 0:
@@ -365,7 +368,7 @@ def _life(part: Mapping) -> str:
 def _degrees(ends: list) -> str:
     low, high = ("" if end is None else f"{end:.1f}" for end in ends)
     if not (low or high):
-        return ", without a finite 95 % interval"
+        return NO_ENDS
     between = f"{low} to {high}" if low and high else f"above {low}" if low else f"below {high}"
     return f", 95 % {between} degC"
 
