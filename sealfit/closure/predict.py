@@ -16,6 +16,7 @@ import pandas as pd
 
 from sealfit.closure.criteria import NEAR_TESTED_SPEED
 from sealfit.closure.errors_and_intervals import Sandwich, mean_half_width, t_quantile
+from sealfit.closure.forms import describe
 from sealfit.closure.output import from_record
 from sealfit.closure.prediction_csv import ANSWERS
 from sealfit.config import Config
@@ -36,6 +37,8 @@ FORCE_COLUMNS = list(ANSWERS[:-2])  # all but `extrapolated` and `note`
 NO_INTERVAL = "no interval: as many parameters in the model as runs; test more speeds"
 NOT_CONFIRMED = "not confirmed: {}; the interval holds the force with and without each"
 TESTED_ONLY = "the scatter of specimens is not known: intervals hold for the tested ones"
+BEYOND_DAYS = "beyond the tested days the interval holds the force with and without {}"
+ALONG_MOTION = "no force: beyond the tests the model gives one in the direction of motion"
 BETWEEN_DAYS = "no interval: these days were not tested, and the scatter of specimens is not known"
 
 
@@ -89,6 +92,12 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         at = replace(at, force=before_N)  # its lag
         mean, tangent = evaluate(after, at)
         least, most = _across_jumps(model["jumps"], after, at, mean)
+        if aging := [term for term in after.terms if "aging_days" in term.channels]:
+            later = at.days > (1 + BEYOND) * model["ranges"]["aging_days"][1]
+            least = np.where(later, np.minimum(least, before_N), least)
+            most = np.where(later, np.maximum(most, before_N), most)
+            names = " and ".join(describe(term, at) for term in aging)
+            _note(notes, _placed(later, good), BEYOND_DAYS.format(names))
         for one in unconfirmed:
             others = _with_unconfirmed(replace(one, declared=after.declared), at, model["ranges"])
             least, most = np.minimum(least, np.min(others, axis=0)), np.maximum(most, np.max(others, axis=0))
@@ -104,6 +113,9 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         forces = (before_N, mean, least - half, most + half)
         answer[good] = np.column_stack([*forces, least - spread, most + spread])
         answer[untested, 2:] = np.nan
+        along_motion = _placed(mean * at.speed < 0, good) & extrapolated
+        answer[along_motion, 1:] = np.nan
+        _note(notes, along_motion, ALONG_MOTION)
     return points.reset_index(drop=True).assign(
         **dict(zip(FORCE_COLUMNS, answer.T, strict=True)),
         extrapolated=extrapolated & ~np.isnan(answer[:, 1]),  # of `force_after_N`
@@ -232,6 +244,13 @@ def _check_values(table: pd.DataFrame, after: Model, model: dict, notes: list) -
             _note(notes, ~table[name].isin(tested).to_numpy(), f"{name} must be one of {', '.join(tested)}")
 
 
+def _placed(mask: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Return a mask of the points that are answered as one of all points."""
+    every = good.copy()
+    every[good] = mask
+    return every
+
+
 def _note(notes: list[list[str]], points: np.ndarray, text: str) -> None:
     for k in np.flatnonzero(points):
         notes[k].append(text)
@@ -263,7 +282,8 @@ def _outside(
     read += [name for term in after.terms for name in term.channels]
     for name in dict.fromkeys(read):
         tested = ranges.get(name)
-        if not _is_range(tested) or name == "direction":
+        by_series = name == "aging_days" and model["has_aging"]  # see above
+        if not _is_range(tested) or name == "direction" or by_series:
             continue
         values = pd.to_numeric(table[name], errors="coerce").to_numpy(dtype=float)
         values = np.abs(values) if name == "speed_mm_s" else values

@@ -32,6 +32,35 @@ def test_an_effect_that_is_not_confirmed_is_of_a_column_that_was_tested(of_three
             read_document("model", json.dumps(model | {"unconfirmed": [one | {"terms": [term | unknown]}]}))
 
 
+def with_an_effect_of_days(model, slope):
+    """Return a model whose friction also changes by a share `slope` a day."""
+    term = {"id": "linear", "acts_on": "mu", "operation": "multiply", "smoothness": None}
+    term |= {"channels": ["aging_days"], "fixed": {"x_ref": 0.0}, "values": {"A": slope}}
+    covariance = np.pad(np.array(model["covariance"]), (0, 1)).tolist()
+    after = model["after"] | {"terms": [*model["after"]["terms"], term]}
+    return model | {"after": after, "covariance": covariance, "sandwiches": []}
+
+
+def test_beyond_the_tested_days_an_effect_of_them_may_have_ended(of_three_speeds):
+    bins, model = of_three_speeds
+    model, last = with_an_effect_of_days(model, -0.01), bins[bins["aging_days"] == 16].head(1)
+    model["scatter"] = model["scatter"] | {"of_specimens": True}
+    tested, later = (predict(model, last.assign(aging_days=days)).iloc[0] for days in (16.0, 40.0))
+    assert tested["force_after_hi95_N"] < tested["force_before_N"]
+    assert later["force_after_N"] < 0.7 * later["force_before_N"] < later["force_after_hi95_N"]
+    assert "with and without linear in aging_days, factor on mu" in later["note"]
+    assert later["note"].count("outside the tests") == 1
+
+
+def test_beyond_the_tests_no_force_pushes_along_the_motion(of_three_speeds):
+    bins, model = of_three_speeds
+    point = bins[bins["aging_days"] == 16].head(1).assign(aging_days=40.0)
+    answer = predict(with_an_effect_of_days(model, -0.05), point).iloc[0]
+    assert answer["force_before_N"] > 0
+    assert np.isnan(answer["force_after_N"])
+    assert "no force: beyond the tests" in answer["note"]
+
+
 def test_between_three_speeds_the_force_is_not_known(of_three_speeds):
     bins, model = of_three_speeds
     points = bins.groupby("condition").head(1).assign(speed_mm_s=8.1)
