@@ -16,7 +16,7 @@ from sealfit.closure.forms import describe
 from sealfit.closure.left_out import between_speeds, blocks, covered, foldable, folds, whole_settings
 from sealfit.closure.linearised import Proposal
 from sealfit.closure.naming import LINEAR, rivals
-from sealfit.closure.ripples import agreement, pass_shifts, waves_of
+from sealfit.closure.ripples import agreement, pass_shifts, unresolved_wave, waves_of
 from sealfit.config import Config, Loop
 from sealfit.effects.contract import Effect
 from sealfit.effects.free import WITHIN
@@ -299,7 +299,7 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     if not gain.real:
         small = size <= criteria.SMALL_SIZE * force and not proposal.term.effect.periodic
         return NO_GAIN if small else "it does not lower the error on held-out data"
-    if gain.rmse_N < criteria.LEAST_GAIN * force and not proposal.term.effect.periodic:
+    if gain.rmse_N < criteria.LEAST_GAIN * force and not _wave_of_its_own(proposal):
         return NO_GAIN
     if reason := _reason_of_weak_evidence(proposal, gain, rows):
         return reason
@@ -308,6 +308,11 @@ def _reason_refused(fitted: Fitted, proposal: Proposal, gain: Gain, samples: pd.
     if not proposal.term.effect.periodic and vague_between_speeds(fitted, proposal):
         return "with it the force between the tested speeds is less certain than the error that it removes"
     return None
+
+
+def _wave_of_its_own(proposal: Proposal) -> bool:
+    fitted = proposal.fitted
+    return proposal.term.effect.periodic and not unresolved_wave(fitted.model, fitted.rows)
 
 
 def _reason_too_small(proposal: Proposal, added: np.ndarray, rows: Rows, samples: pd.DataFrame) -> str | None:

@@ -21,7 +21,7 @@ from sealfit.closure.spectrum import (
     spectrum_of,
     tops,
 )
-from sealfit.fit.joint.model import passes
+from sealfit.fit.joint.model import Model, passes
 from sealfit.fit.joint.rows import Rows
 from sealfit.ingest.strokes import SPEEDS_APART
 
@@ -429,3 +429,21 @@ def pass_shifts(samples: pd.DataFrame, rows: Rows, wavelength: float, axis: str)
     shift -= wavelength * np.round((waves.middle + shift) / wavelength)
     keys = zip(waves.unit.tolist(), waves.direction.tolist(), strict=True)
     return {names[first[key]]: own for key, own in zip(keys, shift.tolist(), strict=True)}
+
+
+def unresolved_wave(model: Model, rows: Rows) -> bool:
+    """Whether the last effect of a model is a wave that no stroke distinguishes from an earlier one.
+
+    Two waves are distinguished if the longest stroke has one period more of one than of the other.
+    """
+    waves = [
+        (t.channels[0], v["lambda_"])
+        for t, v in zip(model.terms, model.values, strict=True)
+        if "lambda_" in v
+    ]
+    if not waves or not model.terms[-1].effect.periodic:
+        return False
+    (axis, length), earlier = waves[-1], waves[:-1]
+    place = pd.Series(rows.values(axis)).groupby(rows.codes("stroke"))
+    longest = float((place.max() - place.min()).max())
+    return any(axis == other and abs(longest / length - longest / own) < 1.0 for other, own in earlier)

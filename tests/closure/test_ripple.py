@@ -3,13 +3,25 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+from bins_helpers import make_bins
 
 from sealfit.closure import ripple_selection
 from sealfit.closure.confirm import Context
 from sealfit.closure.ripple_selection import turns_joined
-from sealfit.closure.ripples import Peak, _coherent, _incoherent, _with_shared_phase, find_ripple
+from sealfit.closure.ripples import (
+    Peak,
+    _coherent,
+    _incoherent,
+    _with_shared_phase,
+    find_ripple,
+    unresolved_wave,
+)
 from sealfit.closure.spectrum import Spectrum
 from sealfit.config import Config
+from sealfit.effects import EFFECTS
+from sealfit.fit.joint.model import Term
+from sealfit.fit.joint.rows import make_rows
+from sealfit.fit.joint.search import start_model
 
 
 def make_samples(
@@ -330,3 +342,18 @@ def test_a_spectrum_that_only_falls_has_no_peak():
     )  # fmt: skip
     assert _coherent(spectrum) == []
     assert _incoherent(spectrum) == []
+
+
+@pytest.mark.parametrize(
+    ("length", "axis", "unresolved"),
+    [(4.2, "displacement_mm", True), (5.0, "displacement_mm", False), (4.2, "distance_mm", False)],
+)
+def test_a_second_wave_needs_another_length_within_a_stroke(length, axis, unresolved):
+    """Strokes of 38 mm have 9.5 periods of 4 mm, 9.0 of 4.2 mm and 7.6 of 5 mm."""
+    rows = make_rows(make_bins(bins=20, temperatures=(60.0,)), has_aging=True)
+    model = start_model(rows)
+    for place, wave in (("displacement_mm", 4.0), (axis, length)):
+        term = Term(EFFECTS["ripple"], (place,), "mu", "multiply")
+        model = model.with_term(term, {"A": 0.02, "lambda_": wave, "phi": 0.0})
+    assert unresolved_wave(model, rows) == unresolved
+    assert not unresolved_wave(model.without_term(0), rows)
