@@ -37,8 +37,8 @@ OFF_SPEED, MOST_OFF_SPEED = 0.2, 0.3
 FEWEST_SAMPLES = 10
 # Lengths of the rise from rest over which friction follows a step from another speed: of a change of 50 %
 # then 0.05 % are left. At least a half of the steady window is kept, and all of it where the transient is
-# below so many standard errors.
-AFTER_STEP, KEPT, CLEAR_STEP = 7.0, 0.5, 4.0
+# below so many standard errors, or the window is shorter than so many lengths.
+AFTER_STEP, KEPT, CLEAR_STEP, LEAST_LENGTHS = 7.0, 0.5, 4.0, 5.0
 # Share of a turn below which what comes before the first or after the last whole turn is no turn of its own.
 PART_OF_TURN = 0.05
 # Ratio of measured speeds from which they are two settings. Without speed control they vary nearly as much.
@@ -166,10 +166,10 @@ def _following_step(
     The transient is C exp(-x / `rise_mm`) beside a straight line, by least squares.
     """
     none = np.zeros(len(along_mm), dtype=bool)
-    if np.count_nonzero(steady) < LEAST_ROWS:
-        return none
     x = along_mm - along_mm[0]
     own = x[steady]
+    if own.size < LEAST_ROWS or np.ptp(own) < LEAST_LENGTHS * rise_mm:
+        return none
     columns = np.vstack([np.exp(-own / rise_mm), np.ones(own.size), own]).T
     basis, triangle = np.linalg.qr(columns[:, ::-1])
     coefficients = basis.T @ force_N[steady]
