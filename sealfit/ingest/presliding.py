@@ -33,6 +33,8 @@ EARLY, LATE = (0.05, 0.5), (0.6, 0.95)
 LONG = 0.1
 # Rise lengths that are tried, as multiples of the distance to 63 %.
 LENGTHS = np.geomspace(0.3, 3.0, 25)
+# Standard errors above which a transient of known length is clear.
+CLEAR_TRANSIENT = 4.0
 # Factor on the first arrival in the late band, which is early by a part of the last bend.
 MARGIN = 1.05
 # Rise lengths that are tried on the plateau of the speed, as multiples of the one found with the ramp.
@@ -290,6 +292,14 @@ class _Beside:
         left = float(shape @ force_N) / square if square > 0.0 else 0.0
         residual = force_N - left * shape
         return left, float(residual @ residual)
+
+
+def has_transient(distance_mm: np.ndarray, force_N: np.ndarray, length_mm: float) -> bool:
+    """Return whether C of F = A + B x + C exp(-x / length) is clearly not 0; arrays of shape (n,)."""
+    beside = _Beside(distance_mm, True)
+    force = beside.free(force_N)
+    squares = beside.fitted(_shape(distance_mm, length_mm), force)[1]
+    return bool(force @ force - squares > CLEAR_TRANSIENT**2 * squares / (len(force) - 3))
 
 
 def _shape(x_mm: np.ndarray, length_mm: np.ndarray | float, power: int | None = None) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sealfit.config import Strokes
+from sealfit.ingest.presliding import has_transient
 from sealfit.ingest.window import (
     LEAST_ROWS,
     SAME_SPEED,
@@ -36,9 +37,9 @@ OFF_SPEED, MOST_OFF_SPEED = 0.2, 0.3
 # Samples of a steady speed among several, at least. With 6, some are found on ramps of 50 samples.
 FEWEST_SAMPLES = 10
 # Lengths of the rise from rest over which friction follows a step from another speed: of a change of 50 %
-# then 0.05 % are left. At least a half of the steady window is kept, and all of it where the transient is
-# below so many standard errors, or the window is shorter than so many lengths.
-AFTER_STEP, KEPT, CLEAR_STEP, LEAST_LENGTHS = 7.0, 0.5, 4.0, 5.0
+# then 0.05 % are left. At least a half of the steady window is kept, and all of a window that is shorter than
+# so many lengths.
+AFTER_STEP, KEPT, LEAST_LENGTHS = 7.0, 0.5, 5.0
 # Share of a turn below which what comes before the first or after the last whole turn is no turn of its own.
 PART_OF_TURN = 0.05
 # Ratio of measured speeds from which they are two settings. Without speed control they vary nearly as much.
@@ -161,22 +162,12 @@ def _stroke(motion: _TraceMotion, rows: slice, begin: int, origin: int, way: int
 def _following_step(
     along_mm: np.ndarray, force_N: np.ndarray, steady: np.ndarray, rise_mm: float
 ) -> np.ndarray:
-    """Return which rows of a steady window follow a step between two speeds, as a mask of shape (n,).
-
-    The transient is C exp(-x / `rise_mm`) beside a straight line, by least squares.
-    """
-    none = np.zeros(len(along_mm), dtype=bool)
+    """Return which rows of a steady window follow a step between two speeds, as a mask of shape (n,)."""
     x = along_mm - along_mm[0]
     own = x[steady]
-    if own.size < LEAST_ROWS or np.ptp(own) < LEAST_LENGTHS * rise_mm:
-        return none
-    columns = np.vstack([np.exp(-own / rise_mm), np.ones(own.size), own]).T
-    basis, triangle = np.linalg.qr(columns[:, ::-1])
-    coefficients = basis.T @ force_N[steady]
-    left = force_N[steady] - basis @ coefficients
-    noise = np.sqrt(left @ left / (own.size - 3))
-    if abs(triangle[2, 2]) < 1e-9 or abs(coefficients[2]) <= CLEAR_STEP * noise:
-        return none
+    long = own.size >= LEAST_ROWS and np.ptp(own) >= LEAST_LENGTHS * rise_mm
+    if not (long and has_transient(own, force_N[steady], rise_mm)):
+        return np.zeros(len(x), dtype=bool)
     end = min(AFTER_STEP * rise_mm, own[-1] - KEPT * np.ptp(own))
     return steady & (x < end)
 
