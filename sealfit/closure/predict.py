@@ -93,7 +93,7 @@ def predict(model: dict, points: pd.DataFrame, own: Mapping[str, Effect] | None 
         mean, tangent = evaluate(after, at)
         least, most = _across_jumps(model["jumps"], after, at, mean)
         if aging := [term for term in after.terms if "aging_days" in term.channels]:
-            later = at.days > (1 + BEYOND) * model["ranges"]["aging_days"][1]
+            later = at.days > _last_days(conditions, code, model)[good]
             least = np.where(later, np.minimum(least, before_N), least)
             most = np.where(later, np.maximum(most, before_N), most)
             names = " and ".join(describe(term, at) for term in aging)
@@ -262,15 +262,11 @@ def _outside(
     """Return which points are extrapolated, with a note each. They are predicted all the same."""
     ranges = model["ranges"]
     outside = np.zeros(len(table), dtype=bool)
-    tested_count = len(model["conditions"]["condition"])
     series = np.array(conditions["series"], dtype=object)
-    days = conditions["aging_days"].to_numpy(dtype=float)
-    if model["has_aging"]:
-        for k in np.flatnonzero(code >= tested_count):
-            own = days[:tested_count][series[:tested_count] == series[code[k]]]
-            if days[code[k]] > own.max():
-                outside[k] = True
-                notes[k].append(f"aging_days is outside the tests: up to {own.max():g}")
+    days, last = conditions["aging_days"].to_numpy(dtype=float), _last_days(conditions, code, model)
+    for k in np.flatnonzero((code >= 0) & (days[code] > last)):
+        outside[k] = True
+        notes[k].append(f"aging_days is outside the tests: up to {last[k]:g}")
     speed = np.abs(pd.to_numeric(table["speed_mm_s"], errors="coerce").to_numpy(dtype=float))
     for k in np.flatnonzero(code >= 0):
         tested = np.array(model["speeds_mm_s"][series[code[k]]])
@@ -296,6 +292,17 @@ def _outside(
         _note(notes, back, "backward motion was not tested")
         outside |= back
     return outside
+
+
+def _last_days(conditions: pd.DataFrame, code: np.ndarray, model: dict) -> np.ndarray:
+    """Return the last tested day of the series of each point, shape (n,); inf where no day is untested."""
+    last = np.full(len(code), np.inf)
+    if model["has_aging"]:
+        tested = len(model["conditions"]["condition"])
+        days, series = (conditions[name].to_numpy() for name in ("aging_days", "series"))
+        for k in np.flatnonzero(code >= tested):
+            last[k] = days[:tested][series[:tested] == series[code[k]]].max()
+    return last
 
 
 def _in_gaps(jumps: list[dict], after: Model, table: pd.DataFrame) -> Iterator[tuple[dict, np.ndarray]]:
